@@ -1,0 +1,1 @@
+"""Pure functions on arrays. Imports nothing else of drgs."""

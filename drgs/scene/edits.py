@@ -1,0 +1,165 @@
+"""Edits as plain data: one schema for file, REST and WebSocket, applied in order, each undoable (design: Edits)."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Triple = tuple[float, float, float]
+
+
+class _Plain(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class Sphere(_Plain):
+    center: Triple
+    """World units."""
+    radius: Annotated[float, Field(gt=0)]
+    falloff: Annotated[float, Field(ge=0)] = 0.0
+    """Width of the smooth rim outside the radius [world units]."""
+
+
+class Box(_Plain):
+    minimum: Triple
+    maximum: Triple
+    falloff: Annotated[float, Field(ge=0)] = 0.0
+
+
+class Similar(_Plain):
+    point: Triple
+    """World position picked on the surface; the flood starts at its nearest vertex."""
+    tolerance: Annotated[float, Field(gt=0, le=1)] = 0.1
+    """Largest material difference (Euclidean over albedo, roughness, metallic) that the flood crosses."""
+
+
+class Selection(_Plain):
+    """Exactly one field is set."""
+
+    all: bool | None = None
+    sphere: Sphere | None = None
+    box: Box | None = None
+    region: int | None = None
+    similar: Similar | None = None
+    vertex_weights: list[Unit] | None = None
+    """Painted weight of each mesh vertex."""
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> "Selection":
+        given = [name for name in type(self).model_fields if getattr(self, name) not in (None, False)]
+        if len(given) != 1:
+            raise ValueError(f"a selection names exactly one of all, sphere, box, region, similar, vertex_weights; found {given or 'none'}")
+        return self
+
+
+class MaterialValues(_Plain):
+    """Absolute: the new values, 0..1. Multiply: factors."""
+
+    albedo: tuple[float, float, float] | None = None
+    """Linear."""
+    roughness: float | None = None
+    metallic: float | None = None
+
+
+class MaterialEdit(_Plain):
+    op: Literal["material"]
+    select: Selection
+    set: MaterialValues
+    mode: Literal["absolute", "multiply"] = "absolute"
+
+    @model_validator(mode="after")
+    def _in_range(self) -> "MaterialEdit":
+        values = [*(self.set.albedo or ()), *(v for v in (self.set.roughness, self.set.metallic) if v is not None)]
+        if not values:
+            raise ValueError("a material edit sets at least one of albedo, roughness, metallic; found none")
+        upper = 1.0 if self.mode == "absolute" else 100.0
+        if any(not 0.0 <= v <= upper for v in values):
+            raise ValueError(f"material values in mode {self.mode!r} lie in 0..{upper:g}; found {values}")
+        return self
+
+
+class EnvironmentEdit(_Plain):
+    op: Literal["environment"]
+    file: str | None = None
+    """EXR or HDR file (or the name of a stored environment); None keeps the present one."""
+    rotation: float = 0.0
+    """Degrees, counter-clockwise seen from above."""
+    intensity: Annotated[float, Field(ge=0)] = 1.0
+
+
+class TwistMap(_Plain):
+    type: Literal["twist"]
+    rate: float
+    """Radians per world unit of z."""
+
+
+class BendMap(_Plain):
+    type: Literal["bend"]
+    curvature: float
+    """1 / world unit."""
+
+
+class StretchMap(_Plain):
+    type: Literal["stretch"]
+    factor: Annotated[float, Field(gt=0)]
+
+
+class LatticeMap(_Plain):
+    type: Literal["lattice"]
+    minimum: Triple
+    maximum: Triple
+    control_points: list[list[list[Triple]]]
+    """[i][j][k] -> moved position of the control point, x fastest varying last index z."""
+
+
+AnalyticMap = Annotated[TwistMap | BendMap | StretchMap | LatticeMap, Field(discriminator="type")]
+
+
+class DeformEdit(_Plain):
+    op: Literal["deform"]
+    map: AnalyticMap | None = None
+    vertices: str | None = None
+    """NPZ with `vertices` (vertex, 3): the mesh's new vertex positions."""
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> "DeformEdit":
+        if (self.map is None) == (self.vertices is None):
+            raise ValueError("a deform edit has either map or vertices; found both or neither")
+        return self
+
+
+class PoseEdit(_Plain):
+    op: Literal["pose"]
+    clip: str
+    time: Annotated[float, Field(ge=0)]
+    """Seconds."""
+
+
+class SimulateEdit(_Plain):
+    op: Literal["simulate"]
+    scene: dict
+    time: Annotated[float, Field(ge=0)]
+
+
+Edit = Annotated[MaterialEdit | EnvironmentEdit | DeformEdit | PoseEdit | SimulateEdit, Field(discriminator="op")]
+_edits = TypeAdapter(list[Edit])
+
+
+def parse_edits(data: list | str | bytes) -> list[Edit]:
+    """Validate JSON text or plain data.
+
+    Raises:
+        ValueError: one sentence naming the first wrong field.
+    """
+    try:
+        return _edits.validate_json(data) if isinstance(data, str | bytes) else _edits.validate_python(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"edits: {'.'.join(map(str, first['loc'])) or 'document'}: {first['msg']}") from error
+
+
+def load_edits(path: Path) -> list[Edit]:
+    """Read an edits file: a JSON list, or one edit alone."""
+    text = path.read_text().strip()
+    return parse_edits(text if text.startswith("[") else f"[{text}]")

@@ -1,0 +1,34 @@
+"""The scene after edits and deformation: what a frame is rendered from."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from drgs.scene.environment import Environment
+from drgs.scene.materials import Materials
+from drgs.scene.mesh import TriangleMesh
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSurfels:
+    """Gaussians in world space, moved by F: tangents need no longer be orthogonal."""
+
+    centers: Float[Tensor, "surfel 3"]
+    tangents: Float[Tensor, "surfel 3 2"]
+    """B' = F B; columns were s_u t_u and s_v t_v at rest [world units]."""
+    opacities: Float[Tensor, "surfel"]
+    """0..1."""
+    materials: Materials
+
+
+@dataclass(frozen=True, eq=False)
+class PosedScene:
+    """Written by pose_scene(asset, edits, state); read by render_frame."""
+
+    surfels: PosedSurfels | None
+    mesh: TriangleMesh
+    environment: Environment
+    environment_rotation_degrees: float = 0.0
+    """Counter-clockwise seen from above; applied by turning directions, the table stays as it is."""
+    environment_intensity: float = 1.0

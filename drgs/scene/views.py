@@ -1,0 +1,26 @@
+"""A capture: posed photographs with masks, and, where known, sparse points."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from drgs.scene.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Photographs of one object. Written by load_views, read by fit_gaussians and fit_materials."""
+
+    cameras: tuple[Camera, ...]
+    images_srgb: UInt8[Tensor, "view height width 3"]
+    """Straight (un-premultiplied) 8-bit sRGB; all views of a capture share one size."""
+    coverage: UInt8[Tensor, "view height width"]
+    """Mask: 255 object, 0 background."""
+    points_world: Float[Tensor, "point 3"] | None
+    """Sparse points of the capture (COLMAP), or None."""
+    point_colors_srgb: Float[Tensor, "point 3"] | None
+    has_masks: bool
+    """False when the capture has neither alpha nor masks: coverage is then 255 everywhere."""
+    source: str
+    """Which reader recognised the folder: nerf-synthetic, nerfstudio, colmap, nero."""
