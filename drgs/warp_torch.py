@@ -1,0 +1,84 @@
+"""The one bridge between torch and Warp: arrays that share memory, and launches that use every CPU thread.
+
+`wp.launch` runs a CPU kernel on one thread and releases the GIL; `launch` cuts the index range into slices and gives
+them to a thread pool. Kernels launched this way take `first: int` as their first argument and start with
+`i = first + wp.tid()`. Warp's atomics on the CPU are plain adds, so two slices must never add to one address.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+wp.config.log_level = wp.LOG_ERROR  # stdout belongs to --json; "no CUDA driver" is no news here
+wp.init()
+
+_pool: ThreadPoolExecutor | None = None
+
+
+def thread_count() -> int:
+    """Threads that CPU launches are spread over: DRGS_THREADS, else the cores this process may use."""
+    asked = os.environ.get("DRGS_THREADS")
+    return max(1, int(asked)) if asked else len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def thread_pool() -> ThreadPoolExecutor:
+    """The pool shared by all CPU launches (and by other callers of code that releases the GIL)."""
+    global _pool
+    if _pool is None:
+        _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="drgs")
+    return _pool
+
+
+def warp_array(tensor: Tensor, dtype: Any = None) -> wp.array:
+    """A Warp array on a tensor's memory; `dtype` (wp.vec3, ...) consumes trailing dimensions. No gradient is tracked."""
+    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+
+
+def warp_device(tensor: Tensor) -> Any:
+    """Warp's device of a tensor."""
+    return wp.device_from_torch(tensor.device)
+
+
+def launch(kernel: Any, count: int, inputs: list, outputs: list, device: Any, slices_per_thread: int = 4) -> None:
+    """Run `kernel` for `count` indices, on CUDA at once, on the CPU in slices over the thread pool.
+
+    The kernel's first argument must be `first: int` (see module docstring); it is added here.
+    """
+    if count == 0:
+        return
+    device = wp.get_device(device)
+    if device.is_cuda:
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=outputs, device=device)
+        return
+    kernel.module.load(device)  # compile once, before threads race for it
+    threads = thread_count()
+    slices = min(count, threads * slices_per_thread) if threads > 1 else 1
+    if slices == 1:
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=outputs, device=device)
+        return
+    edges = [count * k // slices for k in range(slices + 1)]
+
+    def run(first: int, last: int) -> None:
+        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=outputs, device=device)
+
+    for done in [thread_pool().submit(run, a, b) for a, b in zip(edges, edges[1:], strict=False)]:
+        done.result()
+
+
+def device_from_name(name: str) -> torch.device:
+    """Torch device of auto, cpu or cuda.
+
+    Raises:
+        ValueError: cuda was asked for and there is none.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device 'cuda' was asked for, but this machine has no usable NVIDIA GPU; use --device cpu or auto")
+    if name not in ("cpu", "cuda"):
+        raise ValueError(f"device {name!r} is unknown; expected auto, cpu or cuda")
+    return torch.device(name)
