@@ -1,0 +1,327 @@
+"""What passes over WebSocket /api/sessions/{id}/stream: JSON text both ways, binary frames to the client.
+
+`generate_types.py` writes web/src/protocol.gen.ts from these models, and docs/protocol.md explains them in prose.
+Source of the header: service reference, section 4.3; of the ack window and the lossless last frame: jupyter_rfb.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
+
+from drgs.scene.edits import Edit
+
+PROTOCOL_VERSION = 1
+"""A client of another version is told so and closed with 1002."""
+
+MAX_FRAMES_IN_FLIGHT = 2
+"""Frames sent but not yet acknowledged, a viewer."""
+
+CLOSE_VERSION_MISMATCH = 1002
+CLOSE_POLICY = 1008
+
+MAX_SIDE = 4096
+"""Largest width or height that a viewer may ask for [pixels]."""
+MAX_PIXELS = 4_194_304
+MAX_SPP_TARGET = 65535
+"""The header holds 16 bits."""
+
+Channel = Literal["final", "albedo", "roughness", "metallic", "normal", "depth"]
+Phase = Literal["loading", "moving", "still", "converged", "paused"]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Row = tuple[Finite, Finite, Finite, Finite]
+Vector = tuple[Finite, Finite, Finite]
+Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class _Answer(_Message):
+    model_config = ConfigDict(json_schema_serialization_defaults_required=True)
+
+
+# ---- client to server ------------------------------------------------------------------------------------------------
+
+
+class ClientHello(_Message):
+    """First message of a client; nothing else is answered before it."""
+
+    type: Literal["hello"]
+    v: int
+    """PROTOCOL_VERSION of the client."""
+    codecs: list[Literal["jpeg", "png"]] = ["jpeg", "png"]
+    """What the client can decode. With png, the converged frame is lossless (and keeps alpha)."""
+    client: Annotated[str, Field(max_length=100)] = ""
+    """Name of the program, for logs."""
+
+
+class CameraMessage(_Message):
+    """Where this viewer looks from. Latest wins: a newer one replaces one that was not rendered yet."""
+
+    type: Literal["camera"]
+    number: Number = 0
+    """Chosen by the client; a frame carries the low 8 bits of the number of the camera that it shows."""
+    world_from_camera: tuple[Row, Row, Row, Row]
+    """OpenGL camera-to-world, rows: the camera looks down -z, y up. World is right-handed, z up."""
+    fov_y_degrees: Annotated[float, Field(gt=0.1, lt=175)]
+    width: Annotated[int, Field(ge=16, le=MAX_SIDE)]
+    """Pixels of the picture at rest; while moving the server may send fewer."""
+    height: Annotated[int, Field(ge=16, le=MAX_SIDE)]
+
+    @model_validator(mode="after")
+    def _is_a_rigid_camera(self) -> "CameraMessage":
+        if self.width * self.height > MAX_PIXELS:
+            raise ValueError(f"a picture has at most {MAX_PIXELS} pixels; found {self.width} x {self.height}")
+        rows = [row[:3] for row in self.world_from_camera[:3]]
+        for i in range(3):
+            for j in range(3):
+                dot = sum(rows[i][k] * rows[j][k] for k in range(3))
+                if abs(dot - (i == j)) > 1e-2:
+                    raise ValueError("world_from_camera must be a rotation and a translation; its upper left 3x3 is not orthonormal")
+        if any(abs(found - wanted) > 1e-4 for found, wanted in zip(self.world_from_camera[3], (0, 0, 0, 1), strict=True)):
+            raise ValueError(f"the last row of world_from_camera must be 0 0 0 1; found {self.world_from_camera[3]}")
+        return self
+
+
+class EditMessage(_Message):
+    """Append an edit to the session's log. Applied in order, never dropped, answered by `accepted` or `rejected`."""
+
+    type: Literal["edit"]
+    id: Number
+    """Chosen by the client; the answer repeats it."""
+    edit: Edit
+    coalesce: Annotated[str, Field(max_length=100)] | None = None
+    """Edits of one slider drag share a key: an edit replaces the last one when keys match and they are < 500 ms apart."""
+
+
+class UndoMessage(_Message):
+    type: Literal["undo"]
+    id: Number
+
+
+class RedoMessage(_Message):
+    type: Literal["redo"]
+    id: Number
+
+
+class AckMessage(_Message):
+    """This frame, and every one before it, has been shown or dropped."""
+
+    type: Literal["ack"]
+    frame_id: Number
+
+
+class Settings(_Message):
+    """How this viewer sees the session; each viewer has its own."""
+
+    exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    background: Literal["environment", "transparent"] | Vector = "environment"
+    """A triple is a colour, sRGB 0..1. Transparent arrives as PNG with alpha once converged and over grey while JPEG."""
+    spp_target: Annotated[int, Field(ge=1, le=MAX_SPP_TARGET)] = 256
+    """Rays a pixel at which the picture counts as converged."""
+    bounces: Annotated[int, Field(ge=0, le=8)] = 1
+    """Indirect bounces; 0 is direct light with shadows only."""
+    channel: Channel = "final"
+
+
+class SettingsMessage(_Message):
+    type: Literal["settings"]
+    settings: Settings
+
+
+class VisibilityMessage(_Message):
+    """A hidden page gets no frames."""
+
+    type: Literal["visibility"]
+    visible: bool
+
+
+class PickMessage(_Message):
+    """What lies under a pixel of the newest frame."""
+
+    type: Literal["pick"]
+    id: Number
+    x: Annotated[float, Field(ge=0, le=1)]
+    """Share of the width from the left."""
+    y: Annotated[float, Field(ge=0, le=1)]
+    """Share of the height from the top."""
+
+
+ClientMessage = Annotated[
+    ClientHello | CameraMessage | EditMessage | UndoMessage | RedoMessage | AckMessage | SettingsMessage | VisibilityMessage | PickMessage,
+    Field(discriminator="type"),
+]
+client_message = TypeAdapter(ClientMessage)
+
+
+# ---- server to client ------------------------------------------------------------------------------------------------
+
+
+class StartView(_Answer):
+    """A camera that shows the whole object, for the first picture."""
+
+    world_from_camera: tuple[Row, Row, Row, Row]
+    fov_y_degrees: float
+
+
+class EditLog(_Answer):
+    """The session's edits. The same document answers REST calls."""
+
+    revision: Number
+    """Rises by one with every edit, undo and redo; never falls."""
+    edits: list[Edit]
+    """Those in force, in order."""
+    can_undo: bool
+    can_redo: bool
+
+
+class ServerHello(_Answer):
+    """Answer to `hello`, sent once the asset is loaded."""
+
+    type: Literal["hello"] = "hello"
+    v: int = PROTOCOL_VERSION
+    server: str
+    """Version of drgs."""
+    session: str
+    asset: str
+    minimum: Vector
+    """Bounds of the object at rest [world units]."""
+    maximum: Vector
+    start_view: StartView
+    log: EditLog
+    settings: Settings
+    """Those in force until the client sends its own."""
+    max_in_flight: int = MAX_FRAMES_IN_FLIGHT
+
+
+class StateMessage(_Answer):
+    """Sent to every viewer of a session after each change of its edit log."""
+
+    type: Literal["state"] = "state"
+    log: EditLog
+
+
+class AcceptedMessage(_Answer):
+    type: Literal["accepted"] = "accepted"
+    id: Number
+    revision: Number
+    """Of the log with this edit in it; the edit is on disk."""
+
+
+class RejectedMessage(_Answer):
+    type: Literal["rejected"] = "rejected"
+    id: Number
+    reason: str
+
+
+class StatusMessage(_Answer):
+    """For the corner of the picture; sent when the phase changes and with each frame, at most 5 a second."""
+
+    type: Literal["status"] = "status"
+    phase: Phase
+    width: int
+    """Of the pictures sent now."""
+    height: int
+    scale: float
+    """Share of the asked-for width; 1 unless moving."""
+    spp: int
+    spp_target: int
+    frames_per_second: float
+    render_ms: float
+    notes: list[str] = []
+    """What was skipped or reduced, and why."""
+
+
+class PickedMessage(_Answer):
+    type: Literal["picked"] = "picked"
+    id: Number
+    hit: bool
+    position: Vector | None = None
+    """World units."""
+    normal: Vector | None = None
+    albedo: Vector | None = None
+    roughness: float | None = None
+    metallic: float | None = None
+
+
+class ErrorMessage(_Answer):
+    """Something the client did, or the server could not do. The connection lives on unless `fatal`."""
+
+    type: Literal["error"] = "error"
+    message: str
+    fatal: bool = False
+
+
+ServerMessage = Annotated[
+    ServerHello | StateMessage | AcceptedMessage | RejectedMessage | StatusMessage | PickedMessage | ErrorMessage,
+    Field(discriminator="type"),
+]
+server_message = TypeAdapter(ServerMessage)
+
+
+# ---- binary frames ---------------------------------------------------------------------------------------------------
+
+FRAME_HEADER = struct.Struct("<BBHIIHHHHI")
+"""24 bytes, little-endian, then the picture file."""
+FRAME_KIND_PICTURE = 1
+CODEC_JPEG = 0
+CODEC_PNG = 1
+FLAG_MOVING = 1
+"""Reduced size or samples, because the viewer is changing something."""
+FLAG_CONVERGED = 2
+"""Last frame until something changes."""
+FLAG_ALPHA = 4
+CAMERA_NUMBER_SHIFT = 8
+"""Bits 8..15 of the flags hold the low 8 bits of the number of the camera shown."""
+
+
+@dataclass(frozen=True)
+class FrameHeader:
+    """Meaning of the 24 bytes before a picture."""
+
+    kind: int
+    codec: int
+    flags: int
+    frame_id: int
+    """Counts up from 1, a viewer."""
+    state_rev: int
+    """Revision of the edit log that the picture shows."""
+    width: int
+    height: int
+    spp: int
+    spp_target: int
+    render_us: int
+    """Time spent rendering since the last frame [microseconds]."""
+
+
+def pack_frame(header: FrameHeader, picture: bytes) -> bytes:
+    """Header and picture as one WebSocket message."""
+    return (
+        FRAME_HEADER.pack(
+            header.kind,
+            header.codec,
+            header.flags,
+            header.frame_id,
+            header.state_rev,
+            header.width,
+            header.height,
+            min(header.spp, 65535),
+            min(header.spp_target, 65535),
+            min(header.render_us, 2**32 - 1),
+        )
+        + picture
+    )
+
+
+def unpack_frame(message: bytes) -> tuple[FrameHeader, bytes]:
+    """Inverse of `pack_frame`.
+
+    Raises:
+        ValueError: the message is shorter than a header.
+    """
+    if len(message) < FRAME_HEADER.size:
+        raise ValueError(f"a frame has at least {FRAME_HEADER.size} bytes; found {len(message)}")
+    return FrameHeader(*FRAME_HEADER.unpack_from(message)), message[FRAME_HEADER.size :]

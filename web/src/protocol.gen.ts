@@ -1,0 +1,445 @@
+// Written by `python -m server.generate_types` from server/messages.py and server/rest_records.py. Do not edit.
+
+export const PROTOCOL_VERSION = 1;
+export const MAX_FRAMES_IN_FLIGHT = 2;
+export const CLOSE_VERSION_MISMATCH = 1002;
+export const MAX_SIDE = 4096;
+export const MAX_PIXELS = 4194304;
+export const FRAME_KIND_PICTURE = 1;
+export const CODEC_JPEG = 0;
+export const CODEC_PNG = 1;
+export const FLAG_MOVING = 1;
+export const FLAG_CONVERGED = 2;
+export const FLAG_ALPHA = 4;
+export const CAMERA_NUMBER_SHIFT = 8;
+
+/** The 24 little-endian bytes before each picture; see docs/protocol.md. */
+export interface FrameHeader {
+  kind: number;
+  codec: number;
+  flags: number;
+  frameId: number;
+  stateRev: number;
+  width: number;
+  height: number;
+  spp: number;
+  sppTarget: number;
+  renderMicroseconds: number;
+}
+
+export const FRAME_HEADER_BYTES = 24;
+
+export function readFrameHeader(buffer: ArrayBuffer): FrameHeader {
+  const view = new DataView(buffer, 0, FRAME_HEADER_BYTES);
+  return {
+    kind: view.getUint8(0),
+    codec: view.getUint8(1),
+    flags: view.getUint16(2, true),
+    frameId: view.getUint32(4, true),
+    stateRev: view.getUint32(8, true),
+    width: view.getUint16(12, true),
+    height: view.getUint16(14, true),
+    spp: view.getUint16(16, true),
+    sppTarget: view.getUint16(18, true),
+    renderMicroseconds: view.getUint32(20, true),
+  };
+}
+
+export interface AcceptedMessage {
+  type: "accepted";
+  id: number;
+  /** Of the log with this edit in it; the edit is on disk. */
+  revision: number;
+}
+
+/** This frame, and every one before it, has been shown or dropped. */
+export interface AckMessage {
+  type: "ack";
+  frame_id: number;
+}
+
+export interface AssetInfo {
+  id: string;
+  name: string;
+  created_at: string;
+  bytes: number;
+  /** build, upload or session. */
+  source: string;
+  /** 0 for an asset made from a mesh. */
+  surfel_count: number;
+  vertex_count: number;
+  face_count: number;
+  has_thumbnail: boolean;
+}
+
+export interface AssetList {
+  /** Newest first. */
+  assets: AssetInfo[];
+  total: number;
+}
+
+export interface BendMap {
+  type: "bend";
+  curvature: number;
+}
+
+export interface Box {
+  minimum: [number, number, number];
+  maximum: [number, number, number];
+  falloff?: number;
+}
+
+/** A build of a capture that the server can already see. A zip is uploaded as multipart instead, with the same fields. */
+export interface BuildRequest {
+  /** `sample` for the bundled capture, or a folder below a root that was allowed when the server started. */
+  dataset: string;
+  /** Of the asset; the folder's name when absent. */
+  name?: string | null;
+  preset?: "draft" | "fast" | "full";
+  seed?: number;
+}
+
+/** Where this viewer looks from. Latest wins: a newer one replaces one that was not rendered yet. */
+export interface CameraMessage {
+  type: "camera";
+  /** Chosen by the client; a frame carries the low 8 bits of the number of the camera that it shows. */
+  number?: number;
+  /** OpenGL camera-to-world, rows: the camera looks down -z, y up. World is right-handed, z up. */
+  world_from_camera: [[number, number, number, number], [number, number, number, number], [number, number, number, number], [number, number, number, number]];
+  fov_y_degrees: number;
+  /** Pixels of the picture at rest; while moving the server may send fewer. */
+  width: number;
+  height: number;
+}
+
+/** First message of a client; nothing else is answered before it. */
+export interface ClientHello {
+  type: "hello";
+  /** PROTOCOL_VERSION of the client. */
+  v: number;
+  /** What the client can decode. With png, the converged frame is lossless (and keeps alpha). */
+  codecs?: ("jpeg" | "png")[];
+  /** Name of the program, for logs. */
+  client?: string;
+}
+
+export interface DeformEdit {
+  op: "deform";
+  map?: TwistMap | BendMap | StretchMap | LatticeMap | null;
+  vertices?: string | null;
+}
+
+/** The session's edits. The same document answers REST calls. */
+export interface EditLog {
+  /** Rises by one with every edit, undo and redo; never falls. */
+  revision: number;
+  /** Those in force, in order. */
+  edits: Edit[];
+  can_undo: boolean;
+  can_redo: boolean;
+}
+
+/** Append an edit to the session's log. Applied in order, never dropped, answered by `accepted` or `rejected`. */
+export interface EditMessage {
+  type: "edit";
+  /** Chosen by the client; the answer repeats it. */
+  id: number;
+  edit: Edit;
+  /** Edits of one slider drag share a key: an edit replaces the last one when keys match and they are < 500 ms apart. */
+  coalesce?: string | null;
+}
+
+export interface EditRequest {
+  edit: Edit;
+}
+
+export interface EnvironmentEdit {
+  op: "environment";
+  file?: string | null;
+  rotation?: number;
+  intensity?: number;
+}
+
+export interface EnvironmentInfo {
+  /** What an environment edit's `file` says. */
+  name: string;
+  title: string;
+  width: number;
+  height: number;
+}
+
+export interface EnvironmentList {
+  environments: EnvironmentInfo[];
+}
+
+/** Something the client did, or the server could not do. The connection lives on unless `fatal`. */
+export interface ErrorMessage {
+  type: "error";
+  message: string;
+  fatal: boolean;
+}
+
+export interface JobInfo {
+  id: string;
+  kind: "build";
+  name: string;
+  preset: string;
+  state: "queued" | "running" | "stalled" | "done" | "failed" | "cancelled" | "unknown";
+  created_at: string;
+  finished_at: string | null;
+  /** Of the build; empty before it starts. */
+  stage: string;
+  iteration: number;
+  iterations: number;
+  /** Of the whole job, 0..1. */
+  fraction: number;
+  psnr: number | null;
+  eta_seconds: number | null;
+  message: string;
+  /** How often the work was started: 1 unless a worker died or it was retried. */
+  attempts: number;
+  /** Set when done. */
+  asset_id: string | null;
+  /** A sentence, when failed. */
+  error: string | null;
+  /** Rises with each new preview picture; 0 while there is none. Use it to get round the browser's cache. */
+  preview_version: number;
+}
+
+export interface JobList {
+  /** Newest first. */
+  jobs: JobInfo[];
+  total: number;
+  workers_alive: number;
+}
+
+export interface LatticeMap {
+  type: "lattice";
+  minimum: [number, number, number];
+  maximum: [number, number, number];
+  control_points: [number, number, number][][][];
+}
+
+export interface MaterialEdit {
+  op: "material";
+  select: Selection;
+  set: MaterialValues;
+  mode?: "absolute" | "multiply";
+}
+
+/** Absolute: the new values, 0..1. Multiply: factors. */
+export interface MaterialValues {
+  albedo?: [number, number, number] | null;
+  roughness?: number | null;
+  metallic?: number | null;
+}
+
+/** What lies under a pixel of the newest frame. */
+export interface PickMessage {
+  type: "pick";
+  id: number;
+  /** Share of the width from the left. */
+  x: number;
+  /** Share of the height from the top. */
+  y: number;
+}
+
+export interface PickedMessage {
+  type: "picked";
+  id: number;
+  hit: boolean;
+  /** World units. */
+  position: [number, number, number] | null;
+  normal: [number, number, number] | null;
+  albedo: [number, number, number] | null;
+  roughness: number | null;
+  metallic: number | null;
+}
+
+export interface PoseEdit {
+  op: "pose";
+  clip: string;
+  time: number;
+}
+
+/** RFC 9457 problem details; `detail` is a sentence a user can act on. */
+export interface Problem {
+  type: string;
+  title: string;
+  status: number;
+  detail: string;
+}
+
+export interface RedoMessage {
+  type: "redo";
+  id: number;
+}
+
+export interface RejectedMessage {
+  type: "rejected";
+  id: number;
+  reason: string;
+}
+
+/** Exactly one field is set. */
+export interface Selection {
+  all?: boolean | null;
+  sphere?: Sphere | null;
+  box?: Box | null;
+  region?: number | null;
+  similar?: Similar | null;
+  vertex_weights?: number[] | null;
+}
+
+/** Answer to `hello`, sent once the asset is loaded. */
+export interface ServerHello {
+  type: "hello";
+  v: number;
+  /** Version of drgs. */
+  server: string;
+  session: string;
+  asset: string;
+  /** Bounds of the object at rest [world units]. */
+  minimum: [number, number, number];
+  maximum: [number, number, number];
+  start_view: StartView;
+  log: EditLog;
+  /** Those in force until the client sends its own. */
+  settings: Settings;
+  max_in_flight: number;
+}
+
+export interface SessionInfo {
+  id: string;
+  asset: string;
+  asset_name: string;
+  created_at: string;
+  revision: number;
+  edits: Edit[];
+  can_undo: boolean;
+  can_redo: boolean;
+  viewers: number;
+}
+
+export interface SessionList {
+  sessions: SessionInfo[];
+}
+
+export interface SessionRequest {
+  asset: string;
+}
+
+/** How this viewer sees the session; each viewer has its own. */
+export interface Settings {
+  exposure_stops?: number;
+  /** A triple is a colour, sRGB 0..1. Transparent arrives as PNG with alpha once converged and over grey while JPEG. */
+  background?: "environment" | "transparent" | [number, number, number];
+  /** Rays a pixel at which the picture counts as converged. */
+  spp_target?: number;
+  /** Indirect bounces; 0 is direct light with shadows only. */
+  bounces?: number;
+  channel?: "final" | "albedo" | "roughness" | "metallic" | "normal" | "depth";
+}
+
+export interface SettingsMessage {
+  type: "settings";
+  settings: Settings;
+}
+
+export interface Similar {
+  point: [number, number, number];
+  tolerance?: number;
+}
+
+export interface SimulateEdit {
+  op: "simulate";
+  scene: Record<string, unknown>;
+  time: number;
+}
+
+export interface Sphere {
+  center: [number, number, number];
+  radius: number;
+  falloff?: number;
+}
+
+/** A camera that shows the whole object, for the first picture. */
+export interface StartView {
+  world_from_camera: [[number, number, number, number], [number, number, number, number], [number, number, number, number], [number, number, number, number]];
+  fov_y_degrees: number;
+}
+
+/** Sent to every viewer of a session after each change of its edit log. */
+export interface StateMessage {
+  type: "state";
+  log: EditLog;
+}
+
+/** For the corner of the picture; sent when the phase changes and with each frame, at most 5 a second. */
+export interface StatusMessage {
+  type: "status";
+  phase: "loading" | "moving" | "still" | "converged" | "paused";
+  /** Of the pictures sent now. */
+  width: number;
+  height: number;
+  /** Share of the asked-for width; 1 unless moving. */
+  scale: number;
+  spp: number;
+  spp_target: number;
+  frames_per_second: number;
+  render_ms: number;
+  /** What was skipped or reduced, and why. */
+  notes: string[];
+}
+
+export interface StretchMap {
+  type: "stretch";
+  factor: number;
+}
+
+export interface TokenRequest {
+  token: string;
+}
+
+export interface TwistMap {
+  type: "twist";
+  rate: number;
+}
+
+export interface UndoMessage {
+  type: "undo";
+  id: number;
+}
+
+/** A hidden page gets no frames. */
+export interface VisibilityMessage {
+  type: "visibility";
+  visible: boolean;
+}
+
+export type ClientMessage =
+  | ClientHello
+  | CameraMessage
+  | EditMessage
+  | UndoMessage
+  | RedoMessage
+  | AckMessage
+  | SettingsMessage
+  | VisibilityMessage
+  | PickMessage;
+
+export type ServerMessage =
+  | ServerHello
+  | StateMessage
+  | AcceptedMessage
+  | RejectedMessage
+  | StatusMessage
+  | PickedMessage
+  | ErrorMessage;
+
+export type Edit =
+  | MaterialEdit
+  | EnvironmentEdit
+  | DeformEdit
+  | PoseEdit
+  | SimulateEdit;
