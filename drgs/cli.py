@@ -1,0 +1,301 @@
+"""The command line: `drgs build · render · import · export · simulate · eval · doctor · serve · worker · bench`.
+
+Each command reads its arguments, calls one function of the library and prints. Heavy modules are imported inside the commands, so
+that `drgs --help` answers at once. Wrong input ends with one sentence on stderr and exit code 2, Ctrl-C with 130; DRGS_TRACEBACK=1
+shows where a sentence came from. With --json stdout holds one JSON document and nothing else.
+"""
+
+import json
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+
+class _Commands(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; turn what a user can cause into one sentence and an exit code."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            print("drgs: stopped by Ctrl-C", file=sys.stderr)
+            raise typer.Exit(130) from None
+        except BrokenPipeError:
+            raise  # the reader of our pipe has gone: typer ends quietly
+        except (ValueError, OSError) as error:
+            if os.environ.get("DRGS_TRACEBACK"):
+                raise
+            print(f"drgs: {' '.join(str(error).split())}", file=sys.stderr)
+            raise typer.Exit(2) from None
+
+
+app = typer.Typer(cls=_Commands, add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+class Preset(StrEnum):
+    draft = "draft"
+    fast = "fast"
+    full = "full"
+
+
+class BindingKind(StrEnum):
+    particles = "particles"
+    mesh = "mesh"
+
+
+class DeviceName(StrEnum):
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+class Primary(StrEnum):
+    gaussians = "gaussians"
+    mesh = "mesh"
+
+
+class Denoiser(StrEnum):
+    none = "none"
+    svgf = "svgf"
+    oidn = "oidn"
+
+
+class ExportFormat(StrEnum):
+    ply = "ply"
+    ply3 = "ply3"
+    glb = "glb"
+    usd = "usd"
+    env = "env"
+
+
+AssetPath = Annotated[Path, typer.Argument(metavar="ASSET", help="Asset folder, or the same zipped.")]
+DatasetPath = Annotated[Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP or NeRO folder.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
+DataFolder = Annotated[Path, typer.Option("--data", help="Folder of assets, jobs and the token.")]
+
+
+@app.callback()
+def about() -> None:
+    """Relightable, deformable, editable 2D Gaussians: photos in, an asset out."""
+
+
+@app.command()
+def build(
+    dataset: DatasetPath,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Asset folder to write.")],
+    preset: Annotated[Preset, typer.Option(help="How much time to spend.")] = Preset.fast,
+    binding: Annotated[BindingKind, typer.Option(help="What carries the Gaussians when the object deforms.")] = BindingKind.particles,
+    device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
+    seed: Annotated[int, typer.Option()] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint that a stopped build left.")] = False,
+    json_progress: Annotated[bool, typer.Option("--json-progress", help="Print one JSON line for each progress report on stdout.")] = False,
+) -> None:
+    """Build an asset from posed photographs."""
+    from drgs.build.build_asset import BuildSettings, BuildStopped, build_asset
+    from drgs.cli_progress import StopOnInterrupt, build_progress
+
+    settings = BuildSettings(preset=preset.value, binding=binding.value, device=device.value, seed=seed, resume=resume)
+    with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
+        try:
+            asset = build_asset(dataset, out, settings, progress=report, should_stop=interrupt.is_set)
+        except BuildStopped:
+            print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value} --resume", file=sys.stderr)
+            raise typer.Exit(130) from None
+    if json_progress:
+        print(json.dumps({"stage": "done", "fraction": 1.0, "asset": str(out), "provenance": asset.provenance}), flush=True)
+    else:
+        print(f"Asset written to {out}: {len(asset.mesh.faces)} faces. Look at it with: drgs serve", file=sys.stderr)
+
+
+@app.command()
+def render(
+    asset: AssetPath,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the pictures, one for each camera.")],
+    cameras: Annotated[Path, typer.Option(help="transforms.json with the cameras.")],
+    env: Annotated[Path | None, typer.Option(help="Environment (EXR or HDR) instead of the recovered one.")] = None,
+    env_rotation: Annotated[float, typer.Option(help="Degrees, counter-clockwise seen from above.")] = 0.0,
+    edits: Annotated[Path | None, typer.Option(help="Edits (JSON), applied in order.")] = None,
+    spp: Annotated[int, typer.Option(min=1, help="Rays a pixel.")] = 256,
+    bounces: Annotated[int, typer.Option(min=0, help="Indirect bounces.")] = 1,
+    primary: Annotated[Primary | None, typer.Option(help="What the camera sees; by default the Gaussians where there are some.")] = None,
+    denoise: Annotated[Denoiser, typer.Option()] = Denoiser.none,
+    aov: Annotated[bool, typer.Option("--aov", help="Write <name>.exr with the maps behind the picture, too.")] = False,
+    seed: Annotated[int, typer.Option()] = 0,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Picture size instead of the file's.")] = None,
+    device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
+    explain: Annotated[bool, typer.Option("--explain", help="Say what was left out of the work, and why.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Render an asset from the cameras of a file: <name>.png (RGBA, straight alpha, sRGB), and maps with --aov."""
+    from drgs.build.load_views import load_cameras
+    from drgs.cli_progress import frame_progress
+    from drgs.render.render_cameras import render_cameras
+    from drgs.render.render_frame import RenderSettings
+    from drgs.scene.edits import EnvironmentEdit, load_edits
+
+    changes = load_edits(edits) if edits else []
+    if env or env_rotation:
+        changes.append(EnvironmentEdit(op="environment", file=str(env.resolve()) if env else None, rotation=env_rotation))
+    views = load_cameras(cameras, _size(size))
+    scene = _pose(asset, changes, edits.parent if edits else Path(), device.value)
+    settings = RenderSettings(
+        samples_per_pixel=spp,
+        bounces=bounces,
+        primary=primary.value if primary else ("gaussians" if scene.surfels is not None else "mesh"),
+        denoise=denoise.value,
+        seed=seed,
+    )
+    with frame_progress("Rendering", len(views)) as advance:
+        frames = render_cameras(scene, views, out, settings, aov=aov, done=advance)
+    if as_json:
+        print(json.dumps({"out": str(out), "frames": frames}))
+    elif explain:
+        for frame in frames:
+            print(json.dumps(frame, indent=1))
+
+
+@app.command("import")
+def import_(
+    mesh: Annotated[Path, typer.Argument(metavar="MESH", help="glb, obj, or ply with vertex materials.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Asset folder to write.")],
+) -> None:
+    """Make an asset of a mesh, without training."""
+    from drgs.build.import_mesh import import_mesh
+    from drgs.scene.asset import save_asset
+
+    save_asset(import_mesh(mesh), out)
+    print(f"Asset written to {out}", file=sys.stderr)
+
+
+@app.command()
+def export(
+    asset: AssetPath,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write.")],
+    format: Annotated[ExportFormat, typer.Option(help="ply: 2D Gaussians; glb: textured mesh; env: the light as EXR.")],
+) -> None:
+    """Write an asset as a file that other programs read."""
+    from drgs.build.export_asset import export_asset
+    from drgs.scene.asset import load_asset
+
+    export_asset(load_asset(asset), out, format.value)
+    print(f"Wrote {out}", file=sys.stderr)
+
+
+@app.command()
+def simulate(
+    asset: AssetPath,
+    out: Annotated[Path, typer.Argument(metavar="OUT")],
+    scene: Annotated[Path, typer.Option(help="Simulation scene (JSON).")],
+) -> None:
+    """Drop, squash and shake an asset (not in this version)."""
+    raise ValueError("simulate: this version has no simulation; deform an asset with drgs render --edits and a 'deform' edit")
+
+
+@app.command("eval")
+def eval_(
+    asset: AssetPath,
+    dataset: Annotated[
+        Path,
+        typer.Argument(metavar="DATASET", help="Folder with transforms_test.json; truth for maps, light, shape is used where it is there."),
+    ],
+    out: Annotated[Path | None, typer.Option(help="Keep the rendered pictures in this folder.")] = None,
+    spp: Annotated[int, typer.Option(min=1, help="Rays a pixel.")] = 256,
+    seed: Annotated[int, typer.Option()] = 0,
+    device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
+    as_json: Json = False,
+) -> None:
+    """Render an asset's test views and score them against the truth."""
+    from drgs.build.evaluate_asset import EvaluationSettings, evaluate_asset
+    from drgs.cli_progress import frame_progress
+    from drgs.scene.asset import load_asset
+
+    with frame_progress("Evaluating", None) as advance:
+        figures = evaluate_asset(
+            load_asset(asset), dataset, out, EvaluationSettings(samples_per_pixel=spp, seed=seed, device=device.value), done=advance
+        )
+    _print_document(figures, as_json)
+
+
+@app.command()
+def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
+    """Check a capture before time is spent on it."""
+    from drgs.build.doctor import doctor as examine
+
+    _print_document(examine(dataset), as_json)
+
+
+@app.command()
+def serve(
+    data: DataFolder = Path("data"),
+    host: Annotated[str, typer.Option()] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8000,
+) -> None:
+    """Start the server and a worker for its jobs; prints the address to open."""
+    from server.run import serve as run_server
+
+    run_server(data, host=host, port=port)
+
+
+@app.command()
+def worker(data: DataFolder = Path("data")) -> None:
+    """Run queued builds without serving pages, for example on another machine."""
+    from worker.run import run_worker
+
+    run_worker(data)
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def bench(context: typer.Context, name: Annotated[str, typer.Argument(metavar="NAME", help="rasterize, build, ...")]) -> None:
+    """Run a benchmark; the arguments are those of `python -m benchmarks NAME`."""
+    try:
+        from benchmarks.__main__ import main as run_benchmark
+    except ModuleNotFoundError as error:
+        raise ValueError("bench: the benchmarks are in the repository, not in the installed package; run this from a checkout") from error
+
+    run_benchmark([name, *context.args])
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """(width, height) of '400x300'."""
+    if text is None:
+        return None
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+        raise ValueError(f"--size is {text!r}; expected WIDTHxHEIGHT in pixels, like 400x300")
+    return int(width), int(height)
+
+
+def _pose(asset_path: Path, edits: list, base_directory: Path, device_name: str) -> Any:
+    from drgs.deform.pose_scene import pose_scene
+    from drgs.scene.asset import load_asset
+
+    return pose_scene(load_asset(asset_path), edits, base_directory)
+
+
+def _print_document(document: dict, as_json: bool) -> None:
+    """One JSON document, or the same as lines 'name value'."""
+    if as_json:
+        print(json.dumps(document))
+        return
+
+    def show(value: Any, name: str) -> None:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                show(inner, f"{name}.{key}" if name else str(key))
+        else:
+            print(f"{name:40s} {value:.4f}" if isinstance(value, float) else f"{name:40s} {value}")
+
+    show(document, "")
+
+
+def main() -> None:
+    """Entry point of the `drgs` command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()
