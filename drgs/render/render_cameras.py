@@ -1,0 +1,64 @@
+"""Render a scene from several cameras into a folder: <name>.png (RGBA, straight alpha, sRGB) and, if asked, <name>.exr with the maps."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+from drgs.exchange.exr import encode_maps
+from drgs.render.records import Frame
+from drgs.render.render_frame import RenderSettings, render_frame
+from drgs.scene.camera import Camera
+from drgs.scene.posed_scene import PosedScene
+
+
+def render_cameras(
+    scene: PosedScene,
+    cameras: Iterable[Camera],
+    out: Path,
+    settings: RenderSettings,
+    aov: bool = False,
+    done: Callable[[str], None] = lambda name: None,
+) -> list[dict]:
+    """One picture a camera, named after it.
+
+    Args:
+        done: called with the name of each finished picture.
+
+    Returns:
+        For each camera its name and the frame's metadata (samples, seconds per step, what was skipped and why).
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    device = scene.mesh.vertices.device
+    report = []
+    for camera in cameras:
+        frame = render_frame(scene, camera.to(device), settings)
+        write_png(frame, out / f"{camera.name}.png")
+        if aov:
+            (out / f"{camera.name}.exr").write_bytes(maps_of_frame(frame))
+        report.append({"name": camera.name, **frame.metadata})
+        done(camera.name)
+    return report
+
+
+def write_png(frame: Frame, path: Path) -> None:
+    """8-bit RGBA, straight alpha, sRGB."""
+    pixels = (frame.rgba_srgb.clamp(0, 1) * 255).round().to(torch.uint8)
+    Image.fromarray(pixels.cpu().numpy()).save(path)
+
+
+def maps_of_frame(frame: Frame) -> bytes:
+    """The EXR of `drgs render --aov`."""
+    maps = frame.gbuffer
+    tensors = (
+        frame.radiance_linear,
+        maps.coverage,
+        maps.albedo,
+        maps.normal_world,
+        maps.depth,
+        maps.roughness,
+        maps.metallic,
+        frame.radiance.visibility,
+    )
+    return encode_maps(*(tensor.cpu().numpy() for tensor in tensors))
