@@ -1,15 +1,40 @@
-"""An asset: the relightable object at rest, and what it was made from."""
+"""An asset: the relightable object at rest, and what it was made from; a folder or zip on disk (design: Asset)."""
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 
+import numpy as np
+import safetensors.numpy
+import torch
+from torch import Tensor
+
+from drgs.exchange.exr import decode_environment, encode_environment
+from drgs.exchange.gaussian_ply import decode_gaussian_ply, encode_gaussian_ply
+from drgs.exchange.glb import GlbMesh, decode_glb, encode_glb
+from drgs.exchange.package import read_package, write_package
+from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.scene.binding import Binding
-from drgs.scene.camera import Camera
+from drgs.scene.camera import Camera, opengl_from_camera
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 
 SCHEMA_VERSION = 1
 """Of the asset folder; a reader refuses a larger one."""
+
+CONVENTIONS = {
+    "world": "right-handed, z up",
+    "mesh": "vertex buffers are z up, in world units; the node's matrix turns them to glTF's y up and metres",
+    "cameras": "transform_matrix is OpenGL camera-to-world; camera_from_world is OpenCV; pixel centres at +0.5",
+    "quaternions": "wxyz",
+    "colour": "linear Rec.709",
+    "environment": "lat-long; texel (u, v) holds radiance from d with u = 0.5 - atan2(d_y, d_x) / 2 pi, v = acos(d_z) / pi",
+    "brdf": "metallic-roughness, GGX with alpha = roughness^2",
+}
+_FILES = ("gaussians.ply", "mesh.glb", "binding.safetensors", "environment.exr", "cameras.json")
+_REQUIRED = ("mesh.glb", "environment.exr", "cameras.json")
+THUMBNAIL = "thumb.jpg"
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,3 +52,139 @@ class Asset:
     meters_per_unit: float = 1.0
     provenance: dict = field(default_factory=dict)
     """Plain JSON: source, preset, seed, versions, seconds per stage, quality."""
+
+
+def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = None) -> None:
+    """Write a folder, or a zip if the path ends in .zip, atomically; float32 arrays are kept bit for bit.
+
+    Raises:
+        ValueError: a value is not finite, an index points nowhere, or the path is taken by something that is no asset.
+    """
+    _check(asset, "the asset")
+    mesh = asset.mesh
+    files: dict[str, bytes] = {}
+    if asset.gaussians is not None:
+        normals = rotation_from_quat_wxyz(asset.gaussians.quats_wxyz)[..., 2]
+        note = "spherical harmonics: linear radiance under the light of environment.exr"
+        files["gaussians.ply"] = encode_gaussian_ply(_arrays(asset.gaussians), _array(normals), comments=(note,))
+    albedo, roughness, metallic = _array(mesh.albedo), _array(mesh.roughness), _array(mesh.metallic)
+    # COLOR_0 is the albedo again (one buffer), so that any glTF viewer shows the colours.
+    attributes = {"POSITION": _array(mesh.vertices), "NORMAL": _array(mesh.normals), "COLOR_0": albedo}
+    attributes |= {"_ALBEDO": albedo, "_ROUGHNESS": roughness, "_METALLIC": metallic}
+    means = {"roughnessFactor": min(max(float(roughness.mean()), 0), 1), "metallicFactor": min(max(float(metallic.mean()), 0), 1)}
+    files["mesh.glb"] = encode_glb(GlbMesh(attributes, _array(mesh.faces), means), asset.meters_per_unit)
+    if asset.binding is not None:
+        files["binding.safetensors"] = safetensors.numpy.save(_arrays(asset.binding))
+    files["environment.exr"] = encode_environment(_array(asset.environment.radiance))
+    files["cameras.json"] = json.dumps({"camera_model": "PINHOLE", "frames": [_camera_json(c) for c in asset.cameras]}, indent=1).encode()
+    if thumbnail_jpeg is not None:
+        files[THUMBNAIL] = thumbnail_jpeg
+    surfels = 0 if asset.gaussians is None else len(asset.gaussians.centers)
+    manifest = {
+        "format": "drgs asset",
+        "schema_version": SCHEMA_VERSION,
+        "meters_per_unit": asset.meters_per_unit,
+        "conventions": CONVENTIONS,
+        "counts": {"surfels": surfels, "vertices": len(mesh.vertices), "faces": len(mesh.faces), "cameras": len(asset.cameras)},
+        "provenance": asset.provenance,
+    }
+    write_package(Path(path), manifest, files)
+
+
+def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
+    """Read what `save_asset` wrote.
+
+    Raises:
+        ValueError: one sentence: no asset, a newer schema, an unsafe zip, or a missing, truncated, changed or non-finite file.
+    """
+    path = Path(path)
+    manifest, files = read_package(path, _FILES, _REQUIRED, SCHEMA_VERSION)
+    gaussians = binding = None
+    if "gaussians.ply" in files:
+        arrays = decode_gaussian_ply(files["gaussians.ply"], f"{path}: gaussians.ply")
+        gaussians = Gaussians(**{key: torch.from_numpy(np.ascontiguousarray(values)).to(device) for key, values in arrays.items()})
+    glb = decode_glb(files["mesh.glb"], f"{path}: mesh.glb")
+    names = {"vertices": "POSITION", "normals": "NORMAL", "albedo": "_ALBEDO", "roughness": "_ROUGHNESS", "metallic": "_METALLIC"}
+    missing = [name for name in names.values() if name not in glb.attributes]
+    if missing:
+        raise ValueError(f"{path}: mesh.glb lacks the vertex attribute {missing[0]}")
+    tensors = {key: torch.from_numpy(glb.attributes[name]).to(device) for key, name in names.items()}
+    mesh = TriangleMesh(faces=torch.from_numpy(glb.faces).to(device), **tensors)
+    if "binding.safetensors" in files:
+        binding = _read_binding(files["binding.safetensors"], path, device)
+    radiance = decode_environment(files["environment.exr"], f"{path}: environment.exr", clamp_negative=False)
+    cameras = _read_cameras(files["cameras.json"], path, device)
+    meters, provenance = manifest.get("meters_per_unit"), manifest.get("provenance", {})
+    if not isinstance(meters, float | int) or not 0 < meters < float("inf") or not isinstance(provenance, dict):
+        raise ValueError(f"{path}: asset.json has meters_per_unit {meters!r}; expected a positive number")
+    asset = Asset(gaussians, mesh, binding, Environment(torch.from_numpy(radiance).to(device)), cameras, float(meters), provenance)
+    _check(asset, str(path))
+    return asset
+
+
+def _check(asset: Asset, name: str) -> None:
+    """What must hold of an asset on either side of a file: finite numbers, equal counts, indices that exist."""
+    mesh, binding, gaussians = asset.mesh, asset.binding, asset.gaussians
+    for record in (gaussians, mesh, binding, asset.environment, *asset.cameras):
+        for entry in fields(record) if record is not None else ():
+            value = getattr(record, entry.name)
+            if isinstance(value, Tensor) and not torch.isfinite(value).all():
+                count = int((~torch.isfinite(value)).sum())
+                raise ValueError(f"{name}: {type(record).__name__}.{entry.name} holds {count} values that are not finite")
+    vertices, faces = len(mesh.vertices), mesh.faces
+    if faces.numel() == 0 or int(faces.min()) < 0 or int(faces.max()) >= vertices:
+        raise ValueError(f"{name}: the mesh has no faces, or a face names a vertex that does not exist ({vertices} vertices)")
+    if any(len(values) != vertices for values in (mesh.normals, mesh.albedo, mesh.roughness, mesh.metallic)):
+        raise ValueError(f"{name}: the mesh's vertex attributes differ in length ({vertices} vertices)")
+    if binding is not None:
+        if gaussians is None or len(binding.face) != len(gaussians.centers):
+            found = 0 if gaussians is None else len(gaussians.centers)
+            raise ValueError(f"{name}: the binding is of {len(binding.face)} surfels, there are {found}")
+        if len(binding.face) and (int(binding.face.min()) < 0 or int(binding.face.max()) >= len(faces)):
+            raise ValueError(f"{name}: the binding names a face that does not exist ({len(faces)} faces)")
+
+
+def _read_binding(data: bytes, path: Path, device: torch.device | str) -> Binding:
+    try:
+        arrays = safetensors.numpy.load(data)
+        face, barycentric, offset = arrays["face"], arrays["barycentric"], arrays["normal_offset"]
+    except (safetensors.SafetensorError, KeyError) as error:
+        raise ValueError(f"{path}: binding.safetensors is damaged ({error})") from error
+    if face.dtype != np.int32 or face.ndim != 1 or barycentric.shape != (len(face), 3) or offset.shape != (len(face),):
+        raise ValueError(f"{path}: binding.safetensors holds arrays of the wrong shape")
+    return Binding(*(torch.from_numpy(values.copy()).to(device) for values in (face, barycentric, offset)))
+
+
+def _camera_json(camera: Camera) -> dict:
+    """A frame as nerfstudio spells it, and beside it the exact matrices (float32 values survive JSON's decimals)."""
+    k = camera.intrinsics
+    return {
+        "file_path": camera.name,
+        "fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]), "cx": float(k[0, 2]), "cy": float(k[1, 2]),
+        "w": camera.width, "h": camera.height,
+        "transform_matrix": opengl_from_camera(camera.to("cpu")).tolist(),
+        "camera_from_world": camera.camera_from_world.tolist(),
+        "intrinsics": k.tolist(),
+    }  # fmt: skip
+
+
+def _read_cameras(data: bytes, path: Path, device: torch.device | str) -> tuple[Camera, ...]:
+    try:
+        frames = json.loads(data)["frames"]
+        cameras = []
+        for frame in frames:
+            matrices = [torch.tensor(frame[key], dtype=torch.float32, device=device) for key in ("camera_from_world", "intrinsics")]
+            if matrices[0].shape != (4, 4) or matrices[1].shape != (3, 3):
+                raise ValueError("a matrix has the wrong shape")
+            cameras.append(Camera(*matrices, int(frame["w"]), int(frame["h"]), str(frame["file_path"])))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: cameras.json is damaged ({error!r})") from error
+    return tuple(cameras)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().contiguous().numpy()
+
+
+def _arrays(record: Gaussians | Binding) -> dict[str, np.ndarray]:
+    return {entry.name: _array(getattr(record, entry.name)) for entry in fields(record)}

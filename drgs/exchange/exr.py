@@ -1,0 +1,185 @@
+"""Pictures of linear radiance: lat-long environments (EXR and Radiance HDR) and rendered maps (EXR).
+
+In and out: (height, width, channel) float32 numpy arrays. Which direction a texel belongs to is scene.environment's business.
+Files come from strangers, so sizes are checked before pixels are decoded.
+Source: OpenEXR 3; Ward 1991, "Real Pixels" and the Radiance file format notes for RGBE and its run lengths.
+"""
+
+import io
+import warnings
+
+import numpy as np
+import OpenEXR
+
+MAX_WIDTH = 16384
+MAX_HEIGHT = 8192
+
+
+def decode_environment(data: bytes, name: str = "environment", clamp_negative: bool = True) -> np.ndarray:
+    """(height, width = 2 height, 3) linear radiance of an EXR or Radiance HDR file.
+
+    Args:
+        clamp_negative: set negative values (a resampling filter's ringing) to 0, with a warning.
+
+    Raises:
+        ValueError: damaged, not 2:1, too large, without R, G and B, or a value is not finite.
+    """
+    if data[:4] == b"\x76\x2f\x31\x01":
+        radiance = _decode_exr_rgb(data, name)
+    elif data[:2] == b"#?":
+        radiance = decode_hdr(data, name)
+    else:
+        raise ValueError(f"{name}: is neither an OpenEXR nor a Radiance HDR file")
+    height, width, _ = radiance.shape
+    if width != 2 * height or height < 2:
+        raise ValueError(f"{name}: is {width}x{height}; expected a lat-long environment twice as wide as high")
+    if not np.isfinite(radiance).all():
+        raise ValueError(f"{name}: holds {int((~np.isfinite(radiance)).sum())} values that are not finite")
+    negative = int((radiance < 0).sum())
+    if negative and clamp_negative:
+        warnings.warn(f"{name}: {negative} negative values were set to 0", stacklevel=2)
+        radiance = np.maximum(radiance, 0)
+    return radiance
+
+
+def encode_environment(radiance: np.ndarray) -> bytes:
+    """Bytes of a ZIP-compressed float32 EXR of (height, width, 3)."""
+    return encode_exr({channel: radiance[..., k] for k, channel in enumerate("RGB")})
+
+
+def encode_exr(channels: dict[str, np.ndarray]) -> bytes:
+    """Bytes of a ZIP-compressed float32 EXR of (height, width) channels."""
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    stream = io.BytesIO()
+    OpenEXR.File(header, {key: np.ascontiguousarray(values, np.float32) for key, values in channels.items()}).write(stream)
+    return stream.getvalue()
+
+
+def encode_maps(
+    radiance: np.ndarray,
+    coverage: np.ndarray,
+    albedo: np.ndarray,
+    normal_world: np.ndarray,
+    depth: np.ndarray,
+    roughness: np.ndarray,
+    metallic: np.ndarray,
+    visibility: np.ndarray,
+) -> bytes:
+    """Bytes of the EXR that `drgs render --aov` writes: channels R G B A albedo.* normal.* depth.Z roughness.Y metallic.Y visibility.Y.
+
+    Colours are (height, width, 3), the rest (height, width). Where coverage is 0 the other maps mean nothing and are written as 0,
+    depth as +inf.
+    """
+    nothing = coverage <= 0
+    channels = {key: radiance[..., k] for k, key in enumerate("RGB")} | {"A": coverage}
+    channels |= {f"albedo.{key}": albedo[..., k] for k, key in enumerate("RGB")}
+    channels |= {f"normal.{key}": normal_world[..., k] for k, key in enumerate("XYZ")}
+    channels |= {"depth.Z": depth, "roughness.Y": roughness, "metallic.Y": metallic, "visibility.Y": visibility}
+    empty = dict.fromkeys(channels, 0.0) | {"depth.Z": np.inf}
+    return encode_exr({key: np.where(nothing, np.float32(empty[key]), values) for key, values in channels.items()})
+
+
+def decode_exr(data: bytes, name: str = "EXR") -> dict[str, np.ndarray]:
+    """Channel name -> (height, width) float32.
+
+    Raises:
+        ValueError: damaged, too large, deep, of several parts, or with subsampled channels.
+    """
+    try:
+        with OpenEXR.File(io.BytesIO(data), separate_channels=True, header_only=True) as head:
+            parts, window = len(head.parts), head.header()["dataWindow"]
+            kind, channels = head.header()["type"], head.header()["channels"]
+        width, height = (int(window[1][k]) - int(window[0][k]) + 1 for k in (0, 1))
+        if not (0 < width <= MAX_WIDTH and 0 < height <= MAX_HEIGHT):
+            raise ValueError(f"{name}: is {width}x{height}; the limit is {MAX_WIDTH}x{MAX_HEIGHT}")
+        if (
+            parts != 1
+            or kind not in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
+            or any(c.xSampling != 1 or c.ySampling != 1 for c in channels)
+        ):
+            raise ValueError(f"{name}: has {parts} parts, deep data or subsampled channels; expected one flat picture")
+        with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
+            pixels = {key: np.asarray(channel.pixels).astype(np.float32) for key, channel in file.channels().items()}
+    except (RuntimeError, OverflowError) as error:
+        raise ValueError(f"{name}: is not a readable OpenEXR file ({error})") from error
+    except ValueError as error:
+        raise error if str(error).startswith(name) else ValueError(f"{name}: is a damaged OpenEXR file ({error})") from error
+    if any(values.shape != (height, width) for values in pixels.values()):
+        raise ValueError(f"{name}: is a damaged OpenEXR file (channels of unequal size)")
+    return pixels
+
+
+def _decode_exr_rgb(data: bytes, name: str) -> np.ndarray:
+    channels = decode_exr(data, name)
+    if not {"R", "G", "B"} <= set(channels):
+        raise ValueError(f"{name}: has the channels {', '.join(sorted(channels))}; expected R, G, B")
+    return np.stack([channels[key] for key in "RGB"], -1)
+
+
+def decode_hdr(data: bytes, name: str = "HDR") -> np.ndarray:
+    """(height, width, 3) linear values of a Radiance RGBE picture stored top to bottom, left to right.
+
+    Raises:
+        ValueError: damaged, XYZE, another orientation, or too large.
+    """
+    end = data.find(b"\n\n", 0, 65536)
+    line_end = data.find(b"\n", end + 2, end + 200)
+    if not data.startswith((b"#?RADIANCE", b"#?RGBE")) or end < 0 or line_end < 0:
+        raise ValueError(f"{name}: is not a Radiance HDR file (no header)")
+    lines = data[:end].decode("ascii", "replace").splitlines()
+    if any(line.startswith("FORMAT=") and line.strip() != "FORMAT=32-bit_rle_rgbe" for line in lines):
+        raise ValueError(f"{name}: holds XYZE values; expected FORMAT=32-bit_rle_rgbe")
+    resolution = data[end + 2 : line_end].decode("ascii", "replace").split()
+    match resolution:
+        case ["-Y", rows, "+X", columns] if rows.isdigit() and columns.isdigit():
+            height, width = int(rows), int(columns)
+        case _:
+            raise ValueError(f"{name}: has the resolution line {' '.join(resolution)!r}; expected '-Y height +X width'")
+    if not (0 < width <= MAX_WIDTH and 0 < height <= MAX_HEIGHT):
+        raise ValueError(f"{name}: is {width}x{height}; the limit is {MAX_WIDTH}x{MAX_HEIGHT}")
+    rgbe = np.empty((height, width, 4), np.uint8)
+    position = line_end + 1
+    try:
+        for row in range(height):
+            position = _decode_hdr_row(data, position, rgbe[row])
+    except (IndexError, ValueError) as error:
+        raise ValueError(f"{name}: is a damaged Radiance HDR file (row {row} of {height})") from error
+    scale = np.ldexp(np.float32(1), rgbe[..., 3].astype(np.int32) - 136)
+    return np.where(rgbe[..., 3:] > 0, rgbe[..., :3].astype(np.float32) * scale[..., None], np.float32(0))
+
+
+def _decode_hdr_row(data: bytes, position: int, row: np.ndarray) -> int:
+    """Fill one (width, 4) row from `position`; returns where the next row starts."""
+    width = len(row)
+    if data[position] == 2 and data[position + 1] == 2 and data[position + 2] < 128:
+        if (data[position + 2] << 8 | data[position + 3]) != width:
+            raise ValueError("row length")
+        position += 4
+        for component in range(4):
+            filled = 0
+            while filled < width:
+                count = data[position]
+                run = count > 128
+                count = count - 128 if run else count
+                if count == 0 or filled + count > width:
+                    raise ValueError("run length")
+                values = data[position + 1] if run else np.frombuffer(data, np.uint8, count, position + 1)
+                row[filled : filled + count, component] = values
+                position += 2 if run else 1 + count
+                filled += count
+        return position
+    # Flat or old run lengths: a pixel (1, 1, 1, n) repeats the last one n << 8k times, k counting repeats in a row.
+    filled = shift = 0
+    while filled < width:
+        pixel = np.frombuffer(data, np.uint8, 4, position)
+        position += 4
+        if pixel[0] == pixel[1] == pixel[2] == 1:
+            count = int(pixel[3]) << shift
+            if filled == 0 or filled + count > width or shift > 24:
+                raise ValueError("run length")
+            row[filled : filled + count] = row[filled - 1]
+            filled, shift = filled + count, shift + 8
+        else:
+            row[filled] = pixel
+            filled, shift = filled + 1, 0
+    return position
