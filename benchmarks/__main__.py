@@ -1,0 +1,28 @@
+"""`python -m benchmarks NAME ...`: run one benchmark; `--help` after the name lists its arguments."""
+
+import sys
+from importlib import import_module
+
+NAMES = ("rasterize", "build")
+
+
+def main(arguments: list[str]) -> None:
+    """Run the benchmark that the first argument names with the rest.
+
+    Raises:
+        ValueError: there is no such benchmark.
+    """
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(f"usage: python -m benchmarks {{{','.join(NAMES)}}} ...")
+        return
+    if arguments[0] not in NAMES:
+        raise ValueError(f"there is no benchmark {arguments[0]!r}; expected one of {', '.join(NAMES)}")
+    import_module(f"benchmarks.{arguments[0]}").main(arguments[1:])
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except (ValueError, OSError) as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        sys.exit(2)
