@@ -1,0 +1,183 @@
+"""Jobs through a real worker process and a real queue on SQLite, with a builder that only counts."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy.orm import Session
+
+from worker.builders import BUILDER_VARIABLE
+from worker.data_directory import DataDirectory, open_data_directory
+from worker.database import JobRow, now, open_database
+from worker.queue import JobNotInState, JobQueue
+
+REPOSITORY = Path(__file__).parents[2]
+PATIENCE_SECONDS = 15.0
+
+
+class Bench:
+    """A data directory, its queue as the API sees it, and worker processes that the test may end as it likes."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.directory: DataDirectory = open_data_directory(root / "data")
+        self.engine = open_database(self.directory)
+        self.queue = JobQueue(self.directory, self.engine)
+        self.workers: list[subprocess.Popen] = []
+
+    def start_worker(self) -> subprocess.Popen:
+        environment = {
+            **os.environ,
+            BUILDER_VARIABLE: "tiny_builder:build",
+            "PYTHONPATH": f"{Path(__file__).parent}{os.pathsep}{REPOSITORY}",
+        }
+        worker = subprocess.Popen([sys.executable, "-m", "worker", "--data", str(self.directory.root)], env=environment, cwd=self.root)
+        self.workers.append(worker)
+        return worker
+
+    def submit(self, **plan: object) -> str:
+        job_id = uuid.uuid4().hex
+        capture = self.directory.uploads / job_id
+        capture.mkdir()
+        (capture / "plan.json").write_text(json.dumps({"iterations": 3, "seconds": 0.02, **plan}))
+        self.queue.submit(JobRow(id=job_id, kind="build", name="tiny", dataset=str(capture), preset="draft", seed=0, created_at=now()))
+        return job_id
+
+    def state(self, job_id: str) -> str:
+        return self.queue.statuses([job_id])[job_id].state
+
+    def row(self, job_id: str) -> JobRow:
+        with Session(self.engine) as session:
+            return session.get_one(JobRow, job_id)
+
+    def wait(self, condition: Callable[[], bool]) -> float:
+        """Seconds until it held."""
+        start = time.monotonic()
+        while not condition():
+            assert time.monotonic() - start < PATIENCE_SECONDS, "waited too long"
+            time.sleep(0.03)
+        return time.monotonic() - start
+
+    def wait_for(self, job_id: str, state: str) -> float:
+        try:
+            return self.wait(lambda: self.state(job_id) == state)
+        except AssertionError as error:
+            raise AssertionError(f"expected {state}, still {self.state(job_id)}: {self.row(job_id).error}") from error
+
+    def iterations_run(self, job_id: str) -> list[tuple[int, int]]:
+        """(process, iteration), in order."""
+        lines = (self.directory.job(job_id) / "ran.txt").read_text().split("\n")
+        return [(int(line.split()[0]), int(line.split()[1])) for line in lines if line]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    yield bench
+    for worker in bench.workers:
+        if worker.poll() is None:
+            worker.terminate()
+    for worker in bench.workers:
+        worker.wait(10)
+    bench.queue.close()
+    bench.engine.dispose()
+
+
+def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:
+    job = bench.submit()
+    assert bench.state(job) == "queued"
+    bench.start_worker()
+    bench.wait_for(job, "done")
+    row = bench.row(job)
+    assert (row.asset_id, row.fraction, row.attempts, row.error) == (job, 1.0, 1, None)
+    assert row.preview_version == 3 and bench.directory.preview(job).read_bytes() == b"\xff\xd8tiny"
+    assert (bench.directory.asset(job) / "asset.json").exists()
+    assert not (bench.directory.job(job) / "asset.build").exists()
+
+
+def test_a_job_survives_kill_9_of_its_worker_and_goes_on_from_the_checkpoint(bench: Bench) -> None:
+    job = bench.submit(iterations=30, seconds=0.05)
+    first = bench.start_worker()
+    bench.wait(lambda: bench.row(job).iteration >= 5)
+    first.kill()
+    first.wait()
+    assert bench.state(job) == "stalled"
+    second = bench.start_worker()
+    bench.wait_for(job, "done")
+    ran = bench.iterations_run(job)
+    assert {process for process, _ in ran} == {first.pid, second.pid}
+    repeated = len(ran) - len({iteration for _, iteration in ran})
+    assert sorted({iteration for _, iteration in ran}) == list(range(30)) and repeated <= 1
+    assert bench.row(job).attempts == 2
+
+
+def test_a_job_goes_on_after_its_worker_was_asked_to_end(bench: Bench) -> None:
+    job = bench.submit(iterations=30, seconds=0.05)
+    first = bench.start_worker()
+    bench.wait(lambda: bench.row(job).iteration >= 3)
+    first.send_signal(signal.SIGTERM)
+    assert first.wait(10) == 0
+    assert bench.state(job) == "stalled" and bench.row(job).error is None
+    bench.start_worker()
+    bench.wait_for(job, "done")
+    assert [iteration for _, iteration in bench.iterations_run(job)] == list(range(30))
+
+
+def test_a_running_job_is_cancelled_within_two_seconds_and_can_be_retried(bench: Bench) -> None:
+    job = bench.submit(iterations=60, seconds=0.05)
+    bench.start_worker()
+    bench.wait(lambda: bench.row(job).iteration >= 2)
+    bench.queue.cancel(job)
+    assert bench.state(job) == "cancelled"
+    count = -1
+
+    def stopped() -> bool:
+        nonlocal count
+        before, count = count, len(bench.iterations_run(job))
+        time.sleep(0.2)
+        return before == count
+
+    assert bench.wait(stopped) < 2.0
+    assert bench.row(job).asset_id is None
+    with pytest.raises(JobNotInState, match="This job is cancelled"):
+        bench.queue.cancel(job)
+    bench.queue.retry(job)
+    bench.wait_for(job, "done")
+    assert [iteration for _, iteration in bench.iterations_run(job)] == list(range(60))
+
+
+def test_a_failed_job_says_why_and_can_be_retried(bench: Bench) -> None:
+    job = bench.submit(fail="The capture has no cameras.")
+    bench.start_worker()
+    bench.wait_for(job, "failed")
+    assert bench.row(job).error == "The capture has no cameras."
+    (bench.directory.uploads / job / "plan.json").write_text(json.dumps({"iterations": 1, "seconds": 0}))
+    bench.queue.retry(job)
+    bench.wait_for(job, "done")
+    assert bench.row(job).error is None
+
+
+def test_another_worker_takes_over_what_a_dead_one_left(bench: Bench) -> None:
+    job = bench.submit(iterations=30, seconds=0.05)
+    first = bench.start_worker()
+    bench.wait(lambda: bench.row(job).iteration >= 2)
+    second = bench.start_worker()
+    bench.wait(lambda: len(bench.queue.alive_workers()) == 2)
+    with pytest.raises(JobNotInState, match="worker is alive"):
+        bench.queue.resume(job)
+    first.kill()
+    first.wait()
+    assert bench.queue.requeue_dead() == [job]
+    bench.wait_for(job, "done")
+    assert bench.iterations_run(job)[-1][0] == second.pid
+
+
+def test_an_unknown_job_is_not_done(bench: Bench) -> None:
+    assert bench.state("no-such-job") == "unknown"

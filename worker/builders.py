@@ -1,0 +1,74 @@
+"""The function that turns a capture into an asset, found by name so that jobs and tests can name another.
+
+A builder is called as `builder(request, progress, should_stop)`; it must write the finished asset to `request.out` (atomically),
+keep checkpoints in `OUT.build/` so that a second call goes on, and raise BuildStopped soon after `should_stop()` turns true.
+"""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+DEFAULT_BUILDER = "worker.builders:build_with_drgs"
+BUILDER_VARIABLE = "DRGS_BUILDER"
+"""Environment variable `module:function`."""
+
+
+class BuildStopped(Exception):
+    """should_stop() was true; the checkpoint is on disk."""
+
+
+@dataclass(frozen=True)
+class BuildRequest:
+    """One build, in plain values."""
+
+    dataset: Path
+    out: Path
+    preset: str
+    seed: int
+    device: str
+    """auto, cpu or cuda."""
+
+
+@dataclass(frozen=True)
+class BuildProgress:
+    """How far a build is; the fields of drgs.build.build_asset.Progress."""
+
+    stage: str
+    iteration: int
+    iterations: int
+    fraction: float
+    """Of the whole build, 0..1."""
+    psnr: float | None = None
+    message: str = ""
+    eta_seconds: float | None = None
+    preview_jpeg: bytes | None = None
+
+
+Builder = Callable[[BuildRequest, Callable[[BuildProgress], None], Callable[[], bool]], None]
+
+
+def find_builder() -> Builder:
+    """The builder that the environment names, or the real one.
+
+    Raises:
+        ValueError: the name is not `module:function` of something that can be imported.
+    """
+    name = os.environ.get(BUILDER_VARIABLE, DEFAULT_BUILDER)
+    module, _, function = name.partition(":")
+    try:
+        return getattr(import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{BUILDER_VARIABLE}={name}: expected module:function of a builder; {error}") from error
+
+
+def build_with_drgs(request: BuildRequest, progress: Callable[[BuildProgress], None], should_stop: Callable[[], bool]) -> None:
+    """drgs.build_asset, resumed from its checkpoint where there is one."""
+    from drgs.build import build_asset as build
+
+    settings = build.BuildSettings(preset=request.preset, seed=request.seed, device=request.device, resume=True)
+    try:
+        build.build_asset(request.dataset, request.out, settings, progress=progress, should_stop=should_stop)
+    except build.BuildStopped as stopped:
+        raise BuildStopped from stopped

@@ -1,0 +1,123 @@
+"""The folder that holds everything a service keeps: one record of its paths, made on first use with mode 0700.
+
+token               who knows it may use the service (mode 0600)
+app.sqlite          assets, jobs, workers, sessions with their edit logs
+jobs.sqlite         the queue's own state (DBOS). Whoever can write it runs code in workers, hence the mode of the folder
+assets/ID/          finished assets
+uploads/ID/         captures as they came, unpacked
+jobs/ID/            a build's working folder: checkpoints, preview
+environments/       NAME.exr and NAME.jpg, its small picture
+workers/            locks that give each worker of this machine a stable number
+"""
+
+import fcntl
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class DataDirectory:
+    """Paths below one root. Ids in them are made by the server, never by users."""
+
+    root: Path
+    """Absolute."""
+    database_url: str
+    """Of assets, jobs, workers and sessions (SQLAlchemy)."""
+    queue_url: str
+    """Of DBOS's tables."""
+
+    @property
+    def token_path(self) -> Path:
+        return self.root / "token"
+
+    @property
+    def assets(self) -> Path:
+        return self.root / "assets"
+
+    @property
+    def uploads(self) -> Path:
+        return self.root / "uploads"
+
+    @property
+    def jobs(self) -> Path:
+        return self.root / "jobs"
+
+    @property
+    def environments(self) -> Path:
+        return self.root / "environments"
+
+    @property
+    def workers(self) -> Path:
+        return self.root / "workers"
+
+    def asset(self, asset_id: str) -> Path:
+        return self.assets / asset_id
+
+    def job(self, job_id: str) -> Path:
+        return self.jobs / job_id
+
+    def preview(self, job_id: str) -> Path:
+        return self.job(job_id) / "preview.jpg"
+
+
+def open_data_directory(root: Path) -> DataDirectory:
+    """Make what is missing and return the paths.
+
+    Raises:
+        ValueError: `root` is a file, or cannot be made or entered.
+    """
+    root = root.expanduser().resolve()
+    if root.exists() and not root.is_dir():
+        raise ValueError(f"data directory {root}: expected a folder, found a file")
+    try:
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        root.chmod(0o700)
+        for name in ("assets", "uploads", "jobs", "environments", "workers"):
+            (root / name).mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"data directory {root}: {error.strerror}; name a folder you may write with --data") from error
+    directory = DataDirectory(root, f"sqlite:///{root / 'app.sqlite'}", f"sqlite:///{root / 'jobs.sqlite'}")
+    _ensure_token(directory)
+    return directory
+
+
+def read_token(directory: DataDirectory) -> str:
+    """The 256-bit token that callers must know."""
+    return directory.token_path.read_text().strip()
+
+
+def _ensure_token(directory: DataDirectory) -> None:
+    with lock_file(directory.root / ".setup.lock"):
+        if not directory.token_path.exists():
+            draft = directory.root / ".token.new"
+            draft.unlink(missing_ok=True)
+            with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(secrets.token_hex(32) + "\n")
+            draft.rename(directory.token_path)
+        directory.token_path.chmod(0o600)
+
+
+@contextmanager
+def lock_file(path: Path) -> Iterator[None]:
+    """Hold an exclusive lock between processes; the kernel releases it when its holder dies."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def try_lock_file(path: Path) -> int | None:
+    """Descriptor of an exclusive lock, to be kept open while it is wanted; None when another process holds it."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    return descriptor

@@ -1,0 +1,196 @@
+"""The queue as the API sees it: enqueue, cancel, retry, list, give a dead worker's jobs to a living one.
+
+Uses DBOSClient only. DBOS.launch() in the API process would restart the PENDING jobs of its executor, and so run a live job twice.
+Arguments and results are small JSON. A queue row tagged as pickled would still be unpickled on reading, so inputs and outputs are
+never loaded here, and pickle reading is switched off (`refuse_pickled_rows`).
+"""
+
+import os
+import socket
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
+from dbos._serialization import DefaultSerializer
+from sqlalchemy import Engine, select
+from sqlalchemy.orm import Session
+
+from worker.data_directory import DataDirectory, lock_file
+from worker.database import JobRow, WorkerRow, now
+
+QUEUE_NAME = "builds"
+BUILD_WORKFLOW = "build_asset_job"
+JOBS_VERSION = "1"
+"""Raise it when a workflow's steps change, so that a worker of another version leaves older jobs alone. DBOS would otherwise hash
+the source code, and any edit of it would orphan the jobs that wait."""
+APPLICATION_NAME = "drgs"
+HEARTBEAT_SECONDS = 2.0
+DEAD_AFTER_SECONDS = 15.0
+"""Without a heartbeat. A worker on this machine whose process is gone counts as dead at once."""
+
+_STATES = {
+    "ENQUEUED": "queued",
+    "DELAYED": "queued",
+    "PENDING": "running",
+    "SUCCESS": "done",
+    "ERROR": "failed",
+    "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "failed",
+    "CANCELLED": "cancelled",
+}
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """What the queue says of one job."""
+
+    state: str
+    """queued, running, stalled, done, failed, cancelled or unknown."""
+    gave_up: bool
+    """The worker died in it too often."""
+
+
+class JobNotInState(Exception):
+    """A job cannot be cancelled, retried or resumed as it is; the text is a sentence."""
+
+
+class JobQueue:
+    """Final. One an API process; thread-safe as DBOSClient is."""
+
+    def __init__(self, directory: DataDirectory, engine: Engine) -> None:
+        refuse_pickled_rows()
+        self._engine = engine
+        migrate_queue(directory)
+        self._client = DBOSClient(
+            system_database_url=directory.queue_url, serializer=DBOSPortableJSONSerializer(), application_name=APPLICATION_NAME
+        )
+
+    def close(self) -> None:
+        self._client.destroy()
+
+    def submit(self, row: JobRow, priority: int = 1) -> None:
+        """Store the job and enqueue it; a job that was stored but not enqueued reads `unknown`, never done."""
+        job_id, dataset, preset, seed = row.id, row.dataset, row.preset, row.seed
+        with Session(self._engine) as session, session.begin():
+            session.add(row)
+        self._client.enqueue(
+            {
+                "workflow_name": BUILD_WORKFLOW,
+                "queue_name": QUEUE_NAME,
+                "workflow_id": job_id,
+                "app_version": JOBS_VERSION,
+                "priority": priority,
+                "application_name": APPLICATION_NAME,
+            },
+            job_id,
+            dataset,
+            preset,
+            seed,
+        )
+
+    def statuses(self, job_ids: Iterable[str]) -> dict[str, JobStatus]:
+        """One for each id, `unknown` for those the queue has never heard of."""
+        wanted = list(job_ids)
+        if not wanted:
+            return {}
+        rows = self._client.list_workflows(workflow_ids=wanted, load_input=False, load_output=False)
+        dead = self._dead_workers()
+        found = {row.workflow_id: row for row in rows}
+        answer = {}
+        for job_id in wanted:
+            row = found.get(job_id)
+            state = _STATES.get(row.status, "unknown") if row else "unknown"
+            if row and state == "running" and row.executor_id in dead:
+                state = "stalled"
+            answer[job_id] = JobStatus(state, bool(row) and row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
+        return answer
+
+    def cancel(self, job_id: str) -> None:
+        """Ask for the end: no step starts any more, and the running one sees the flag within a second.
+
+        Raises:
+            JobNotInState: it is over.
+        """
+        state = self.statuses([job_id])[job_id].state
+        if state not in ("queued", "running", "stalled"):
+            raise JobNotInState(f"This job is {state}; only a job that waits or runs can be cancelled.")
+        with Session(self._engine) as session, session.begin():
+            row = session.get_one(JobRow, job_id)
+            row.cancel_requested = True
+            row.finished_at = now()
+        self._client.cancel_workflow(job_id)
+
+    def retry(self, job_id: str) -> None:
+        """Start a failed or cancelled job again; its build goes on from the checkpoint.
+
+        Raises:
+            JobNotInState: it is neither.
+        """
+        state = self.statuses([job_id])[job_id].state
+        if state not in ("failed", "cancelled"):
+            raise JobNotInState(f"This job is {state}; only a failed or cancelled job can be retried.")
+        with Session(self._engine) as session, session.begin():
+            row = session.get_one(JobRow, job_id)
+            row.cancel_requested, row.error, row.finished_at, row.message = False, None, None, ""
+        self._client.rewind_workflow(job_id, queue_name=QUEUE_NAME)
+
+    def resume(self, job_id: str) -> None:
+        """Hand a job whose worker is dead to whichever worker is free.
+
+        Raises:
+            JobNotInState: its worker lives, or it does not run.
+        """
+        state = self.statuses([job_id])[job_id].state
+        if state == "running":
+            raise JobNotInState("This job's worker is alive and works on it.")
+        if state != "stalled":
+            raise JobNotInState(f"This job is {state}; only a stalled job can be resumed, and a failed or cancelled one retried.")
+        self._client.resume_workflow(job_id, queue_name=QUEUE_NAME)
+
+    def requeue_dead(self) -> list[str]:
+        """Hand over all jobs of dead workers, if some worker is alive to take them. Returns their ids."""
+        dead = self._dead_workers()
+        if not dead or not self.alive_workers():
+            return []
+        rows = self._client.list_workflows(status="PENDING", executor_id=sorted(dead), load_input=False, load_output=False)
+        for row in rows:
+            self._client.resume_workflow(row.workflow_id, queue_name=QUEUE_NAME)
+        return [row.workflow_id for row in rows]
+
+    def active_count(self) -> int:
+        """Jobs that wait or run."""
+        return len(self._client.list_workflows(status=["ENQUEUED", "DELAYED", "PENDING"], load_input=False, load_output=False))
+
+    def alive_workers(self) -> list[str]:
+        with Session(self._engine) as session:
+            return [row.id for row in session.scalars(select(WorkerRow)) if is_alive(row)]
+
+    def _dead_workers(self) -> set[str]:
+        with Session(self._engine) as session:
+            return {row.id for row in session.scalars(select(WorkerRow)) if not is_alive(row)}
+
+
+def is_alive(worker: WorkerRow) -> bool:
+    """By its process where it runs on this machine, and by its heartbeat."""
+    if worker.id.rpartition("-")[0] == socket.gethostname():
+        try:
+            os.kill(worker.pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:
+            return True
+    return now() - worker.heartbeat_at < DEAD_AFTER_SECONDS
+
+
+def migrate_queue(directory: DataDirectory) -> None:
+    """Make or upgrade DBOS's tables; DBOSClient itself never does."""
+    with lock_file(directory.root / ".setup.lock"):
+        DBOS.migrate(directory.queue_url)
+
+
+def refuse_pickled_rows() -> None:
+    """DBOS decodes each row by the tag stored in it, so one tagged py_pickle would be unpickled whatever serializer we configure."""
+
+    def refuse(self: DefaultSerializer, serialized_data: str) -> object:
+        raise ValueError("the jobs database holds a pickled value; drgs writes none, so somebody else did")
+
+    DefaultSerializer.deserialize = refuse  # type: ignore[method-assign]

@@ -1,0 +1,97 @@
+"""`drgs worker`: take builds from the queue until told to stop.
+
+SIGTERM and Ctrl-C: the running build writes its checkpoint and stays in the queue as it is, so the next start goes on with it.
+"""
+
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from pathlib import Path
+from types import FrameType
+
+from dbos import DBOS, DBOSPortableJSONSerializer
+from sqlalchemy import Engine
+from sqlalchemy.orm import Session
+
+from worker.builders import find_builder
+from worker.data_directory import DataDirectory, open_data_directory, try_lock_file
+from worker.database import WorkerRow, now, open_database
+from worker.jobs import WorkerContext, set_context
+from worker.queue import APPLICATION_NAME, HEARTBEAT_SECONDS, JOBS_VERSION, QUEUE_NAME, migrate_queue, refuse_pickled_rows
+
+SHUTDOWN_SECONDS = 30
+"""For the checkpoint of a build that is told to stop."""
+MAX_SLOTS = 64
+
+
+def run_worker(data: Path, device: str = "auto", parent_pid: int | None = None) -> int:
+    """Work until SIGTERM, SIGINT, or until the process `parent_pid` is gone. Returns the exit code.
+
+    Raises:
+        ValueError: the data directory cannot be used.
+    """
+    directory = open_data_directory(data)
+    worker_id, slot_lock = _claim_slot(directory)
+    os.nice(10)  # the viewer comes first where both run on one machine
+    engine = open_database(directory)
+    migrate_queue(directory)
+    refuse_pickled_rows()
+    stopping = threading.Event()
+    set_context(WorkerContext(directory, engine, worker_id, find_builder(), device, stopping))
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        stopping.set()
+
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+    _beat(engine, worker_id, first=True)
+    DBOS(
+        config={
+            "name": APPLICATION_NAME,
+            "system_database_url": directory.queue_url,
+            "application_version": JOBS_VERSION,
+            "executor_id": worker_id,
+            "run_migrations": False,
+            "serializer": DBOSPortableJSONSerializer(),
+            "run_admin_server": False,
+            "log_level": "WARNING",
+        }
+    )
+    DBOS.launch()
+    DBOS.register_queue(QUEUE_NAME, worker_concurrency=1, polling_interval_sec=0.2)
+    print(f"drgs worker {worker_id} takes builds from {directory.root}", file=sys.stderr, flush=True)
+    while not stopping.wait(HEARTBEAT_SECONDS):
+        _beat(engine, worker_id)
+        if parent_pid is not None and os.getppid() != parent_pid:
+            logging.getLogger(__name__).warning("the server that started this worker is gone")
+            stopping.set()
+    DBOS.destroy(workflow_completion_timeout_sec=SHUTDOWN_SECONDS)
+    with Session(engine) as session, session.begin():
+        if (row := session.get(WorkerRow, worker_id)) is not None:
+            row.heartbeat_at = 0.0
+    engine.dispose()
+    os.close(slot_lock)
+    return 0
+
+
+def _claim_slot(directory: DataDirectory) -> tuple[str, int]:
+    """`hostname-N` with the smallest free N: after kill -9 the kernel frees the lock, so a restart gets the same name."""
+    for slot in range(MAX_SLOTS):
+        lock = try_lock_file(directory.workers / f"slot-{slot}.lock")
+        if lock is not None:
+            return f"{socket.gethostname()}-{slot}", lock
+    raise ValueError(f"{MAX_SLOTS} workers already use {directory.root} on this machine; expected fewer")
+
+
+def _beat(engine: Engine, worker_id: str, first: bool = False) -> None:
+    with Session(engine) as session, session.begin():
+        row = session.get(WorkerRow, worker_id)
+        if row is None:
+            row = WorkerRow(id=worker_id, pid=os.getpid(), started_at=now(), heartbeat_at=now())
+            session.add(row)
+        if first:
+            row.pid, row.started_at = os.getpid(), now()
+        row.heartbeat_at = now()
