@@ -241,11 +241,11 @@ def serve(
 
 
 @app.command()
-def worker(data: DataFolder = Path("data")) -> None:
+def worker(data: DataFolder = Path("data"), device: Annotated[DeviceName, typer.Option()] = DeviceName.auto) -> None:
     """Run queued builds without serving pages, for example on another machine."""
     from worker.run import run_worker
 
-    run_worker(data)
+    raise typer.Exit(run_worker(data, device.value))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})

@@ -54,7 +54,7 @@ def evaluate_asset(
 
 
 def _render_all(
-    asset: Asset, capture: Path, renders: Path, cameras: tuple[Camera, ...], settings: EvaluationSettings, done: Callable[[str], None]
+    asset: Asset, capture: Path, renders: Path, cameras: list[Camera], settings: EvaluationSettings, done: Callable[[str], None]
 ) -> None:
     """Write the test, relight and deform folders and the recovered light."""
     primary = "mesh" if asset.gaussians is None else "gaussians"
@@ -62,7 +62,7 @@ def _render_all(
 
     def render(folder: Path, edits: list[Edit], aov: bool = False) -> None:
         """The cameras that have a truth picture in the capture's folder of the same name."""
-        wanted = tuple(camera for camera in cameras if (capture / folder / f"{camera.name}.png").exists())
+        wanted = [camera for camera in cameras if (capture / folder / f"{camera.name}.png").exists()]
         scene = pose_scene(asset, edits, capture)
         render_cameras(scene, wanted, renders / folder, render_settings, aov=aov, done=lambda name: done(f"{folder}/{name}"))
 
