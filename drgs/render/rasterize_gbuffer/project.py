@@ -90,8 +90,8 @@ def project_surfels(
         scale = -scale
 
     # The filter's centre: middle of the box at the fixed cutoff.
-    center_x = -1.0e6
-    center_y = -1.0e6
+    center_x = float(-1.0e6)
+    center_y = float(-1.0e6)
     d9 = FILTER_CUTOFF_SQUARED * slope2 - tw[2] * tw[2]
     filtered = tw[2] > near
     if filtered:
@@ -104,10 +104,10 @@ def project_surfels(
 
     # Screen box of all pixels that may reach MIN_ALPHA: union of the plane's and the filter's, relative to origin.
     d = rho_max * slope2 - tw[2] * tw[2]
-    low_x = -1.0e9
-    high_x = 1.0e9
-    low_y = -1.0e9
-    high_y = 1.0e9
+    low_x = float(-1.0e9)
+    high_x = float(1.0e9)
+    low_y = float(-1.0e9)
+    high_y = float(1.0e9)
     if d < 0.0 and tw[2] > 0.0:
         mx = (rho_max * (tu[0] * tw[0] + tu[1] * tw[1]) - tu[2] * tw[2]) / d
         my = (rho_max * (tv[0] * tw[0] + tv[1] * tw[1]) - tv[2] * tw[2]) / d

@@ -163,12 +163,12 @@ def pixel_kernels(channels: int, depth: bool) -> tuple[Any, Any]:
         py = pixel / stride
         tile = (py / 16) * tiles_x + px / 16
         sums = feature_vector()
-        coverage = 0.0
-        transmittance = 1.0
-        sum_z = 0.0
-        sum_zz = 0.0
-        median_z = 0.0
-        median = -1
+        coverage = float(0.0)
+        transmittance = float(1.0)
+        sum_z = float(0.0)
+        sum_zz = float(0.0)
+        median_z = float(0.0)
+        median = int(-1)
         for entry in range(starts[tile], starts[tile + 1]):
             surfel = list_surfel[entry]
             s = evaluate_surfel(parameters, surfel, float(px) + 0.5, float(py) + 0.5)
@@ -212,7 +212,7 @@ def pixel_kernels(channels: int, depth: bool) -> tuple[Any, Any]:
         for k in range(channels):
             g[k] = gradients[k, pixel]
         behind = total[pixel]
-        transmittance = 1.0
+        transmittance = float(1.0)
         for entry in range(starts[tile], starts[tile + 1]):
             surfel = list_surfel[entry]
             x_pixel = float(px) + 0.5
@@ -224,9 +224,9 @@ def pixel_kernels(channels: int, depth: bool) -> tuple[Any, Any]:
                 for k in range(channels):
                     gf = gf + g[k] * features[surfel, k]
                     wp.atomic_add(surfel_gradients, surfel, 16 + k, g[k] * w)
-                dhx = 0.0
-                dhy = 0.0
-                dhz = 0.0
+                dhx = float(0.0)
+                dhy = float(0.0)
+                dhz = float(0.0)
                 if wp.static(depth):
                     z = s.z - depth_origin
                     g1 = gradients[channels + 1, pixel]
