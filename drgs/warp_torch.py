@@ -43,6 +43,12 @@ def warp_device(tensor: Tensor) -> Any:
     return wp.device_from_torch(tensor.device)
 
 
+def load_kernel(kernel: Any, device: Any) -> None:
+    """Compile a kernel's module before threads race for it; the CPU's launches have blocks of 1, and Warp compiles for a block size."""
+    device = wp.get_device(device)
+    kernel.module.load(device, None if device.is_cuda else 1)
+
+
 def launch(kernel: Any, count: int, inputs: list, outputs: list, device: Any, slices_per_thread: int = 4) -> None:
     """Run `kernel` for `count` indices, on CUDA at once, on the CPU in slices over the thread pool.
 
@@ -54,7 +60,7 @@ def launch(kernel: Any, count: int, inputs: list, outputs: list, device: Any, sl
     if device.is_cuda:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=outputs, device=device)
         return
-    kernel.module.load(device)  # compile once, before threads race for it
+    load_kernel(kernel, device)
     threads = thread_count()
     slices = min(count, threads * slices_per_thread) if threads > 1 else 1
     if slices == 1:

@@ -20,11 +20,15 @@ def f0_from_base(albedo: Tensor, metallic: Tensor) -> Tensor:
     return 0.04 * (1 - m) + albedo * m
 
 
-def ggx_d(n_dot_h: Tensor, alpha: Tensor) -> Tensor:
-    """GGX distribution; written with sin^2 = 1 - (n.h)^2 kept apart from alpha^2 so that the peak survives float32."""
+def ggx_d(n_dot_h: Tensor, alpha: Tensor, sin2_nh: Tensor | None = None) -> Tensor:
+    """GGX distribution; sin^2 is kept apart from alpha^2 so that the peak survives float32.
+
+    Args:
+        sin2_nh: |n x h|^2. Default 1 - (n.h)^2, which in float32 is off by 6e-8: 7 % of the peak at the smallest alpha.
+    """
     a2 = alpha * alpha
     c2 = n_dot_h * n_dot_h
-    denominator = (1 - c2) + c2 * a2
+    denominator = ((1 - c2) if sin2_nh is None else sin2_nh) + c2 * a2
     return a2 / (math.pi * denominator * denominator).clamp(min=1e-30)
 
 
@@ -51,7 +55,8 @@ def evaluate_brdf(wi: Tensor, wo: Tensor, normal: Tensor, albedo: Tensor, roughn
     n_dot_l, n_dot_v = (normal * wi).sum(-1), (normal * wo).sum(-1)
     above = (n_dot_l > 0) & (n_dot_v > 0)
     n_dot_h, h_dot_v = (normal * h).sum(-1).clamp(0, 1), (h * wo).sum(-1).clamp(0, 1)
-    dv = ggx_d(n_dot_h, alpha) * smith_v(n_dot_l.clamp(min=1e-6), n_dot_v.clamp(min=1e-6), alpha)
+    sin2_nh = torch.linalg.cross(normal, h).square().sum(-1)
+    dv = ggx_d(n_dot_h, alpha, sin2_nh) * smith_v(n_dot_l.clamp(min=1e-6), n_dot_v.clamp(min=1e-6), alpha)
     specular = dv[..., None] * schlick_f(h_dot_v, f0_from_base(albedo, metallic))
     diffuse = ((1 - metallic)[..., None] * albedo / math.pi).expand_as(specular)
     zero = torch.zeros((), dtype=specular.dtype, device=specular.device)

@@ -1,0 +1,133 @@
+"""Light transport against an independent path tracer: error, bias and time, in one run.
+
+    python -m benchmarks.integrator --reference DIR [--spp 8 32 128] [--json] [--pictures OUT]
+
+DIR holds mesh.ply, cameras.json, env_*.exr, `<env>_<direct|bounce1>_<camera>.exr` (linear, premultiplied, many
+samples) and `*_se.npy` (standard error of each pixel's mean). relmse = mean over covered pixels and channels of
+(x - ref)^2 / (ref^2 + 0.01); bias = (sum x - sum ref) / sum ref; its error bar has both sides' noise.
+within_4se = share of covered pixels whose RGB mean is within four standard errors (both sides' noise).
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import torch
+
+from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, start_frame
+from drgs.render.sample_rays import SampleCounts
+from drgs.render.trace_rays import build_tracer
+from drgs.scene.camera import Camera, camera_from_opengl
+from drgs.scene.environment import Environment
+from drgs.scene.mesh import TriangleMesh
+from drgs.scene.posed_scene import PosedScene
+
+
+def read_exr(path: Path) -> np.ndarray:
+    """(height, width, channels) float32."""
+    channels = OpenEXR.File(str(path)).channels()
+    pixels = next(iter(channels.values())).pixels if len(channels) == 1 else np.stack([channels[c].pixels for c in "RGB"], -1)
+    return np.asarray(pixels, np.float32)
+
+
+def read_mesh(path: Path) -> TriangleMesh:
+    """A binary PLY of float vertices x y z nx ny nz albedo_r/g/b roughness metallic and triangles."""
+    raw = path.read_bytes()
+    end = raw.index(b"end_header\n") + len(b"end_header\n")
+    lines = raw[:end].decode().split("\n")
+    counts = {line.split()[1]: int(line.split()[2]) for line in lines if line.startswith("element")}
+    names = [line.split()[2] for line in lines if line.startswith("property float")]
+    vertex = np.frombuffer(raw, "<f4", counts["vertex"] * len(names), end).reshape(-1, len(names))
+    faces = np.frombuffer(raw, np.dtype([("n", "u1"), ("v", "<i4", 3)]), counts["face"], end + vertex.nbytes)["v"]
+
+    def columns(*wanted: str) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(vertex[:, [names.index(name) for name in wanted]]))
+
+    return TriangleMesh(
+        columns("x", "y", "z"),
+        torch.from_numpy(np.ascontiguousarray(faces)),
+        torch.nn.functional.normalize(columns("nx", "ny", "nz"), dim=-1),
+        columns("albedo_r", "albedo_g", "albedo_b"),
+        columns("roughness")[:, 0],
+        columns("metallic")[:, 0],
+    )
+
+
+def read_cameras(path: Path, size: int) -> list[Camera]:
+    document = json.loads(path.read_text())
+    focal = 0.5 * size / np.tan(0.5 * document["camera_angle_x"])
+    intrinsics = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    return [camera_from_opengl(torch.tensor(f["transform_matrix"]), intrinsics, size, size) for f in document["frames"]]
+
+
+def compare(mean: np.ndarray, variance: np.ndarray, reference: np.ndarray, standard_error: np.ndarray) -> dict:
+    """Error figures of one premultiplied image (height, width, 3) against the reference."""
+    covered = reference[..., 3] > 0
+    x, truth, se = mean[covered].astype(np.float64), reference[covered][:, :3].astype(np.float64), standard_error[covered]
+    noise = np.sqrt(variance[covered] + se**2)
+    difference = x.mean(1) - truth.mean(1)
+    return {
+        "relmse": float(np.mean((x - truth) ** 2 / (truth**2 + 0.01))),
+        "bias": float(difference.sum() / truth.mean(1).sum()),
+        "bias_error": float(np.sqrt((noise**2).sum()) / truth.mean(1).sum()),
+        "within_4se": float((np.abs(difference) <= 4 * noise + 1e-6).mean()),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--reference", type=Path, required=True)
+    parser.add_argument("--spp", type=int, nargs="+", default=[8, 32, 128])
+    parser.add_argument("--env", nargs="+", default=["interior", "dawn", "city"])
+    parser.add_argument("--light", nargs="+", default=["direct", "bounce1"])
+    parser.add_argument("--cameras", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--counts", type=int, nargs=3, help="cosine, GGX and environment samples a pass")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--pictures", type=Path, help="folder for linear images and differences (npy)")
+    arguments = parser.parse_args()
+
+    folder: Path = arguments.reference
+    mesh = read_mesh(folder / "mesh.ply")
+    tracer = build_tracer(mesh)
+    rows = []
+    for env in arguments.env:
+        environment = Environment(torch.from_numpy(read_exr(folder / f"env_{env}.exr")[..., :3].copy()))
+        scene = PosedScene(None, mesh, environment)
+        for light in arguments.light:
+            for number in arguments.cameras:
+                reference = read_exr(folder / f"{env}_{light}_{number}.exr")
+                standard_error = np.load(folder / f"{env}_{light}_{number}_se.npy")
+                camera = read_cameras(folder / "cameras.json", len(reference))[number]
+                counts = SampleCounts(*arguments.counts) if arguments.counts else None
+                settings = RenderSettings(bounces=int(light == "bounce1"), primary="mesh", seed=arguments.seed, counts=counts)
+                refine_frame(start_frame(scene, camera, settings, tracer))  # compile and warm up
+                started = time.perf_counter()
+                state = start_frame(scene, camera, settings, tracer)
+                for spp in sorted(arguments.spp):
+                    state = refine_frame(state, max(0, -(-spp // state.counts.total) - state.passes))
+                    seconds = time.perf_counter() - started
+                    frame = resolve_frame(state)
+                    coverage = frame.gbuffer.coverage
+                    mean = (frame.radiance_linear * coverage[..., None]).numpy()
+                    variance = (frame.radiance.variance * coverage**2).numpy()
+                    row = {"env": env, "light": light, "camera": number, "spp": frame.radiance.samples, "seconds": round(seconds, 4)}
+                    row |= compare(mean, variance, reference, standard_error)
+                    rows.append(row)
+                    if not arguments.json:
+                        print("  ".join(f"{k} {v:.5g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
+                if arguments.pictures:
+                    arguments.pictures.mkdir(parents=True, exist_ok=True)
+                    np.save(
+                        arguments.pictures / f"{env}_{light}_{number}.npy",
+                        np.stack([mean, reference[..., :3], np.repeat(variance[..., None], 3, -1)]),
+                    )
+    if arguments.json:
+        print(json.dumps({"rows": rows}))
+
+
+if __name__ == "__main__":
+    main()

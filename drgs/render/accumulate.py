@@ -1,0 +1,231 @@
+"""Progressive frames: start, refine as often as wished, look at any time.
+
+A pass adds `samples_per_pass` rays to every covered pixel and updates the running sums; passes continue the same
+low-discrepancy sequences, so n passes of k samples are as good as one of n k. With the mesh as primary
+surface each pass also looks through another place of the pixel. State is a frozen record: refining returns a new one.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drgs.render.environment_table import build_environment_table, environment_light
+from drgs.render.lift_points import lift_points
+from drgs.render.rasterize_gbuffer import rasterize_gbuffer
+from drgs.render.records import Frame, GBuffer, Radiance
+from drgs.render.sample_rays import SampleCounts, sample_counts, shading_points
+from drgs.render.shade import PointLight, shade
+from drgs.render.tonemap import tonemap
+from drgs.render.trace_primary import PrimaryPoints, screen_box, trace_primary_points
+from drgs.render.trace_rays import build_tracer
+from drgs.render.tracer import AbstractTracer
+from drgs.scene.camera import Camera, pixel_rays_world
+from drgs.scene.environment import Environment, environment_radiance
+from drgs.scene.posed_scene import PosedScene
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How a frame is made."""
+
+    samples_per_pixel: int = 32
+    """Light samples behind a finished frame."""
+    samples_per_pass: int | None = None
+    """Light samples a pass adds; None: 32 on Gaussians, 8 on a mesh, whose passes are its antialiasing as well."""
+    counts: SampleCounts | None = None
+    """Samples of each strategy a pass; None: 2:1:1. Overrides samples_per_pass."""
+    bounces: int = 1
+    """Surfaces light may meet on its way from the environment to the visible one; 0: direct light and shadows only."""
+    primary: Literal["gaussians", "mesh"] | None = None
+    """What the camera sees; None: the Gaussians where the scene has any."""
+    denoise: Literal["none", "svgf", "oidn"] = "none"
+    seed: int = 0
+    exposure: float = 0.0
+    """[stops]."""
+    background: Literal["transparent", "environment"] | tuple[float, float, float] = "transparent"
+    """A colour is linear radiance."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameState:
+    """A frame in the making. Sums run over passes and are weighted by coverage; pixels are flat, row-major."""
+
+    scene: PosedScene
+    camera: Camera
+    settings: RenderSettings
+    tracer: AbstractTracer
+    light: Any
+    """EnvironmentLight struct."""
+    counts: SampleCounts
+    fixed: PrimaryPoints | None
+    """The points of every pass, when the camera sees Gaussians."""
+    box: tuple[int, int, int, int]
+    """Part of the image that may see the mesh: left, top, right, bottom [pixels]."""
+    gbuffer: GBuffer | None
+    """Given by the rasteriser; None when the mesh is traced: then `surface` holds running sums."""
+    diffuse: Float[Tensor, "pixel 3"]
+    specular: Float[Tensor, "pixel 3"]
+    weight: Float[Tensor, "pixel"]
+    """Passes that found a surface."""
+    luminance: Float[Tensor, "pixel"]
+    luminance_squared: Float[Tensor, "pixel"]
+    scatter: Float[Tensor, "pixel"]
+    """Sum of the passes' own variance estimates."""
+    visibility: Float[Tensor, "pixel"]
+    surface: Float[Tensor, "pixel 15"]
+    """Sums of position, normal, wo, albedo, roughness, metallic, depth."""
+    passes: int
+    seconds: dict[str, float]
+    """Of each step, summed over passes."""
+
+
+def start_frame(
+    scene: PosedScene, camera: Camera, settings: RenderSettings, tracer: AbstractTracer | None = None, gbuffer: GBuffer | None = None
+) -> FrameState:
+    """All that a frame needs before its first pass.
+
+    Args:
+        tracer: of scene.mesh, to reuse one.
+        gbuffer: of the scene's Gaussians through this camera, to reuse one.
+    """
+    seconds: dict[str, float] = {}
+    clock = time.perf_counter()
+
+    def lap(step: str) -> None:
+        nonlocal clock
+        now = time.perf_counter()
+        seconds[step] = seconds.get(step, 0.0) + now - clock
+        clock = now
+
+    device = scene.mesh.vertices.device
+    primary = settings.primary or ("gaussians" if scene.surfels is not None else "mesh")
+    if primary == "gaussians" and scene.surfels is None and gbuffer is None:
+        raise ValueError("primary 'gaussians' was asked for, but this scene has no Gaussians; use primary 'mesh'")
+    tracer = build_tracer(scene.mesh) if tracer is None else tracer
+    lap("build_tracer")
+    table = build_environment_table(scene.environment)
+    light = environment_light(scene.environment, table, scene.environment_rotation_degrees, scene.environment_intensity)
+    lap("environment_table")
+    fixed, box = None, (0, 0, camera.width, camera.height)
+    if primary == "gaussians":
+        if gbuffer is None:
+            gbuffer = rasterize_gbuffer(scene.surfels, camera)
+        lap("rasterize_gbuffer")
+        points = shading_points(gbuffer)
+        fixed = PrimaryPoints(points, lift_points(points, tracer), gbuffer.depth.reshape(-1)[points.pixel.long()])
+        lap("lift_points")
+    else:
+        gbuffer = None
+        box = screen_box(scene.mesh, camera)
+    counts = settings.counts or sample_counts(settings.samples_per_pass or (32 if primary == "gaussians" else 8))
+    pixels = camera.width * camera.height
+    vectors = [torch.zeros(pixels, 3, device=device) for _ in range(2)]
+    numbers = [torch.zeros(pixels, device=device) for _ in range(5)]
+    surface = torch.zeros(pixels, 15, device=device)
+    return FrameState(scene, camera, settings, tracer, light, counts, fixed, box, gbuffer, *vectors, *numbers, surface, 0, seconds)
+
+
+def refine_frame(state: FrameState, passes: int = 1) -> FrameState:
+    """The frame after `passes` more passes; the given state stays as it is."""
+    diffuse, specular, surface = state.diffuse.clone(), state.specular.clone(), state.surface.clone()
+    weight, luminance, luminance_squared = state.weight.clone(), state.luminance.clone(), state.luminance_squared.clone()
+    scatter, visibility = state.scatter.clone(), state.visibility.clone()
+    seconds = dict(state.seconds)
+    rec709 = diffuse.new_tensor([0.2126, 0.7152, 0.0722])
+    for index in range(state.passes, state.passes + passes):
+        clock = time.perf_counter()
+        primary = state.fixed
+        if primary is None:
+            primary = trace_primary_points(state.tracer, state.camera, state.settings.seed, index, box=state.box)
+        points = primary.points
+        traced = time.perf_counter()
+        light: PointLight = shade(
+            points, primary.starts, state.light, state.tracer, state.counts, state.settings.bounces, state.settings.seed, index
+        )
+        shaded = time.perf_counter()
+        # Each pixel occurs once a pass, so plain indexed adds are exact and ordered.
+        pixel = points.pixel.long()
+        y = (light.diffuse + light.specular) @ rec709
+        diffuse.index_add_(0, pixel, light.diffuse)
+        specular.index_add_(0, pixel, light.specular)
+        weight.index_add_(0, pixel, torch.ones_like(y))
+        luminance.index_add_(0, pixel, y)
+        luminance_squared.index_add_(0, pixel, y * y)
+        scatter.index_add_(0, pixel, light.variance)
+        visibility.index_add_(0, pixel, light.visibility)
+        if state.fixed is None:
+            vectors = [points.position_world, points.normal_world, points.wo_world, points.albedo]
+            numbers = [points.roughness[:, None], points.metallic[:, None], primary.depth[:, None]]
+            surface.index_add_(0, pixel, torch.cat([*vectors, *numbers], -1))
+        ended = time.perf_counter()
+        for step, duration in (("trace_primary", traced - clock), ("shade", shaded - traced), ("accumulate", ended - shaded)):
+            seconds[step] = seconds.get(step, 0.0) + duration
+    return replace(
+        state, diffuse=diffuse, specular=specular, weight=weight, luminance=luminance, luminance_squared=luminance_squared,
+        scatter=scatter, visibility=visibility, surface=surface, passes=state.passes + passes, seconds=seconds,
+    )  # fmt: skip
+
+
+def resolve_frame(state: FrameState) -> Frame:
+    """The picture so far."""
+    clock = time.perf_counter()
+    camera, settings = state.camera, state.settings
+    shape = (camera.height, camera.width)
+    passes = max(1, state.passes)
+    gbuffer = _mean_gbuffer(state) if state.gbuffer is None else state.gbuffer
+    weight = state.weight.clamp(min=1)
+    # Straight (alpha-normalised) radiance; the variance is that of the mean of one pixel's passes.
+    mean = state.luminance / passes
+    between = (state.luminance_squared / passes - mean * mean).clamp(min=0) / max(1, passes - 1)
+    variance = (between if passes > 1 else state.scatter) * (passes / weight) ** 2
+    radiance = Radiance(
+        (state.diffuse / weight[:, None]).reshape(*shape, 3),
+        (state.specular / weight[:, None]).reshape(*shape, 3),
+        variance.reshape(shape),
+        (state.visibility / weight).reshape(shape),
+        state.passes * state.counts.total,
+    )
+    linear = radiance.diffuse + radiance.specular
+    rgba = tonemap(linear, gbuffer.coverage, settings.exposure, _background(state))
+    seconds = {**state.seconds, "resolve": time.perf_counter() - clock}
+    metadata = {
+        "samples": radiance.samples,
+        "passes": state.passes,
+        "bounces": settings.bounces,
+        "counts": {"cosine": state.counts.cosine, "ggx": state.counts.ggx, "environment": state.counts.environment},
+        "primary": "mesh" if state.fixed is None else "gaussians",
+        "milliseconds": {step: round(1000 * duration, 3) for step, duration in seconds.items()},
+    }
+    return Frame(rgba, linear, gbuffer, radiance, metadata)
+
+
+def passes_needed(state: FrameState) -> int:
+    """Passes that the settings' samples a pixel ask for, in all."""
+    return max(1, -(-state.settings.samples_per_pixel // state.counts.total))
+
+
+def _mean_gbuffer(state: FrameState) -> GBuffer:
+    shape = (state.camera.height, state.camera.width)
+    coverage = (state.weight / max(1, state.passes)).reshape(shape)
+    mean = (state.surface / state.weight.clamp(min=1)[:, None]).reshape(*shape, 15)
+    depth = torch.where(coverage > 0, mean[..., 14], torch.inf)
+    normal, wo = (torch.nn.functional.normalize(mean[..., a : a + 3], dim=-1) for a in (3, 6))
+    return GBuffer(coverage, depth, mean[..., :3], normal, wo, mean[..., 9:12], mean[..., 12], mean[..., 13])
+
+
+def _background(state: FrameState) -> Tensor | None:
+    background, scene = state.settings.background, state.scene
+    if background == "transparent":
+        return None
+    if background != "environment":
+        return torch.tensor(background, device=state.diffuse.device)
+    _, direction = pixel_rays_world(state.camera)
+    angle = torch.tensor(scene.environment_rotation_degrees).deg2rad()
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    x, y, z = direction.to(state.diffuse.device).unbind(-1)
+    turned = torch.stack([cos * x + sin * y, cos * y - sin * x, z], -1)
+    return scene.environment_intensity * environment_radiance(Environment(scene.environment.radiance.detach()), turned)

@@ -1,0 +1,199 @@
+"""Shading points in, sampled directions with balance-heuristic weights out.
+
+Three strategies a point: cosine hemisphere, GGX visible normals, environment table. The estimate of an integral of g
+over the hemisphere is the sum of g(direction) * weight over a point's samples, weight = 1 / sum_k n_k p_k (Veach 1995);
+a sample below the horizon has weight 0. Random numbers are Owen-scrambled Sobol points addressed by
+(seed, pixel, strategy, sample), so they depend neither on batching nor on threads.
+Does not know the tracer, nor radiance.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+
+from drgs.render.brdf_warp import PI, alpha_of, cosine_direction, ggx_direction, ggx_pdf
+from drgs.render.environment_table import (
+    EnvironmentLight,
+    EnvironmentTable,
+    environment_direction,
+    environment_light,
+    lookup_pdf,
+    table_place,
+)
+from drgs.render.random_warp import hash_combine, sobol_2d
+from drgs.render.records import GBuffer, Rays, ShadingPoints
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+MIN_COVERAGE = 1 / 255
+"""Pixels covered by no more than this get no light: they could not change an 8-bit image."""
+
+
+@dataclass(frozen=True)
+class SampleCounts:
+    """Samples a point of each strategy; 16/8/8 is the published split for 32."""
+
+    cosine: int = 16
+    ggx: int = 8
+    environment: int = 8
+
+    @property
+    def total(self) -> int:
+        return self.cosine + self.ggx + self.environment
+
+
+def sample_counts(total: int) -> SampleCounts:
+    """2:1:1 of `total` samples (at least one each)."""
+    quarter = max(1, total // 4)
+    return SampleCounts(max(1, total - 2 * quarter), quarter, quarter)
+
+
+def shading_points(gbuffer: GBuffer) -> ShadingPoints:
+    """The covered pixels of a G-buffer, packed in row-major order; differentiable."""
+    pixel = torch.nonzero(gbuffer.coverage.reshape(-1) > MIN_COVERAGE).squeeze(-1)
+    return ShadingPoints(
+        gbuffer.position_world.reshape(-1, 3)[pixel],
+        gbuffer.normal_world.reshape(-1, 3)[pixel],
+        gbuffer.wo_world.reshape(-1, 3)[pixel],
+        gbuffer.albedo.reshape(-1, 3)[pixel],
+        gbuffer.roughness.reshape(-1)[pixel],
+        gbuffer.metallic.reshape(-1)[pixel],
+        pixel.int(),
+    )
+
+
+@wp.struct
+class PointArrays:
+    """ShadingPoints as kernels see them."""
+
+    position: wp.array[wp.vec3]
+    normal: wp.array[wp.vec3]
+    wo: wp.array[wp.vec3]
+    albedo: wp.array[wp.vec3]
+    roughness: wp.array[float]
+    metallic: wp.array[float]
+    pixel: wp.array[int]
+
+
+@wp.struct
+class SampleSet:
+    """How a point's samples are laid out, and which of each strategy's sequence they are."""
+
+    cosine: int
+    ggx: int
+    environment: int
+    round: int
+    """Samples already taken: rounds of the same counts."""
+    seed: wp.uint32
+
+
+@wp.func
+def strategy_of(samples: SampleSet, slot: int) -> wp.vec2i:
+    """(strategy, index in its sequence) of a point's slot-th sample."""
+    if slot < samples.cosine:
+        return wp.vec2i(0, samples.round * samples.cosine + slot)
+    if slot < samples.cosine + samples.ggx:
+        return wp.vec2i(1, samples.round * samples.ggx + slot - samples.cosine)
+    return wp.vec2i(2, samples.round * samples.environment + slot - samples.cosine - samples.ggx)
+
+
+@wp.func
+def strategy_seed(samples: SampleSet, pixel: int, strategy: int) -> wp.uint32:
+    return hash_combine(hash_combine(samples.seed, wp.uint32(pixel)), wp.uint32(strategy))
+
+
+@wp.func
+def sampled_direction(samples: SampleSet, light: EnvironmentLight, pixel: int, slot: int, wo: wp.vec3, n: wp.vec3, alpha: float) -> wp.vec3:
+    """World direction of a point's slot-th sample; possibly below the horizon."""
+    place = strategy_of(samples, slot)
+    u = sobol_2d(wp.uint32(place[1]), strategy_seed(samples, pixel, place[0]))
+    if place[0] == 0:
+        return cosine_direction(u, n)
+    if place[0] == 1:
+        return ggx_direction(u, wo, n, alpha)
+    return environment_direction(light, u)
+
+
+@wp.func
+def balance_weight(
+    samples: SampleSet, light: EnvironmentLight, wi: wp.vec3, wo: wp.vec3, n: wp.vec3, alpha: float, table_uv: wp.vec3
+) -> float:
+    """1 / sum_k n_k p_k of a direction above the horizon."""
+    density = float(samples.cosine) * wp.dot(n, wi) / PI
+    if samples.ggx > 0:
+        density += float(samples.ggx) * ggx_pdf(wi, wo, n, alpha)
+    if samples.environment > 0:
+        density += float(samples.environment) * lookup_pdf(light, table_uv)
+    if density <= 0.0:
+        return 0.0
+    return 1.0 / density
+
+
+@wp.kernel
+def sample_directions(
+    first: int,
+    points: PointArrays,
+    light: EnvironmentLight,
+    samples: SampleSet,
+    # outputs
+    direction: wp.array[wp.vec3],
+    weight: wp.array[float],
+):
+    i = first + wp.tid()
+    count = samples.cosine + samples.ggx + samples.environment
+    point = i // count
+    n = points.normal[point]
+    wo = points.wo[point]
+    alpha = alpha_of(points.roughness[point])
+    wi = n
+    w = wp.float32(0.0)
+    if wp.dot(n, wo) > 0.0:
+        wi = sampled_direction(samples, light, points.pixel[point], i % count, wo, n, alpha)
+        if wp.dot(n, wi) > 0.0:
+            w = balance_weight(samples, light, wi, wo, n, alpha, table_place(light, wi))
+    direction[i] = wi
+    weight[i] = w
+
+
+def point_arrays(points: ShadingPoints) -> Any:
+    """The struct that kernels read; shares memory with the tensors."""
+    arrays = PointArrays()
+    arrays.position = warp_array(points.position_world.float(), wp.vec3)
+    arrays.normal = warp_array(points.normal_world.float(), wp.vec3)
+    arrays.wo = warp_array(points.wo_world.float(), wp.vec3)
+    arrays.albedo = warp_array(points.albedo.float(), wp.vec3)
+    arrays.roughness = warp_array(points.roughness.float())
+    arrays.metallic = warp_array(points.metallic.float())
+    arrays.pixel = warp_array(points.pixel.int())
+    return arrays
+
+
+def sample_set(counts: SampleCounts, seed: int, samples_round: int = 0) -> Any:
+    """The struct that kernels read."""
+    samples = SampleSet()
+    samples.cosine, samples.ggx, samples.environment = counts.cosine, counts.ggx, counts.environment
+    samples.round = samples_round
+    samples.seed = seed & 0xFFFFFFFF
+    return samples
+
+
+def sample_rays(points: ShadingPoints, environment_table: EnvironmentTable, counts: SampleCounts, seed: int, lift: float = 0.0) -> Rays:
+    """Directions and weights for all points. Materials, normals and light enter as numbers: no gradient flows through
+    the choice of directions, and none is needed for an unbiased gradient of the estimate.
+
+    Args:
+        environment_table: of the unturned environment (training has none turned).
+        lift: origins stand this far off the points along the normal [world units].
+    """
+    device = points.normal_world.device
+    point_count = len(points.pixel)
+    light = environment_light(None, environment_table)
+    direction = torch.empty(point_count, counts.total, 3, device=device)
+    weight = torch.empty(point_count, counts.total, device=device)
+    inputs = [point_arrays(points), light, sample_set(counts, seed)]
+    outputs = [warp_array(direction.view(-1, 3), wp.vec3), warp_array(weight.view(-1))]
+    launch(sample_directions, point_count * counts.total, inputs, outputs, warp_device(direction))
+    return Rays((points.position_world + lift * points.normal_world).detach(), direction, weight)

@@ -1,0 +1,253 @@
+"""Light at shading points: L_o = sum over samples of f L_i (n.wi) weight, by batches of rays.
+
+In: points with the places their rays start from, the environment, a tracer. Out: diffuse and specular radiance, the variance
+of the luminance, and the open share of the sky, per point. L_i is the environment where a ray escapes, else the outgoing
+light of what it meets: nothing with 0 bounces, otherwise trace_indirect's estimate.
+Rays that cannot carry light (below the true surface, black sky with no bounce) are void and cost next to nothing.
+
+Source: Veach 1995 (balance heuristic). Twin: drgs/reference/shade.py.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from drgs.render.brdf_warp import PI, alpha_of, specular_brdf
+from drgs.render.environment_table import EnvironmentLight, lookup_radiance, table_place
+from drgs.render.records import ShadingPoints
+from drgs.render.sample_rays import PointArrays, SampleCounts, SampleSet, balance_weight, point_arrays, sample_set, sampled_direction
+from drgs.render.trace_indirect import mesh_arrays, scatter_hits, trace_indirect
+from drgs.render.trace_rays import over_slices
+from drgs.render.tracer import AbstractTracer
+from drgs.render.tracer_warp import query_any
+from drgs.warp_torch import load_kernel, thread_count, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+RAYS_A_BATCH = 65536
+"""Rays of one CPU batch: its 4 MB of ray data stay in the cache between sampling, tracing and shading."""
+RAYS_A_BATCH_GPU = 1 << 23
+
+
+@dataclass(frozen=True, eq=False)
+class RayStarts:
+    """Where the rays of shading points leave from. Written by trace_primary or lift_points."""
+
+    origin_world: Float[Tensor, "point 3"]
+    """On the outer side of the mesh, the tracer's lift away from it."""
+    surface_normal_world: Float[Tensor, "point 3"]
+    """Unit normal of the triangle itself: light from below it is blocked by the surface, whatever the shading normal says."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointLight:
+    """Outgoing radiance of shading points."""
+
+    diffuse: Float[Tensor, "point 3"]
+    specular: Float[Tensor, "point 3"]
+    variance: Float[Tensor, "point"]
+    """Of the luminance of this one estimate, from the scatter of its samples within each strategy."""
+    visibility: Float[Tensor, "point"]
+    """Open share of the cosine-weighted sky, 0..1."""
+
+
+@wp.kernel
+def start_rays(
+    first: int,
+    points: PointArrays,
+    starts: wp.array[wp.vec3],
+    surface_normals: wp.array[wp.vec3],
+    light: EnvironmentLight,
+    samples: SampleSet,
+    keep_dark: int,
+    # outputs
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    cosine_weight: wp.array[float],
+    specular: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    count = samples.cosine + samples.ggx + samples.environment
+    point = (first + i) // count
+    n = points.normal[point]
+    wo = points.wo[point]
+    roughness = points.roughness[point]
+    alpha = alpha_of(roughness)
+    start = wp.vec3(1.0e15, 1.0e15, 1.0e15)  # void rays leave from far outside and miss at the root of the tree
+    wi = wp.vec3(0.57735027, 0.57735027, 0.57735027)
+    w = wp.float32(0.0)
+    f = wp.vec3(0.0, 0.0, 0.0)
+    seen = wp.vec3(0.0, 0.0, 0.0)
+    if wp.dot(n, wo) > 0.0:
+        candidate = sampled_direction(samples, light, points.pixel[point], (first + i) % count, wo, n, alpha)
+        if wp.dot(n, candidate) > 0.0 and wp.dot(surface_normals[point], candidate) > 0.0:
+            place = table_place(light, candidate)
+            seen = lookup_radiance(light, place)
+            if keep_dark != 0 or wp.max(seen) > 0.0:
+                start = starts[point]
+                wi = candidate
+                w = balance_weight(samples, light, wi, wo, n, alpha, place) * wp.dot(n, wi)
+                f = w * specular_brdf(wi, wo, n, alpha, points.albedo[point], points.metallic[point])
+    origin[i] = start
+    direction[i] = wi
+    cosine_weight[i] = w
+    specular[i] = f
+    radiance[i] = seen
+
+
+@wp.func
+def luminance(c: wp.vec3) -> float:
+    return 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2]
+
+
+@wp.kernel
+def sum_samples(
+    first: int,
+    points: PointArrays,
+    samples: SampleSet,
+    cosine_weight: wp.array[float],
+    specular: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+    blocked: wp.array[wp.bool],
+    indirect: wp.array[wp.vec3],
+    bounces: int,
+    # outputs
+    diffuse_out: wp.array[wp.vec3],
+    specular_out: wp.array[wp.vec3],
+    variance_out: wp.array[float],
+    visibility_out: wp.array[float],
+):
+    i = wp.tid()
+    point = first + i
+    diffuse_brdf = points.albedo[point] * ((1.0 - points.metallic[point]) / PI)
+    diffuse_sum = wp.vec3(0.0, 0.0, 0.0)
+    specular_sum = wp.vec3(0.0, 0.0, 0.0)
+    variance = wp.float32(0.0)
+    open_sum = wp.float32(0.0)
+    all_sum = wp.float32(0.0)
+    count = samples.cosine + samples.ggx + samples.environment
+    slot = wp.int32(0)
+    for strategy in range(3):
+        size = samples.cosine
+        if strategy == 1:
+            size = samples.ggx
+        if strategy == 2:
+            size = samples.environment
+        total = wp.float32(0.0)
+        total_squares = wp.float32(0.0)
+        for _ in range(size):
+            ray = i * count + slot
+            slot += 1
+            w = cosine_weight[ray]
+            incoming = radiance[ray]
+            all_sum += w
+            if blocked[ray]:
+                incoming = wp.vec3(0.0, 0.0, 0.0)
+                if bounces > 0:
+                    incoming = indirect[ray]
+            else:
+                open_sum += w
+            d = w * wp.cw_mul(diffuse_brdf, incoming)
+            s = wp.cw_mul(specular[ray], incoming)
+            diffuse_sum += d
+            specular_sum += s
+            y = luminance(d + s)
+            total += y
+            total_squares += y * y
+        if size > 1:
+            variance += wp.max(total_squares - total * total / float(size), 0.0) * float(size) / float(size - 1)
+        else:
+            variance += total_squares
+    diffuse_out[point] = diffuse_sum
+    specular_out[point] = specular_sum
+    variance_out[point] = variance
+    visibility_out[point] = wp.where(all_sum > 0.0, open_sum / wp.max(all_sum, 1.0e-30), 1.0)
+
+
+def shade(
+    points: ShadingPoints,
+    starts: RayStarts,
+    light: Any,
+    tracer: AbstractTracer,
+    counts: SampleCounts,
+    bounces: int,
+    seed: int,
+    samples_round: int = 0,
+) -> PointLight:
+    """Outgoing light of all points, one estimate of `counts.total` rays each.
+
+    Args:
+        light: EnvironmentLight struct (environment_table.environment_light).
+        bounces: surfaces that light may meet between the environment and the points.
+        samples_round: how many estimates of the same counts and seed came before; continues their sequences.
+    """
+    device = points.normal_world.device
+    point_count = len(points.pixel)
+    result = PointLight(
+        torch.zeros(point_count, 3, device=device),
+        torch.zeros(point_count, 3, device=device),
+        torch.zeros(point_count, device=device),
+        torch.zeros(point_count, device=device),
+    )
+    if point_count == 0 or counts.total == 0:
+        return result
+    warp_dev = warp_device(result.diffuse)
+    arrays, samples = point_arrays(points), sample_set(counts, seed, samples_round)
+    start_arrays = [warp_array(starts.origin_world, wp.vec3), warp_array(starts.surface_normal_world, wp.vec3)]
+    mesh = mesh_arrays(tracer.mesh, tracer.lift)
+    sums = [
+        warp_array(result.diffuse, wp.vec3),
+        warp_array(result.specular, wp.vec3),
+        warp_array(result.variance),
+        warp_array(result.visibility),
+    ]
+    for kernel in (start_rays, scatter_hits, query_any):
+        load_kernel(kernel, warp_dev)
+
+    def batch(first: int, last: int) -> None:
+        rays = (last - first) * counts.total
+        origin, direction, specular, radiance = (torch.empty(rays, 3, device=device) for _ in range(4))
+        cosine_weight = torch.empty(rays, device=device)
+        vectors = [warp_array(t, wp.vec3) for t in (specular, radiance)]
+        wp.launch(
+            start_rays,
+            dim=rays,
+            inputs=[first * counts.total, arrays, *start_arrays, light, samples, int(bounces > 0)],
+            outputs=[warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), warp_array(cosine_weight), *vectors],
+            device=warp_dev,
+        )
+        if bounces > 0:
+            hits = tracer.closest_hits(origin, direction)
+            blocked = hits.hit
+            indirect = trace_indirect(hits, direction, first, arrays, light, mesh, samples, tracer, bounces)
+        else:
+            blocked = tracer.occluded(origin, direction)
+            indirect = radiance
+        wp.launch(
+            sum_samples,
+            dim=last - first,
+            inputs=[
+                first,
+                arrays,
+                samples,
+                warp_array(cosine_weight),
+                *vectors,
+                warp_array(blocked),
+                warp_array(indirect, wp.vec3),
+                bounces,
+            ],
+            outputs=sums,
+            device=warp_dev,
+        )
+
+    if device.type == "cpu":
+        batch_points = max(1, min(RAYS_A_BATCH // counts.total, -(-point_count // (4 * thread_count()))))
+    else:
+        batch_points = max(1, RAYS_A_BATCH_GPU // counts.total)
+    over_slices(point_count, device, batch, batch_points)
+    return result

@@ -1,0 +1,180 @@
+"""What the camera sees of a mesh, by rays: one position inside each pixel a pass (box filter).
+
+In: mesh (through its tracer), camera, seed and pass. Out: shading points with the places their rays start from, packed by pixel, or
+a GBuffer. Passes of one pixel follow an Owen-scrambled Sobol sequence over its area, so edges and textures are antialiased by
+accumulation. Shading normals are the interpolated vertex normals, not turned towards the camera: at a silhouette
+where they face away the surface is black, as in any path tracer; the back of a triangle is not seen at all.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from drgs.render.random_warp import hash_combine, sobol_2d
+from drgs.render.records import GBuffer, ShadingPoints
+from drgs.render.shade import RayStarts
+from drgs.render.trace_indirect import MeshArrays, mesh_arrays, surface_at
+from drgs.render.trace_rays import build_tracer, trace_rays
+from drgs.render.tracer import AbstractTracer
+from drgs.scene.camera import Camera
+from drgs.scene.mesh import TriangleMesh
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+PRIMARY_STREAM = wp.constant(0x5EED)
+"""Keeps the jitter's random numbers apart from those of the light samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class PrimaryPoints:
+    """The covered pixels of one pass."""
+
+    points: ShadingPoints
+    starts: RayStarts
+    depth: Float[Tensor, "point"]
+    """Along the viewing axis [world units]."""
+
+
+@wp.kernel
+def primary_rays(
+    first: int,
+    camera_from_pixel: wp.mat33,
+    world_from_camera: wp.mat33,
+    center: wp.vec3,
+    image_width: int,
+    left: int,
+    top: int,
+    width: int,
+    seed: wp.uint32,
+    index: wp.uint32,
+    jitter: float,
+    # outputs
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+):
+    i = first + wp.tid()
+    x = left + i % width
+    y = top + i // width
+    u = sobol_2d(index, hash_combine(hash_combine(seed, wp.uint32(y * image_width + x)), wp.uint32(PRIMARY_STREAM)))
+    place = wp.vec3(float(x) + 0.5 + jitter * (u[0] - 0.5), float(y) + 0.5 + jitter * (u[1] - 0.5), 1.0)
+    origin[i] = center
+    direction[i] = wp.normalize(world_from_camera * (camera_from_pixel * place))
+
+
+@wp.kernel
+def surface_points(
+    first: int,
+    face: wp.array[int],
+    barycentric: wp.array[wp.vec2],
+    mesh: MeshArrays,
+    # outputs
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    face_normal: wp.array[wp.vec3],
+    start: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    metallic: wp.array[float],
+):
+    i = first + wp.tid()
+    surface = surface_at(mesh, face[i], barycentric[i])
+    position[i] = surface.position
+    normal[i] = surface.normal
+    face_normal[i] = surface.face_normal
+    start[i] = surface.position + mesh.lift * surface.face_normal
+    albedo[i] = surface.albedo
+    roughness[i] = surface.roughness
+    metallic[i] = surface.metallic
+
+
+def _mat33(matrix: Tensor) -> wp.mat33:
+    return wp.mat33(*matrix.detach().double().cpu().reshape(-1).tolist())
+
+
+def screen_box(mesh: TriangleMesh, camera: Camera) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom [pixels, right and bottom exclusive] of the mesh's picture; the whole image when part of it is behind."""
+    camera_from_world = camera.camera_from_world.to(mesh.vertices.device)
+    in_camera = mesh.vertices.detach() @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    if float(in_camera[:, 2].amin()) <= 1e-6:
+        return 0, 0, camera.width, camera.height
+    on_screen = in_camera @ camera.intrinsics.to(mesh.vertices.device).T
+    places = on_screen[:, :2] / on_screen[:, 2:]
+    (x0, y0), (x1, y1) = places.amin(0).tolist(), places.amax(0).tolist()
+    left, top = max(0, math.floor(x0)), max(0, math.floor(y0))
+    return left, top, max(left, min(camera.width, math.ceil(x1))), max(top, min(camera.height, math.ceil(y1)))
+
+
+def trace_primary_points(
+    tracer: AbstractTracer, camera: Camera, seed: int, pass_index: int, jitter: bool = True, box: tuple[int, int, int, int] | None = None
+) -> PrimaryPoints:
+    """One ray through each pixel that may see the mesh.
+
+    Args:
+        jitter: False sends it through the pixel's centre.
+        box: `screen_box` of the mesh, where the caller knows it.
+    """
+    mesh, device = tracer.mesh, tracer.mesh.vertices.device
+    left, top, right, bottom = screen_box(mesh, camera) if box is None else box
+    ray_count = (right - left) * (bottom - top)
+    origin, direction = torch.empty(ray_count, 3, device=device), torch.empty(ray_count, 3, device=device)
+    world_from_camera = camera.camera_from_world[:3, :3].T
+    center = wp.vec3(*camera.center_world.tolist())
+    launch(
+        primary_rays,
+        ray_count,
+        [_mat33(torch.linalg.inv(camera.intrinsics.double())), _mat33(world_from_camera), center,
+         camera.width, left, top, max(1, right - left), wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
+        [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3)],
+        warp_device(origin),
+    )  # fmt: skip
+    hits = trace_rays(origin, direction, tracer)
+    ray = torch.nonzero(hits.hit).squeeze(-1)
+    count = len(ray)
+    vectors = [torch.empty(count, 3, device=device) for _ in range(5)]
+    numbers = [torch.empty(count, device=device) for _ in range(2)]
+    launch(
+        surface_points,
+        count,
+        [warp_array(hits.face[ray]), warp_array(hits.barycentric[ray], wp.vec2), mesh_arrays(mesh, tracer.lift)],
+        [*(warp_array(t, wp.vec3) for t in vectors), *(warp_array(t) for t in numbers)],
+        warp_device(origin),
+    )
+    position, normal, face_normal, start, albedo = vectors
+    width = max(1, right - left)
+    pixel = ((ray // width + top) * camera.width + ray % width + left).int()
+    view_axis = camera.camera_from_world[2, :3].to(device)
+    arriving = direction[ray]
+    depth = hits.distance[ray] * (arriving @ view_axis)
+    # Seen from the back a triangle is black: a normal that faces away makes it so whatever its vertices say.
+    behind = (face_normal * arriving).sum(-1) > 0
+    normal = torch.where((behind & ((normal * arriving).sum(-1) < 0))[:, None], -normal, normal)
+    return PrimaryPoints(ShadingPoints(position, normal, -arriving, albedo, *numbers, pixel), RayStarts(start, face_normal), depth)
+
+
+def trace_primary(
+    mesh: TriangleMesh, camera: Camera, seed: int = 0, pass_index: int = 0, jitter: bool = False, tracer: AbstractTracer | None = None
+) -> GBuffer:
+    """A G-buffer of one ray a pixel; coverage is 0 or 1."""
+    primary = trace_primary_points(build_tracer(mesh) if tracer is None else tracer, camera, seed, pass_index, jitter)
+    points, pixel = primary.points, primary.points.pixel.long()
+
+    def image(values: Tensor, empty: float = 0.0) -> Tensor:
+        flat = torch.full((camera.height * camera.width, *values.shape[1:]), empty, device=values.device)
+        flat[pixel] = values
+        return flat.reshape(camera.height, camera.width, *values.shape[1:])
+
+    return GBuffer(
+        image(torch.ones_like(primary.depth)),
+        image(primary.depth, torch.inf),
+        image(points.position_world),
+        image(points.normal_world),
+        image(points.wo_world),
+        image(points.albedo),
+        image(points.roughness),
+        image(points.metallic),
+    )

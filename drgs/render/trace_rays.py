@@ -1,0 +1,67 @@
+"""Rays in, first hits or visibility out: large batches, cut into slices over the CPU's threads.
+
+Knows nothing of shading. Which tracer answers follows the mesh's device: Embree on the CPU, Warp elsewhere.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from drgs.render.records import Hits
+from drgs.render.tracer import AbstractTracer
+from drgs.render.tracer_embree import EmbreeTracer
+from drgs.render.tracer_warp import WarpTracer, query_any
+from drgs.scene.mesh import TriangleMesh
+from drgs.warp_torch import load_kernel, thread_count, thread_pool
+
+SLICE_RAYS = 65536
+"""Rays of a CPU slice: long enough to hide Python, short enough to balance threads."""
+SLICE_RAYS_GPU = 1 << 24
+
+
+def build_tracer(mesh: TriangleMesh) -> AbstractTracer:
+    """The fastest tracer of the mesh's device."""
+    return EmbreeTracer(mesh) if mesh.vertices.device.type == "cpu" else WarpTracer(mesh)
+
+
+def over_slices(count: int, device: torch.device, work: Callable[[int, int], object], slice_length: int | None = None) -> list:
+    """work(first, last) for slices of range(count): over the thread pool on the CPU, one after the other elsewhere.
+
+    `work` may call kernels by wp.launch and tracers, but nothing that waits for the pool itself.
+    """
+    if count == 0:
+        return []
+    slices = -(-count // (slice_length or (SLICE_RAYS if device.type == "cpu" else SLICE_RAYS_GPU)))
+    edges = [count * k // slices for k in range(slices + 1)]
+    if device.type != "cpu" or thread_count() == 1 or slices == 1:
+        return [work(a, b) for a, b in pairwise(edges)]
+    return [done.result() for done in [thread_pool().submit(work, a, b) for a, b in pairwise(edges)]]
+
+
+def trace_rays(origins: Tensor, directions: Tensor, tracer: AbstractTracer) -> Hits:
+    """First hits of rays (ray, 3) with unit directions."""
+    origins, directions = origins.detach().float().contiguous(), directions.detach().float().contiguous()
+    _compile_once(tracer)
+    parts = over_slices(len(origins), origins.device, lambda a, b: tracer.closest_hits(origins[a:b], directions[a:b]))
+    if len(parts) == 1:
+        return parts[0]
+    if not parts:
+        return tracer.closest_hits(origins, directions)
+    return Hits(*(torch.cat([getattr(part, name) for part in parts]) for name in ("hit", "distance", "face", "barycentric")))
+
+
+def trace_visibility(origins: Tensor, directions: Tensor, tracer: AbstractTracer) -> Tensor:
+    """(ray,) bool: True where nothing lies along the ray."""
+    origins, directions = origins.detach().float().contiguous(), directions.detach().float().contiguous()
+    _compile_once(tracer)
+    parts = over_slices(len(origins), origins.device, lambda a, b: tracer.occluded(origins[a:b], directions[a:b]))
+    return ~torch.cat(parts) if parts else torch.zeros(0, dtype=torch.bool, device=origins.device)
+
+
+def _compile_once(tracer: AbstractTracer) -> None:
+    """Load Warp's kernels before threads race for them."""
+    if isinstance(tracer, WarpTracer):
+        load_kernel(query_any, wp.device_from_torch(tracer.mesh.vertices.device))

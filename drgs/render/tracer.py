@@ -1,0 +1,43 @@
+"""What every ray tracer against a mesh offers. Implementations: tracer_embree (CPU), tracer_warp (CPU and CUDA)."""
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+
+from drgs.render.records import Hits
+from drgs.scene.mesh import TriangleMesh
+
+LIFT_OF_EXTENT = 1e-5
+"""Ray origins stand this share of the mesh's extent off its surface ..."""
+LIFT_OF_COORDINATE = 1e-6
+"""... plus this share of the largest coordinate: about eight float32 steps, for meshes far from the origin."""
+
+
+class AbstractTracer(ABC):
+    """Answers ray queries on the calling thread; callers may use it from several threads at once.
+
+    Rays are (ray, 3) float32 tensors on the mesh's device; directions are unit. A void ray is one whose origin is far
+    outside (see sample_rays): it misses at the root.
+    """
+
+    mesh: TriangleMesh
+    lift: float
+    """How far ray origins must stand off the surface [world units]."""
+    extent: float
+    """Diagonal of the mesh's box [world units]."""
+
+    @abstractmethod
+    def closest_hits(self, origins: Tensor, directions: Tensor) -> Hits:
+        """First surface along each ray."""
+
+    @abstractmethod
+    def occluded(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """(ray,) bool: whether anything at all lies along each ray."""
+
+
+def mesh_extent(mesh: TriangleMesh) -> tuple[float, float]:
+    """Diagonal of the box and the lift of ray origins [world units] of a mesh."""
+    low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
+    extent = float(torch.linalg.norm(high - low))
+    return extent, LIFT_OF_EXTENT * extent + LIFT_OF_COORDINATE * float(torch.maximum(low.abs(), high.abs()).max())
