@@ -1,0 +1,104 @@
+/** The REST calls of the viewer, each once. Every failure is an ApiError whose message is a sentence for the user. */
+
+import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobInfo, JobList, Problem, SessionInfo, SessionList } from './protocol.gen';
+
+export class ApiError extends Error {
+  constructor(
+    readonly status: number,
+    message: string,
+  ) {
+    super(message);
+  }
+}
+
+const UNREACHABLE = 'The server does not answer. Check that `drgs serve` is still running.';
+
+function sentenceFor(status: number, body: string): string {
+  try {
+    const problem = JSON.parse(body) as Partial<Problem>;
+    if (typeof problem.detail === 'string' && problem.detail) return problem.detail;
+  } catch {
+    // not a problem document: fall through to the status
+  }
+  if (status === 401 || status === 403) return 'This page is not signed in. Open the link with the token that `drgs serve` printed.';
+  if (status === 404) return 'The server no longer has that.';
+  if (status === 413) return 'That file is larger than the server accepts.';
+  return `The server answered with error ${status}. Its log says more.`;
+}
+
+async function call<T>(method: string, path: string, body?: unknown): Promise<T> {
+  let response: Response;
+  try {
+    response = await fetch(path, {
+      method,
+      headers: body === undefined ? undefined : { 'Content-Type': 'application/json' },
+      body: body === undefined ? undefined : JSON.stringify(body),
+    });
+  } catch {
+    throw new ApiError(0, UNREACHABLE);
+  }
+  const text = await response.text();
+  if (!response.ok) throw new ApiError(response.status, sentenceFor(response.status, text));
+  return (text ? JSON.parse(text) : undefined) as T;
+}
+
+/** Send a form by XMLHttpRequest, which unlike fetch tells how far an upload is (0..1). */
+function upload<T>(path: string, form: FormData, onProgress?: (share: number) => void): Promise<T> {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    request.open('POST', path);
+    request.upload.onprogress = (event) => event.lengthComputable && onProgress?.(event.loaded / event.total);
+    request.onload = () => {
+      if (request.status >= 200 && request.status < 300) resolve(JSON.parse(request.responseText) as T);
+      else reject(new ApiError(request.status, sentenceFor(request.status, request.responseText)));
+    };
+    request.onerror = () => reject(new ApiError(0, UNREACHABLE));
+    request.send(form);
+  });
+}
+
+const part = encodeURIComponent;
+
+export const login = (token: string) => call<void>('POST', '/api/login', { token });
+
+export const listAssets = () => call<AssetList>('GET', '/api/assets');
+export const assetThumb = (asset: AssetInfo) => `/api/assets/${part(asset.id)}/thumb.jpg`;
+export const assetMesh = (id: string) => `/api/assets/${part(id)}/mesh.glb`;
+export const assetEnvironment = (id: string) => `/api/assets/${part(id)}/environment.exr`;
+export const assetExport = (id: string, format: ExportFormat) => `/api/assets/${part(id)}/export?format=${format}`;
+export type ExportFormat = 'glb' | 'ply' | 'env';
+
+export function uploadAsset(file: File, onProgress?: (share: number) => void): Promise<AssetInfo> {
+  const form = new FormData();
+  form.append('file', file);
+  return upload('/api/assets', form, onProgress);
+}
+
+export const listEnvironments = () => call<EnvironmentList>('GET', '/api/environments');
+export const environmentThumb = (name: string) => `/api/environments/${part(name)}/thumb.jpg`;
+export const environmentFile = (name: string) => `/api/environments/${part(name)}`;
+
+export function uploadEnvironment(file: File, onProgress?: (share: number) => void): Promise<EnvironmentInfo> {
+  const form = new FormData();
+  form.append('file', file);
+  return upload('/api/environments', form, onProgress);
+}
+
+export const listJobs = () => call<JobList>('GET', '/api/jobs');
+export const startBuild = (request: BuildRequest) => call<JobInfo>('POST', '/api/jobs', request);
+export const cancelJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/cancel`);
+export const retryJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/retry`);
+export const jobPreview = (job: JobInfo) => `/api/jobs/${part(job.id)}/preview.jpg?v=${job.preview_version}`;
+
+export function uploadCapture(file: File, preset: string, onProgress?: (share: number) => void): Promise<JobInfo> {
+  const form = new FormData();
+  form.append('preset', preset);
+  form.append('name', file.name.replace(/\.zip$/i, ''));
+  form.append('file', file);
+  return upload('/api/jobs', form, onProgress);
+}
+
+export const listSessions = () => call<SessionList>('GET', '/api/sessions');
+export const openSession = (asset: string) => call<SessionInfo>('POST', '/api/sessions', { asset });
+export const getSession = (id: string) => call<SessionInfo>('GET', `/api/sessions/${part(id)}`);
+export const appendEdit = (session: string, edit: Edit) => call<unknown>('POST', `/api/sessions/${part(session)}/edits`, { edit });

@@ -1,0 +1,103 @@
+/** Builds, assets and environments: what the server holds, kept up to date by asking. */
+
+import * as api from './api';
+import type { AssetInfo, JobInfo } from './protocol.gen';
+import { openAsset } from './session';
+import { assets, attempt, environments, jobs, notify, session, workersAlive } from './state';
+
+const BUSY_MS = 1000;
+const IDLE_MS = 6000;
+
+export const isActive = (job: JobInfo) => job.state === 'queued' || job.state === 'running' || job.state === 'stalled';
+
+/** Builds started from this page open their asset when it is ready, unless the user has opened another meanwhile. */
+const toOpen = new Set<string>();
+
+export async function refreshJobs(): Promise<void> {
+  const list = await api.listJobs();
+  const before = new Map(jobs.value.map((job) => [job.id, job.state]));
+  jobs.value = list.jobs;
+  workersAlive.value = list.workers_alive;
+  for (const job of list.jobs) {
+    const earlier = before.get(job.id);
+    if (earlier === undefined || earlier === job.state) continue;
+    if (job.state === 'done') await built(job);
+    if (job.state === 'failed') notify(`The build “${job.name}” failed: ${job.error ?? 'the server gave no reason.'}`);
+  }
+}
+
+async function built(job: JobInfo): Promise<void> {
+  await refreshAssets();
+  const wanted = toOpen.delete(job.id);
+  if (job.asset_id && (wanted || !session.value)) await openAsset(job.asset_id);
+  else notify(`“${job.name}” is built: find it under Assets.`, 'info');
+}
+
+export async function refreshAssets(): Promise<void> {
+  assets.value = (await api.listAssets()).assets;
+}
+
+export async function refreshEnvironments(): Promise<void> {
+  environments.value = (await api.listEnvironments()).environments;
+}
+
+/** Ask for jobs for as long as the page lives: often while one runs, seldom otherwise, not at all while hidden. */
+export function watchJobs(): void {
+  let failing = false;
+  const step = async () => {
+    if (!document.hidden) {
+      try {
+        await refreshJobs();
+        if (failing) await Promise.all([refreshAssets(), refreshEnvironments()]);
+        failing = false;
+      } catch (error) {
+        // Said once; the stream's own "reconnecting" sign stays on while the server is away.
+        if (!failing) notify((error as Error).message);
+        failing = true;
+      }
+    }
+    setTimeout(step, failing || jobs.value.some(isActive) ? BUSY_MS : IDLE_MS);
+  };
+  void step();
+}
+
+async function follow(started: Promise<JobInfo>): Promise<void> {
+  const job = await attempt(started);
+  if (!job) return;
+  toOpen.add(job.id);
+  jobs.value = [job, ...jobs.value.filter((other) => other.id !== job.id)];
+  void attempt(refreshJobs());
+}
+
+export const buildSample = (preset: Preset) => follow(api.startBuild({ dataset: 'sample', preset }));
+export const retry = (job: JobInfo) => follow(api.retryJob(job.id));
+export type Preset = 'draft' | 'fast' | 'full';
+
+export async function cancel(job: JobInfo): Promise<void> {
+  await attempt(api.cancelJob(job.id));
+  await attempt(refreshJobs());
+}
+
+/** Take a dropped or chosen file by what its name says it is; returns what was made of it. */
+export async function takeFile(file: File, preset: Preset, onProgress: (share: number) => void): Promise<'environment' | 'asset' | 'build' | null> {
+  const name = file.name.toLowerCase();
+  if (/\.(exr|hdr)$/.test(name)) {
+    const added = await attempt(api.uploadEnvironment(file, onProgress));
+    if (!added) return null;
+    await attempt(refreshEnvironments());
+    return 'environment';
+  }
+  if (/\.(glb|obj|ply)$/.test(name)) {
+    const added: AssetInfo | null = await attempt(api.uploadAsset(file, onProgress));
+    if (!added) return null;
+    await attempt(refreshAssets());
+    await openAsset(added.id);
+    return 'asset';
+  }
+  if (name.endsWith('.zip')) {
+    await follow(api.uploadCapture(file, preset, onProgress));
+    return 'build';
+  }
+  notify(`“${file.name}” is none of the kinds that can be dropped here: a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr).`);
+  return null;
+}

@@ -1,0 +1,83 @@
+/** The one table of keys: it feeds the keyboard handler, the tool-tips and the `?` help. Pointer rows are for the help only. */
+
+export interface Shortcut {
+  group: 'Camera' | 'Light' | 'Edit' | 'View' | 'Panels';
+  /** As `chordOf` writes it, e.g. `mod+shift+z`; several chords may do the same. Empty for pointer gestures. */
+  chords: string[];
+  /** What the help shows for a gesture without keys. */
+  gesture?: string;
+  text: string;
+  action?: ActionName;
+}
+
+export type ActionName =
+  | 'frame' | 'home' | 'undo' | 'redo' | 'help' | 'escape' | 'local' | 'theme' | 'library' | 'inspector'
+  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'still' | 'before';
+
+export const shortcuts: Shortcut[] = [
+  { group: 'Camera', chords: [], gesture: 'Left drag, one finger', text: 'Orbit' },
+  { group: 'Camera', chords: [], gesture: 'Right drag, Shift+middle drag, two fingers', text: 'Pan' },
+  { group: 'Camera', chords: [], gesture: 'Wheel, Ctrl+middle drag, pinch', text: 'Zoom' },
+  { group: 'Camera', chords: [], gesture: 'Double-click', text: 'Put the focal point on the surface' },
+  { group: 'Camera', chords: ['f'], text: 'Frame the object', action: 'frame' },
+  { group: 'Camera', chords: ['shift+f'], text: 'Reset the camera', action: 'home' },
+  { group: 'Light', chords: [], gesture: 'Alt+drag, Shift+right drag', text: 'Turn the environment' },
+  { group: 'Edit', chords: ['mod+z'], text: 'Undo', action: 'undo' },
+  { group: 'Edit', chords: ['mod+shift+z', 'mod+y'], text: 'Redo', action: 'redo' },
+  { group: 'Edit', chords: [], gesture: 'Double-click a slider', text: 'Reset that value' },
+  { group: 'View', chords: ['1'], text: 'Final picture', action: 'channel1' },
+  { group: 'View', chords: ['2'], text: 'Albedo', action: 'channel2' },
+  { group: 'View', chords: ['3'], text: 'Roughness', action: 'channel3' },
+  { group: 'View', chords: ['4'], text: 'Metallic', action: 'channel4' },
+  { group: 'View', chords: ['5'], text: 'Normal', action: 'channel5' },
+  { group: 'View', chords: ['6'], text: 'Depth', action: 'channel6' },
+  { group: 'View', chords: ['p'], text: 'Instant local picture on or off', action: 'local' },
+  { group: 'View', chords: ['mod+s'], text: 'Save the picture as PNG', action: 'still' },
+  { group: 'Panels', chords: ['l'], text: 'Library', action: 'library' },
+  { group: 'Panels', chords: ['i'], text: 'Inspector', action: 'inspector' },
+  { group: 'Panels', chords: ['t'], text: 'Dark or light theme', action: 'theme' },
+  { group: 'Panels', chords: ['?'], text: 'This list', action: 'help' },
+  { group: 'Panels', chords: ['escape'], text: 'Close what is open', action: 'escape' },
+];
+
+const isApple = /Mac|iPhone|iPad/.test(navigator.platform);
+
+/** `mod` stands for Ctrl, or ⌘ on Apple machines. Shift is named only beside letters and named keys: `?` already implies it. */
+export function chordOf(event: KeyboardEvent): string {
+  const key = event.key.toLowerCase();
+  const parts: string[] = [];
+  if (isApple ? event.metaKey : event.ctrlKey) parts.push('mod');
+  if (event.altKey) parts.push('alt');
+  if (event.shiftKey && (key.length > 1 || key !== key.toUpperCase())) parts.push('shift');
+  return [...parts, key].join('+');
+}
+
+export function chordText(chord: string): string {
+  const names: Record<string, string> = isApple ? { mod: '⌘', shift: '⇧', alt: '⌥', escape: 'Esc' } : { mod: 'Ctrl', shift: 'Shift', alt: 'Alt', escape: 'Esc' };
+  return chord.split('+').map((part) => names[part] ?? part.toUpperCase()).join(isApple ? '' : '+');
+}
+
+/** Tool-tip text: what a button does and the key that does it too. */
+export function titleFor(action: ActionName, text?: string): string {
+  const entry = shortcuts.find((shortcut) => shortcut.action === action);
+  const chord = entry?.chords[0];
+  return `${text ?? entry?.text ?? action}${chord ? ` (${chordText(chord)})` : ''}`;
+}
+
+/** Route key presses to `actions`; typing in a field keeps its own keys, except Escape and the undo chords of the page. */
+export function listenForKeys(actions: Partial<Record<ActionName, () => void>>): () => void {
+  const byChord = new Map(shortcuts.flatMap((entry) => entry.chords.map((chord) => [chord, entry.action] as const)));
+  const onKey = (event: KeyboardEvent) => {
+    const chord = chordOf(event);
+    const target = event.target as HTMLElement;
+    const typing = target.matches('input:not([type=range]):not([type=checkbox]):not([type=radio]):not([type=color]), textarea, select');
+    if (typing && chord !== 'escape') return;
+    const action = byChord.get(chord);
+    const run = action && actions[action];
+    if (!run) return;
+    event.preventDefault();
+    run();
+  };
+  window.addEventListener('keydown', onKey);
+  return () => window.removeEventListener('keydown', onKey);
+}

@@ -1,0 +1,228 @@
+/**
+ * One WebSocket to a session: JSON text both ways, pictures as binary (docs/protocol.md).
+ *
+ * Camera and settings are latest-wins and sent at most every CAMERA_INTERVAL_MS. Edits, undo and redo are ordered: they wait
+ * in `outbox` until the server has accepted or rejected them, and are sent again after a reconnection, so none is lost.
+ */
+
+import {
+  CAMERA_NUMBER_SHIFT,
+  CLOSE_VERSION_MISMATCH,
+  FRAME_HEADER_BYTES,
+  PROTOCOL_VERSION,
+  readFrameHeader,
+  type CameraMessage,
+  type ClientMessage,
+  type Edit,
+  type EditMessage,
+  type FrameHeader,
+  type PickedMessage,
+  type RedoMessage,
+  type ServerHello,
+  type ServerMessage,
+  type Settings,
+  type UndoMessage,
+} from './protocol.gen';
+
+const CAMERA_INTERVAL_MS = 25;
+const RECONNECT_FIRST_MS = 200;
+const RECONNECT_LONGEST_MS = 2000;
+
+export type Connection = 'connecting' | 'open' | 'lost' | 'closed';
+type Ordered = EditMessage | UndoMessage | RedoMessage;
+
+export interface StreamEvents {
+  connection(state: Connection): void;
+  hello(message: ServerHello): void;
+  message(message: Exclude<ServerMessage, ServerHello | PickedMessage>): void;
+  /** The decoded picture; the receiver closes it. `cameraNumber`: low 8 bits of the number of the camera that it shows. */
+  frame(header: FrameHeader, picture: ImageBitmap, cameraNumber: number): void;
+  /** The server will not take this client back; `reason` is for the user. */
+  refused(reason: string): void;
+  /** The connection dropped: ask whether the session still exists, and under which id. Null: keep trying the same one. */
+  lost(): Promise<string | null>;
+}
+
+export class Stream {
+  private socket: WebSocket | null = null;
+  private ready = false;
+  private closed = false;
+  private retryMs = RECONNECT_FIRST_MS;
+  private nextId = 1;
+  private outbox: Ordered[] = [];
+  private camera: CameraMessage | null = null;
+  private cameraNumber = 0;
+  private cameraSentAt = 0;
+  private cameraTimer = 0;
+  private settings: Settings | null = null;
+  private settingsTimer = 0;
+  private picks = new Map<number, (picked: PickedMessage) => void>();
+  private newestFrame = 0;
+
+  constructor(
+    private session: string,
+    private readonly events: StreamEvents,
+  ) {
+    this.connect();
+    document.addEventListener('visibilitychange', this.onVisibility);
+  }
+
+  close(): void {
+    this.closed = true;
+    document.removeEventListener('visibilitychange', this.onVisibility);
+    this.socket?.close();
+    this.events.connection('closed');
+  }
+
+  /** Number by which frames will name this camera (low 8 bits). */
+  sendCamera(camera: Omit<CameraMessage, 'type' | 'number'>): number {
+    this.cameraNumber = (this.cameraNumber + 1) >>> 0;
+    this.camera = { type: 'camera', number: this.cameraNumber, ...camera };
+    if (!this.cameraTimer) {
+      const wait = Math.max(0, this.cameraSentAt + CAMERA_INTERVAL_MS - performance.now());
+      this.cameraTimer = window.setTimeout(this.flushCamera, wait);
+    }
+    return this.cameraNumber & 0xff;
+  }
+
+  sendSettings(settings: Settings): void {
+    this.settings = settings;
+    if (!this.settingsTimer) this.settingsTimer = window.setTimeout(this.flushSettings, CAMERA_INTERVAL_MS);
+  }
+
+  /** The id that `accepted` or `rejected` will repeat. */
+  sendEdit(edit: Edit, coalesce: string | null): number {
+    return this.order({ type: 'edit', id: this.nextId++, edit, coalesce });
+  }
+
+  undo(): number {
+    return this.order({ type: 'undo', id: this.nextId++ });
+  }
+
+  redo(): number {
+    return this.order({ type: 'redo', id: this.nextId++ });
+  }
+
+  /** What lies under a point of the picture, as shares of its width and height. */
+  pick(x: number, y: number): Promise<PickedMessage> {
+    const id = this.nextId++;
+    return new Promise((resolve) => {
+      if (!this.ready) return resolve({ type: 'picked', id, hit: false, position: null, normal: null, albedo: null, roughness: null, metallic: null });
+      this.picks.set(id, resolve);
+      this.send({ type: 'pick', id, x, y });
+    });
+  }
+
+  get unanswered(): number {
+    return this.outbox.length;
+  }
+
+  private order(message: Ordered): number {
+    this.outbox.push(message);
+    if (this.ready) this.send(message);
+    return message.id;
+  }
+
+  private send(message: ClientMessage): void {
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  private flushCamera = () => {
+    this.cameraTimer = 0;
+    if (!this.ready || !this.camera) return;
+    this.cameraSentAt = performance.now();
+    this.send(this.camera);
+  };
+
+  private flushSettings = () => {
+    this.settingsTimer = 0;
+    if (this.ready && this.settings) this.send({ type: 'settings', settings: this.settings });
+  };
+
+  private onVisibility = () => {
+    if (this.ready) this.send({ type: 'visibility', visible: !document.hidden });
+  };
+
+  private connect(): void {
+    this.events.connection('connecting');
+    const scheme = location.protocol === 'https:' ? 'wss' : 'ws';
+    const socket = new WebSocket(`${scheme}://${location.host}/api/sessions/${this.session}/stream`);
+    socket.binaryType = 'arraybuffer';
+    this.socket = socket;
+    socket.onopen = () => this.send({ type: 'hello', v: PROTOCOL_VERSION, codecs: ['jpeg', 'png'], client: 'viewer' });
+    socket.onmessage = (event: MessageEvent<string | ArrayBuffer>) => {
+      if (typeof event.data === 'string') this.receive(JSON.parse(event.data) as ServerMessage);
+      else void this.receiveFrame(event.data);
+    };
+    socket.onclose = (event) => void this.dropped(socket, event);
+  }
+
+  private receive(message: ServerMessage): void {
+    switch (message.type) {
+      case 'hello':
+        this.ready = true;
+        this.retryMs = RECONNECT_FIRST_MS;
+        this.newestFrame = 0;
+        this.events.hello(message);
+        this.events.connection('open');
+        this.flushSettings();
+        this.flushCamera();
+        if (document.hidden) this.onVisibility();
+        for (const waiting of this.outbox) this.send(waiting);
+        return;
+      case 'picked':
+        this.picks.get(message.id)?.(message);
+        this.picks.delete(message.id);
+        return;
+      case 'accepted':
+      case 'rejected':
+        this.outbox = this.outbox.filter((waiting) => waiting.id !== message.id);
+        break;
+      case 'error':
+        if (message.fatal) {
+          this.closed = true;
+          this.events.refused(message.message);
+        }
+        break;
+    }
+    this.events.message(message);
+  }
+
+  private async receiveFrame(data: ArrayBuffer): Promise<void> {
+    if (data.byteLength <= FRAME_HEADER_BYTES) return;
+    const header = readFrameHeader(data);
+    const socket = this.socket;
+    const picture = await createImageBitmap(new Blob([new Uint8Array(data, FRAME_HEADER_BYTES)])).catch(() => null);
+    if (socket !== this.socket) return picture?.close();
+    // Decoding may finish out of order; an older picture must not replace a newer one.
+    if (picture && header.frameId > this.newestFrame) {
+      this.newestFrame = header.frameId;
+      this.events.frame(header, picture, header.flags >> CAMERA_NUMBER_SHIFT);
+    } else picture?.close();
+    this.send({ type: 'ack', frame_id: header.frameId });
+  }
+
+  private async dropped(socket: WebSocket, event: CloseEvent): Promise<void> {
+    if (socket !== this.socket) return;
+    this.ready = false;
+    for (const [id, resolve] of this.picks) resolve({ type: 'picked', id, hit: false, position: null, normal: null, albedo: null, roughness: null, metallic: null });
+    this.picks.clear();
+    if (this.closed) return;
+    if (event.code === CLOSE_VERSION_MISMATCH) {
+      this.closed = true;
+      this.events.refused(event.reason || 'This page is older or newer than the server. Reload the page.');
+      return;
+    }
+    this.events.connection('lost');
+    const wait = this.retryMs;
+    this.retryMs = Math.min(RECONNECT_LONGEST_MS, this.retryMs * 2);
+    await new Promise((resolve) => setTimeout(resolve, wait));
+    const session = await this.events.lost();
+    if (this.closed) return;
+    if (session && session !== this.session) {
+      this.session = session;
+      this.outbox = []; // the new session was given the whole log
+    }
+    this.connect();
+  }
+}

@@ -1,0 +1,45 @@
+/** What the picture is right now: samples, size, speed, and whether the server is there. */
+
+import { connection, session, settings, status } from '../state';
+
+const PHASE_TEXT = { loading: 'Loading the asset…', moving: 'Moving', still: 'Refining', converged: 'Converged', paused: 'Paused' };
+
+export function Hud() {
+  if (!session.value) return null;
+  const now = status.value;
+  const link = connection.value;
+  const state = link === 'lost' || (link === 'connecting' && now) ? 'Reconnecting…' : link === 'connecting' ? 'Opening…' : link === 'closed' ? 'Disconnected' : now ? PHASE_TEXT[now.phase] : 'Loading the asset…';
+  const kind = link !== 'open' ? 'away' : now?.phase === 'converged' ? 'done' : 'busy';
+  const scale = now && now.scale < 0.995 ? ` (${Math.round(100 * now.scale)} %)` : '';
+  return (
+    <div class="hud" data-state={link === 'open' ? now?.phase ?? 'loading' : link}>
+      <span class={`lamp ${kind}`} aria-hidden="true" />
+      <span role="status">{state}</span>
+      {now && link === 'open' && (
+        <>
+          {settings.value.channel === 'final' && (
+            <span class="hud-samples">
+              Sample {now.spp}/{now.spp_target}
+            </span>
+          )}
+          <span>
+            {now.width}×{now.height}
+            {scale}
+          </span>
+          <span>{now.frames_per_second.toFixed(now.frames_per_second < 10 ? 1 : 0)} fps</span>
+          <span>{now.render_ms.toFixed(0)} ms</span>
+          {now.notes.length > 0 && (
+            <span class="hud-notes" title={now.notes.join('\n')}>
+              {now.notes.length === 1 ? now.notes[0] : `${now.notes.length} skips`}
+            </span>
+          )}
+        </>
+      )}
+      {now && link === 'open' && now.phase !== 'converged' && settings.value.channel === 'final' && (
+        <div class="hud-bar" aria-hidden="true">
+          <div style={{ width: `${(100 * now.spp) / Math.max(1, now.spp_target)}%` }} />
+        </div>
+      )}
+    </div>
+  );
+}

@@ -1,0 +1,156 @@
+/** Form pieces that every panel uses. While a value is dragged they show the dragged value, not the echo of the server. */
+
+import { useState } from 'preact/hooks';
+import type { ComponentChildren } from 'preact';
+import { hexFromLinear, linearFromHex, type Triple } from '../color';
+import { Icon } from './icons';
+
+export function Section({ title, children, open = true }: { title: string; children: ComponentChildren; open?: boolean }) {
+  return (
+    <details class="section" open={open}>
+      <summary>{title}</summary>
+      <div class="section-body">{children}</div>
+    </details>
+  );
+}
+
+export interface SliderProps {
+  label: string;
+  value: number;
+  min: number;
+  max: number;
+  step: number;
+  unit?: string;
+  /** Not set by the user yet: shown dimmed. */
+  unset?: boolean;
+  onChange(value: number): void;
+  /** Absent: there is nothing to go back to. */
+  onReset?: () => void;
+}
+
+const clamp = (value: number, low: number, high: number) => Math.min(high, Math.max(low, value));
+
+export function Slider({ label, value, min, max, step, unit, unset, onChange, onReset }: SliderProps) {
+  const [dragged, setDragged] = useState<number | null>(null);
+  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  const shown = dragged ?? value;
+  const id = `slider-${label.toLowerCase().replace(/\W+/g, '-')}`;
+  const set = (text: string) => {
+    const number = Number(text);
+    if (text.trim() !== '' && Number.isFinite(number)) onChange(clamp(number, min, max));
+  };
+  return (
+    <div class={`field${unset ? ' unset' : ''}`}>
+      <label for={id}>{label}</label>
+      <input
+        id={id}
+        type="range"
+        min={min}
+        max={max}
+        step={step}
+        value={clamp(shown, min, max)}
+        style={{ '--share': `${(100 * (clamp(shown, min, max) - min)) / (max - min)}%` }}
+        onInput={(event) => {
+          setDragged(event.currentTarget.valueAsNumber);
+          onChange(event.currentTarget.valueAsNumber);
+        }}
+        onChange={() => setDragged(null)}
+        onDblClick={onReset}
+      />
+      <span class="number">
+        <input type="number" aria-label={`${label}, exact value`} min={min} max={max} step={step} value={shown.toFixed(digits)} onChange={(event) => set(event.currentTarget.value)} />
+        {unit && <span class="unit">{unit}</span>}
+      </span>
+      <ResetButton label={label} onReset={onReset} />
+    </div>
+  );
+}
+
+function ResetButton({ label, onReset }: { label: string; onReset?: () => void }) {
+  return (
+    <button class="reset" title={`Reset ${label.toLowerCase()}`} aria-label={`Reset ${label.toLowerCase()}`} disabled={!onReset} onClick={onReset}>
+      <Icon name="reset" />
+    </button>
+  );
+}
+
+interface ColorProps {
+  label: string;
+  value: Triple;
+  unset?: boolean;
+  onChange(value: Triple): void;
+  onReset?: () => void;
+}
+
+/** A colour as sRGB (picker and hex) and as the linear numbers that the renderer uses. */
+export function ColorField({ label, value, unset, onChange, onReset }: ColorProps) {
+  const [wrongHex, setWrongHex] = useState(false);
+  const hex = hexFromLinear(value);
+  const takeHex = (text: string) => {
+    const linear = linearFromHex(text);
+    setWrongHex(linear === null);
+    if (linear) onChange(linear);
+  };
+  return (
+    <div class={`color-field${unset ? ' unset' : ''}`}>
+      <div class="field">
+        <label for="color-picker">{label}</label>
+        <input id="color-picker" type="color" value={hex} onInput={(event) => takeHex(event.currentTarget.value)} />
+        <input class="hex" type="text" aria-label={`${label}, sRGB hex`} aria-invalid={wrongHex} spellcheck={false} maxLength={7} value={hex} onChange={(event) => takeHex(event.currentTarget.value)} />
+        <ResetButton label={label} onReset={onReset} />
+      </div>
+      <div class="field linear">
+        <span class="label">Linear</span>
+        {(['Red', 'Green', 'Blue'] as const).map((name, i) => (
+          <input
+            type="number"
+            aria-label={`${label}, linear ${name.toLowerCase()}`}
+            title={name}
+            min={0}
+            max={1}
+            step={0.01}
+            value={value[i]!.toFixed(3)}
+            onChange={(event) => {
+              const number = event.currentTarget.valueAsNumber;
+              if (Number.isFinite(number)) onChange(value.map((old, k) => (k === i ? clamp(number, 0, 1) : old)) as Triple);
+            }}
+          />
+        ))}
+      </div>
+    </div>
+  );
+}
+
+interface ChoiceProps<T extends string> {
+  label: string;
+  value: T;
+  options: { value: T; text: string; title?: string }[];
+  onChange(value: T): void;
+}
+
+/** One of a few, as joined buttons (radio buttons to a screen reader and the arrow keys). */
+export function Choice<T extends string>({ label, value, options, onChange }: ChoiceProps<T>) {
+  const name = `choice-${label.toLowerCase().replace(/\W+/g, '-')}`;
+  return (
+    <fieldset class="choice">
+      <legend>{label}</legend>
+      <div class="choice-row">
+        {options.map((option) => (
+          <label title={option.title}>
+            <input type="radio" name={name} value={option.value} checked={option.value === value} onChange={() => onChange(option.value)} />
+            <span>{option.text}</span>
+          </label>
+        ))}
+      </div>
+    </fieldset>
+  );
+}
+
+export function Switch({ label, value, onChange, title }: { label: string; value: boolean; onChange(value: boolean): void; title?: string }) {
+  return (
+    <label class="switch" title={title}>
+      <input type="checkbox" role="switch" checked={value} onChange={(event) => onChange(event.currentTarget.checked)} />
+      <span>{label}</span>
+    </label>
+  );
+}
