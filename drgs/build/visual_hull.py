@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import warp as wp
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy import ndimage
@@ -19,16 +20,17 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from drgs.scene.views import Views
+from drgs.warp_torch import launch, warp_array, warp_device
 
-_Lookup = Callable[[int, Tensor, Tensor, Tensor], Tensor]
-"""View, pixel x, pixel y, depth (each (n,)) → (channels, n)."""
+MOST_OUTVOTED = 3
+"""The kernel keeps the MOST_OUTVOTED + 1 smallest values in one wp.vec4."""
 
 
 @dataclass(frozen=True)
 class VisualHullSettings:
     coarse_cells: int = 64
     """Cells along the longest axis of the box in which the object is looked for."""
-    fine_cells: int = 144
+    fine_cells: int = 192
     """Cells along the longest axis of the box that holds the object."""
     wrong_mask_share: float = 0.03
     """Share of the views whose masks may be wrong."""
@@ -49,6 +51,50 @@ class VisualHull:
     """Edge of a voxel [world units]."""
 
 
+@wp.kernel
+def outvote(
+    first: int,
+    points: wp.array[wp.vec3],
+    pixel_from_world: wp.array[wp.vec4],
+    masks: wp.array3d[wp.uint8],
+    outvoted: int,
+    fewest_seen: int,
+    # outputs
+    field: wp.array[float],
+):
+    """One thread a point: the (outvoted+1)-th smallest coverage, looked up bilinearly, over the views that see the point."""
+    i = first + wp.tid()
+    point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
+    width = masks.shape[2]
+    height = masks.shape[1]
+    smallest = wp.vec4(1.0, 1.0, 1.0, 1.0)
+    seen = int(0)  # noqa: RUF046  Warp: a variable changed in a loop must not be a constant
+    for view in range(masks.shape[0]):
+        depth = wp.dot(pixel_from_world[3 * view + 2], point)
+        if depth > 1.0e-6:
+            x = wp.dot(pixel_from_world[3 * view], point) / depth
+            y = wp.dot(pixel_from_world[3 * view + 1], point) / depth
+            # A view that does not see the point says nothing about it.
+            if x >= 0.0 and y >= 0.0 and x < float(width) and y < float(height):
+                seen += 1
+                u = wp.clamp(x - 0.5, 0.0, float(width - 1))
+                v = wp.clamp(y - 0.5, 0.0, float(height - 1))
+                column = wp.min(int(u), width - 2)
+                row = wp.min(int(v), height - 2)
+                fu = u - float(column)
+                fv = v - float(row)
+                top = float(masks[view, row, column]) * (1.0 - fu) + float(masks[view, row, column + 1]) * fu
+                bottom = float(masks[view, row + 1, column]) * (1.0 - fu) + float(masks[view, row + 1, column + 1]) * fu
+                value = (top * (1.0 - fv) + bottom * fv) / 255.0
+                for rank in range(4):
+                    larger = wp.max(smallest[rank], value)
+                    smallest[rank] = wp.min(smallest[rank], value)
+                    value = larger
+                if smallest[outvoted] <= 0.0:
+                    break
+    field[i] = wp.where(seen >= fewest_seen or smallest[outvoted] <= 0.0, smallest[outvoted], 0.0)
+
+
 def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings()) -> VisualHull | None:
     """Carve the hull; None where the masks have no common shape."""
     carver = _Carver(views, settings)
@@ -59,8 +105,7 @@ def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings(
         lower, upper = box
         cell = float((upper - lower).max()) / settings.coarse_cells
         shape = _grid_shape(lower, upper, cell)
-        maybe, _ = carver.bounds_of_field(_grid_points(lower, cell, shape), cell)
-        occupied = (maybe > settings.level).reshape(shape)
+        occupied = (carver.upper_field(_grid_points(lower, cell, shape), cell) > settings.level).reshape(shape)
         if not occupied.any():
             return None
         sides = [occupied[0], occupied[-1], occupied[:, 0], occupied[:, -1], occupied[:, :, 0], occupied[:, :, -1]]
@@ -125,70 +170,57 @@ class _Carver:
     """Masks and projections, prepared once for many queries."""
 
     def __init__(self, views: Views, settings: VisualHullSettings) -> None:
-        self.masks = views.coverage.cpu().numpy()
-        self.projections = [(c.intrinsics.double() @ c.camera_from_world.double()[:3]).float().cpu() for c in views.cameras]
-        self.focal = float(np.median([float(camera.intrinsics[0, 0]) for camera in views.cameras]))
         count = len(views.cameras)
-        self.outvoted = math.ceil(settings.wrong_mask_share * count) if count >= 12 else 0
+        # Neighbours in the file are neighbours in space; views far apart empty a point sooner.
+        order = np.argsort((np.arange(count) * 0.6180339887) % 1.0)
+        self.masks = views.coverage.cpu().numpy()[order]
+        self.cameras = [views.cameras[index] for index in order]
+        self.pixel_from_world = torch.stack(
+            [(c.intrinsics.double() @ c.camera_from_world.double()[:3]).float().cpu() for c in self.cameras]
+        )
+        self.outvoted = min(MOST_OUTVOTED, math.ceil(settings.wrong_mask_share * count)) if count >= 12 else 0
         self.fewest_seen = max(3, count // 4)
-        # Neighbours in the file are neighbours in space; views far apart empty the grid sooner.
-        self.order = np.argsort((np.arange(count) * 0.6180339887) % 1.0).tolist()
 
-    def bounds_of_field(self, points: Tensor, cell: float) -> tuple[Tensor, Tensor]:
-        """Upper and lower bounds (n,) of the field within each cell around `points` (n, 3)."""
+    def upper_field(self, points: Tensor, cell: float) -> Tensor:
+        """At least the field (n,) anywhere in a cell around each point (n, 3)."""
+        return self._outvote(points, self._widened(points, cell, ndimage.maximum_filter))
 
-        def lookup(view: int, x: Tensor, y: Tensor, depth: Tensor) -> Tensor:
-            # Half the cell's diagonal as seen from there, in steps that keep the number of filter sizes small.
-            pixels = max(1, math.ceil(0.87 * cell * self.focal / float(depth.median().clamp(min=cell))))
-            size = 2 * min(pixels, min(self.masks[view].shape) // 2) + 1
-            pair = np.stack([ndimage.maximum_filter(self.masks[view], size), ndimage.minimum_filter(self.masks[view], size)])
-            return _nearest_pixels(torch.from_numpy(pair).float() / 255, x, y)
-
-        upper, lower = self._outvote(points, 2, lookup)
-        return upper, lower
+    def lower_field(self, points: Tensor, cell: float) -> Tensor:
+        """At most the field (n,) anywhere in a cell around each point (n, 3)."""
+        return self._outvote(points, self._widened(points, cell, ndimage.minimum_filter))
 
     def field(self, points: Tensor) -> Tensor:
-        """The field (n,) at `points` (n, 3), coverage looked up bilinearly."""
+        """The field (n,) at `points` (n, 3)."""
+        return self._outvote(points, self.masks)
 
-        def lookup(view: int, x: Tensor, y: Tensor, depth: Tensor) -> Tensor:
-            mask = torch.from_numpy(self.masks[view])[None, None].float() / 255
-            height, width = mask.shape[-2:]
-            grid = torch.stack([x * (2 / width) - 1, y * (2 / height) - 1], -1)[None, None]
-            return torch.nn.functional.grid_sample(mask, grid, align_corners=False, padding_mode="border")[0, 0]
+    def _widened(self, points: Tensor, cell: float, widen: Callable[[ndarray, int], ndarray]) -> ndarray:
+        """Masks in which each pixel stands for all pixels that a cell's half diagonal covers around it."""
+        widened = np.empty_like(self.masks)
+        middle = points.mean(0)
+        for index, (camera, projection) in enumerate(zip(self.cameras, self.pixel_from_world, strict=True)):
+            depth = max(float(projection[2, :3] @ middle + projection[2, 3]), 2 * cell)
+            # One pixel more than the projection: lookups are bilinear.
+            reach = math.ceil(0.87 * cell * float(camera.intrinsics[0, 0]) / depth * 1.15) + 1
+            widened[index] = widen(self.masks[index], 2 * min(reach, min(self.masks.shape[1:]) // 2) + 1)
+        return widened
 
-        return self._outvote(points, 1, lookup)[0]
-
-    def _outvote(self, points: Tensor, channels: int, lookup: _Lookup) -> Tensor:
-        """(channels, n): the (outvoted+1)-th smallest of what the views that see a point say there."""
-        result = torch.zeros(channels, len(points))
-        alive = torch.arange(len(points))
-        smallest = torch.full((self.outvoted + 1, channels, len(points)), 2.0)
-        seen = torch.zeros(len(points))
-        height, width = self.masks.shape[-2:]
-        for step, view in enumerate(self.order):
-            projection = self.projections[view]
-            projected = points @ projection[:, :3].T + projection[:, 3]
-            depth = projected[:, 2]
-            x, y = projected[:, 0] / depth.clamp(min=1e-6), projected[:, 1] / depth.clamp(min=1e-6)
-            inside = (depth > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            # A view that does not see the point says nothing about it.
-            value = torch.where(inside, lookup(view, x, y, depth), 2.0)
-            seen += inside
-            for rank in range(self.outvoted + 1):
-                smallest[rank], value = torch.minimum(smallest[rank], value), torch.maximum(smallest[rank], value)
-            if step % 4 == 3:  # what has been emptied stays empty: do not look at it again
-                kept = smallest[-1, 0] > 0
-                if not kept.any():
-                    return result
-                points, alive, seen, smallest = points[kept], alive[kept], seen[kept], smallest[:, :, kept]
-        result[:, alive] = torch.where(seen >= self.fewest_seen, smallest[-1].clamp(max=1.0), 0.0)
-        return result
-
-
-def _nearest_pixels(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """(channels, n) values of image (channels, h, w), clamped at its sides."""
-    height, width = image.shape[-2:]
-    return image.reshape(len(image), -1)[:, y.clamp(0, height - 1).long() * width + x.clamp(0, width - 1).long()]
+    def _outvote(self, points: Tensor, masks: ndarray) -> Tensor:
+        points = points.float().contiguous()
+        field = torch.zeros(len(points))
+        launch(
+            outvote,
+            len(points),
+            inputs=[
+                warp_array(points, wp.vec3),
+                warp_array(self.pixel_from_world.reshape(-1, 4), wp.vec4),
+                warp_array(torch.from_numpy(masks)),
+                self.outvoted,
+                self.fewest_seen,
+            ],
+            outputs=[warp_array(field)],
+            device=warp_device(points),
+        )
+        return field
 
 
 def _grid_shape(lower: ndarray, upper: ndarray, cell: float) -> tuple[int, int, int]:
@@ -202,16 +234,22 @@ def _grid_points(lower: ndarray, cell: float, shape: tuple[int, int, int]) -> Te
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
+def _refined(grid: Tensor) -> Tensor:
+    """Each cell becomes 2x2x2."""
+    return grid.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2).contiguous()
+
+
 def _fine_surface(carver: _Carver, lower: ndarray, upper: ndarray, settings: VisualHullSettings) -> VisualHull | None:
     """Level set on the fine grid. Cells that the coarse grid proves empty or full are not looked at again."""
     cell = float((upper - lower).max()) / settings.fine_cells
     coarse_cell = 2 * cell
     coarse_shape = _grid_shape(lower, upper, coarse_cell)
-    maybe, sure = carver.bounds_of_field(_grid_points(lower, coarse_cell, coarse_shape), coarse_cell)
-    field_coarse = torch.where(sure > settings.level, 1.0, 0.0).reshape(coarse_shape)
-    field = field_coarse.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2).contiguous()
-    undecided = ((maybe > settings.level) & (sure <= settings.level)).reshape(coarse_shape)
-    undecided = undecided.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    coarse_points = _grid_points(lower, coarse_cell, coarse_shape)
+    maybe = carver.upper_field(coarse_points, coarse_cell) > settings.level
+    sure = torch.zeros_like(maybe)
+    sure[maybe] = carver.lower_field(coarse_points[maybe], coarse_cell) > settings.level
+    field = _refined(sure.float().reshape(coarse_shape))
+    undecided = _refined((maybe & ~sure).reshape(coarse_shape))
     indices = torch.nonzero(undecided)
     points = torch.from_numpy(lower).float() + (indices.float() + 0.5) * cell
     field[undecided] = carver.field(points)
