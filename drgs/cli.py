@@ -10,10 +10,13 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
+
+if TYPE_CHECKING:
+    from drgs.scene.asset import Asset
 
 
 class _Commands(TyperGroup):
@@ -133,6 +136,7 @@ def render(
     """Render an asset from the cameras of a file: <name>.png (RGBA, straight alpha, sRGB), and maps with --aov."""
     from drgs.build.load_views import load_cameras
     from drgs.cli_progress import frame_progress
+    from drgs.deform.pose_scene import pose_scene
     from drgs.render.render_cameras import render_cameras
     from drgs.render.render_frame import RenderSettings
     from drgs.scene.edits import EnvironmentEdit, load_edits
@@ -141,7 +145,7 @@ def render(
     if env or env_rotation:
         changes.append(EnvironmentEdit(op="environment", file=str(env.resolve()) if env else None, rotation=env_rotation))
     views = load_cameras(cameras, _size(size))
-    scene = _pose(asset, changes, edits.parent if edits else Path(), device.value)
+    scene = pose_scene(_open_asset(asset, device), changes, edits.parent if edits else Path())
     settings = RenderSettings(
         samples_per_pixel=spp,
         bounces=bounces,
@@ -211,12 +215,10 @@ def eval_(
     """Render an asset's test views and score them against the truth."""
     from drgs.build.evaluate_asset import EvaluationSettings, evaluate_asset
     from drgs.cli_progress import frame_progress
-    from drgs.scene.asset import load_asset
 
+    settings = EvaluationSettings(samples_per_pixel=spp, seed=seed)
     with frame_progress("Evaluating", None) as advance:
-        figures = evaluate_asset(
-            load_asset(asset), dataset, out, EvaluationSettings(samples_per_pixel=spp, seed=seed, device=device.value), done=advance
-        )
+        figures = evaluate_asset(_open_asset(asset, device), dataset, out, settings, done=advance)
     _print_document(figures, as_json)
 
 
@@ -269,11 +271,11 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _pose(asset_path: Path, edits: list, base_directory: Path, device_name: str) -> Any:
-    from drgs.deform.pose_scene import pose_scene
+def _open_asset(path: Path, device: DeviceName) -> "Asset":
     from drgs.scene.asset import load_asset
+    from drgs.warp_torch import device_from_name
 
-    return pose_scene(load_asset(asset_path), edits, base_directory)
+    return load_asset(path, device_from_name(device.value))
 
 
 def _print_document(document: dict, as_json: bool) -> None:

@@ -1,0 +1,93 @@
+"""Time the rasteriser forward and backward on one fixed workload: projection, binning, blending, gradients of every input.
+
+    python -m benchmarks rasterize --scene FILE.npz [--json] [--dump image.npy] [--repeats N] [--device cpu] [--depth]
+
+FILE.npz holds centers (N, 3), tangents_u and tangents_v (N, 3, unit), scales (N, 2), opacities (N), features (N, C), K, camera_from_world
+(OpenCV) and size (width, height). --dump writes the blended features, (height, width, C) float32, not divided by coverage.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from drgs.render.rasterize_gbuffer import RasterSettings, rasterize
+from drgs.scene.camera import Camera
+from drgs.warp_torch import device_from_name, thread_count
+
+MIN_REPEATS = 7
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks rasterize", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scene", type=Path, required=True)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--dump", type=Path)
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--device", default="cpu", choices=["auto", "cpu", "cuda"])
+    parser.add_argument("--depth", action="store_true", help="blend depth moments and the median as well")
+    given = parser.parse_args(arguments)
+    if given.repeats < MIN_REPEATS:
+        raise ValueError(f"--repeats is {given.repeats}; a median of fewer than {MIN_REPEATS} means little")
+    camera, surfels = load_workload(given.scene, device_from_name(given.device))
+    settings = RasterSettings(depth=given.depth)
+    if given.dump:
+        with torch.no_grad():
+            np.save(given.dump, rasterize(*surfels, camera, settings).features.permute(1, 2, 0).contiguous().cpu().numpy())
+    print(json.dumps(measure(camera, surfels, settings, given.repeats), indent=None if given.json else 1))
+
+
+def load_workload(path: Path, device: torch.device) -> tuple[Camera, tuple[torch.Tensor, ...]]:
+    """The camera, and centres, tangents, opacities, features as leaves that want gradients."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = {name: torch.from_numpy(stored[name]) for name in stored.files}
+    width, height = (int(x) for x in arrays["size"])
+    camera = Camera(arrays["camera_from_world"].float(), arrays["K"].float(), width, height).to(device)
+    tangents = torch.stack([arrays["tangents_u"], arrays["tangents_v"]], -1) * arrays["scales"][:, None, :]
+    surfels = (arrays["centers"], tangents, arrays["opacities"], arrays["features"])
+    return camera, tuple(tensor.float().to(device).contiguous().requires_grad_() for tensor in surfels)
+
+
+def measure(camera: Camera, surfels: tuple[torch.Tensor, ...], settings: RasterSettings, repeats: int) -> dict:
+    """Medians [ms] over the repeats, after two that compile and warm up."""
+    device = surfels[0].device
+    generator = torch.Generator().manual_seed(0)
+    image_gradient = torch.randn(surfels[3].shape[1], camera.height, camera.width, generator=generator).to(device)
+    depth_gradient = torch.randn(camera.height, camera.width, generator=generator).to(device)
+
+    def clock() -> float:
+        if device.type != "cpu":
+            torch.cuda.synchronize(device)
+        return 1e3 * time.perf_counter()
+
+    times: list[tuple[float, float]] = []
+    for _ in range(repeats + 2):
+        for tensor in surfels:
+            tensor.grad = None
+        start = clock()
+        maps = rasterize(*surfels, camera, settings)
+        middle = clock()
+        if maps.depth_sum is None:
+            maps.features.backward(image_gradient)
+        else:
+            torch.autograd.backward([maps.features, maps.depth_sum], [image_gradient, depth_gradient])
+        times.append((middle - start, clock() - middle))
+    times = times[2:]
+    return {
+        "forward_ms": round(statistics.median(forward for forward, _ in times), 3),
+        "backward_ms": round(statistics.median(backward for _, backward in times), 3),
+        "forward_backward_ms": round(statistics.median(forward + backward for forward, backward in times), 3),
+        "threads": thread_count(),
+        "repeats": repeats,
+        "fastest_forward_backward_ms": round(min(forward + backward for forward, backward in times), 3),
+        "surfels": len(surfels[0]),
+        "channels": surfels[3].shape[1],
+        "size": [camera.width, camera.height],
+        "device": str(device),
+    }
