@@ -6,6 +6,7 @@ them to a thread pool. Kernels launched this way take `first: int` as their firs
 """
 
 import os
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -13,8 +14,28 @@ import torch
 import warp as wp
 from torch import Tensor
 
-wp.config.log_level = wp.LOG_ERROR  # stdout belongs to --json; "no CUDA driver" is no news here
-wp.init()
+
+def _init_warp() -> None:
+    """wp.init without its banner (stdout belongs to --json) and without one line: that there is no NVIDIA driver is no news here.
+
+    Warp's native part writes that line straight to file descriptor 2, whatever the log level; anything else passes.
+    """
+    wp.config.log_level = wp.LOG_ERROR
+    with tempfile.TemporaryFile() as written:
+        stderr = os.dup(2)
+        os.dup2(written.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            written.seek(0)
+            for line in written:
+                if b"Could not find or load the NVIDIA CUDA driver" not in line:
+                    os.write(2, line)
+
+
+_init_warp()
 
 _pool: ThreadPoolExecutor | None = None
 
