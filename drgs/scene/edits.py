@@ -47,7 +47,7 @@ class Selection(_Plain):
 
     @model_validator(mode="after")
     def _exactly_one(self) -> "Selection":
-        given = [name for name in type(self).model_fields if getattr(self, name) not in (None, False)]
+        given = [name for name in type(self).model_fields if (value := getattr(self, name)) is not None and value is not False]
         if len(given) != 1:
             raise ValueError(f"a selection names exactly one of all, sphere, box, region, similar, vertex_weights; found {given or 'none'}")
         return self

@@ -1,0 +1,229 @@
+"""An asset and its edits become the scene that a frame is rendered from.
+
+Selections refer to the object at rest, so material, light and shape do not depend on each other: each is computed from its own
+edits, in their order, and remembered for the asset. A scene posed again with one kind of edit changed therefore holds the very
+same tensors for the rest, and a renderer sees by identity what it must rebuild.
+"""
+
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from drgs.deform.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
+from drgs.deform.maps import check_map, evaluate_map
+from drgs.exchange.npz import read_npz_array
+from drgs.scene.asset import Asset
+from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, SimulateEdit
+from drgs.scene.environment import Environment
+from drgs.scene.gaussians import surfel_tangents
+from drgs.scene.load_environment import load_environment
+from drgs.scene.materials import Materials
+from drgs.scene.posed_scene import PosedScene, PosedSurfels
+from drgs.scene.select_vertices import select_surfels, select_vertices
+
+REMEMBERED = 4
+"""Results kept of each kind for each asset."""
+
+Result = TypeVar("Result")
+_lock = threading.Lock()
+_memory: WeakKeyDictionary[Asset, OrderedDict[Any, Any]] = WeakKeyDictionary()
+
+
+def pose_scene(
+    asset: Asset,
+    edits: Sequence[Edit],
+    base_directory: Path | None = None,
+    environments: Callable[[str], Environment] | None = None,
+    confine: bool = False,
+) -> PosedScene:
+    """Apply edits in order.
+
+    Args:
+        base_directory: what file names in edits are relative to; the working directory if None.
+        environments: gives an environment by the name an edit calls it; without it, names are files.
+        confine: refuse file names that lead out of base_directory. Set it where edits come from strangers.
+
+    Raises:
+        ValueError: one sentence: an edit that does not fit this asset, or a missing or damaged file.
+    """
+    for edit in edits:
+        if isinstance(edit, PoseEdit | SimulateEdit):
+            what = "clips to play" if isinstance(edit, PoseEdit) else "simulation"
+            raise ValueError(f"the edit '{edit.op}' is not available in this asset yet: it has no {what}")
+    files = _Files(base_directory, confine)
+    material = [edit for edit in edits if isinstance(edit, MaterialEdit)]
+    deform = [edit for edit in edits if isinstance(edit, DeformEdit)]
+
+    vertex_materials, surfel_materials = _remembered(asset, ("material", *map(_text, material)), lambda: _apply_materials(asset, material))
+    shape_key = ("shape", *((_text(edit), files.stamp(edit.vertices)) for edit in deform))
+    shape = _remembered(asset, shape_key, lambda: _apply_deformations(asset, deform, files))
+
+    mesh, surfels = asset.mesh, None
+    if material:
+        mesh = replace(mesh, albedo=vertex_materials.albedo, roughness=vertex_materials.roughness, metallic=vertex_materials.metallic)
+    if deform:
+        mesh = replace(mesh, vertices=shape.vertices, normals=shape.normals)
+    if surfel_materials is not None:
+        surfels = PosedSurfels(shape.centers, shape.tangents, _rest(asset).opacities, surfel_materials)
+    environment, rotation, intensity = asset.environment, 0.0, 1.0
+    for edit in edits:
+        if isinstance(edit, EnvironmentEdit):
+            rotation, intensity = edit.rotation, edit.intensity
+            if edit.file is not None:
+                environment = _environment(asset, edit.file, files, environments)
+    return PosedScene(surfels, mesh, environment, rotation, intensity)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """Where everything is."""
+
+    vertices: Tensor
+    normals: Tensor
+    centers: Tensor | None
+    tangents: Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Rest:
+    """Surfels as the posed scene wants them, before any edit."""
+
+    tangents: Tensor
+    opacities: Tensor
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Turns the names in edits into paths."""
+
+    base_directory: Path | None
+    confine: bool
+
+    def path(self, name: str) -> Path:
+        base = Path.cwd() if self.base_directory is None else Path(self.base_directory)
+        path = (base / name).resolve()
+        if self.confine and not path.is_relative_to(base.resolve()):
+            raise ValueError(f"the file {name!r} lies outside the folder that edits may read")
+        if not path.is_file():
+            raise ValueError(f"{path}: does not exist")
+        return path
+
+    def stamp(self, name: str | None) -> tuple | None:
+        """Changes when the file does."""
+        if name is None:
+            return None
+        state = os.stat(self.path(name))
+        return str(self.path(name)), state.st_mtime_ns, state.st_size
+
+
+def _rest(asset: Asset) -> _Rest:
+    gaussians = asset.gaussians
+    assert gaussians is not None
+    return _remembered(asset, ("rest",), lambda: _Rest(surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)))
+
+
+def _apply_materials(asset: Asset, edits: list[MaterialEdit]) -> tuple[Materials, Materials | None]:
+    """Materials of the mesh's vertices and of the surfels."""
+    mesh, gaussians = asset.mesh, asset.gaussians
+    of_vertices = Materials(mesh.albedo, mesh.roughness, mesh.metallic)
+    of_surfels = None if gaussians is None else Materials(gaussians.albedo, gaussians.roughness, gaussians.metallic)
+    for edit in edits:
+        weights = select_vertices(mesh, edit.select)
+        of_vertices = _edited(of_vertices, edit, weights)
+        if gaussians is not None and of_surfels is not None:
+            of_surfels = _edited(of_surfels, edit, select_surfels(gaussians.centers, mesh, asset.binding, edit.select, weights))
+    return of_vertices, of_surfels
+
+
+def _edited(materials: Materials, edit: MaterialEdit, weights: Tensor) -> Materials:
+    """Values move by their weight from what they are towards the new value, or the multiplied one."""
+
+    def changed(old: Tensor, value: tuple[float, ...] | float | None) -> Tensor:
+        if value is None:
+            return old
+        weight = weights[:, None] if old.ndim == 2 else weights
+        new = torch.as_tensor(value, dtype=old.dtype, device=old.device)
+        new = (old * new).clamp(0, 1) if edit.mode == "multiply" else new
+        return old * (1 - weight) + new * weight  # exact at weights 0 and 1
+
+    values = edit.set
+    return Materials(
+        changed(materials.albedo, values.albedo),
+        changed(materials.roughness, values.roughness),
+        changed(materials.metallic, values.metallic),
+    )
+
+
+def _apply_deformations(asset: Asset, edits: list[DeformEdit], files: _Files) -> _Shape:
+    mesh, gaussians = asset.mesh, asset.gaussians
+    vertices, normals = mesh.vertices, mesh.normals
+    centers, tangents = (None, None) if gaussians is None else (gaussians.centers, _rest(asset).tangents)
+    for edit in edits:
+        if edit.map is not None:
+            check_map(edit.map, vertices)
+            vertices, gradient = evaluate_map(edit.map, vertices)
+            normals = carry_normals(normals, gradient)
+            if centers is not None and tangents is not None:
+                centers, gradient = evaluate_map(edit.map, centers)
+                tangents = carry_tangents(tangents, gradient)
+        elif edit.vertices is not None:
+            # The file says where the vertices are, whatever came before: everything is carried from rest.
+            array = read_npz_array(files.path(edit.vertices), "vertices", tuple(mesh.vertices.shape))
+            vertices = torch.from_numpy(array).to(mesh.vertices)
+            gradient = vertex_gradients(mesh.vertices, vertices, mesh.faces)
+            normals = carry_normals(mesh.normals, gradient)
+            if gaussians is not None:
+                if asset.binding is None:
+                    raise ValueError(f"{edit.vertices}: cannot deform this asset: its Gaussians are not bound to its mesh")
+                rest_tangents = _rest(asset).tangents
+                centers, tangents = drive_surfels(
+                    mesh.vertices, vertices, mesh.faces, gradient, asset.binding, gaussians.centers, rest_tangents
+                )
+        if not all(torch.isfinite(values).all() for values in (vertices, normals, centers, tangents) if values is not None):
+            raise ValueError(f"the deform edit {_text(edit)[:120]} moves parts of this object to infinity")
+    return _Shape(vertices, normals, centers, tangents)
+
+
+def _environment(asset: Asset, name: str, files: _Files, environments: Callable[[str], Environment] | None) -> Environment:
+    if environments is not None:
+        return environments(name)
+    device = asset.environment.radiance.device
+
+    def load() -> Environment:
+        return Environment(load_environment(files.path(name)).radiance.to(device))
+
+    return _remembered(asset, ("environment", files.stamp(name)), load)
+
+
+def _text(edit: DeformEdit | MaterialEdit) -> str:
+    return edit.model_dump_json()
+
+
+def _remembered(asset: Asset, key: tuple, make: Callable[[], Result]) -> Result:
+    """The result of `make` for this key, the same object as long as it is among the last few of its kind (the key's first word).
+
+    An asset is frozen, so nothing here goes stale; while its tensors are being optimised, nothing is remembered.
+    """
+    if any(value.requires_grad for record in (asset.gaussians, asset.mesh) if record is not None for value in vars(record).values()):
+        return make()
+    with _lock:
+        kept = _memory.setdefault(asset, OrderedDict())
+        if key in kept:
+            kept.move_to_end(key)
+            return kept[key]
+    result = make()
+    with _lock:
+        result = kept.setdefault(key, result)
+        alike = [other for other in kept if other[0] == key[0]]
+        for other in alike[:-REMEMBERED]:
+            del kept[other]
+    return result
