@@ -8,6 +8,7 @@ them to a thread pool. Kernels launched this way take `first: int` as their firs
 import os
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -92,7 +93,7 @@ def launch(kernel: Any, count: int, inputs: list, outputs: list, device: Any, sl
     def run(first: int, last: int) -> None:
         wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=outputs, device=device)
 
-    for done in [thread_pool().submit(run, a, b) for a, b in zip(edges, edges[1:], strict=False)]:
+    for done in [thread_pool().submit(run, a, b) for a, b in pairwise(edges)]:
         done.result()
 
 
