@@ -9,6 +9,7 @@ from PIL import Image
 from drgs.exchange.exr import encode_maps
 from drgs.render.records import Frame
 from drgs.render.render_frame import RenderSettings, render_frame
+from drgs.render.trace_rays import build_tracer
 from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedScene
 
@@ -31,9 +32,10 @@ def render_cameras(
     """
     out.mkdir(parents=True, exist_ok=True)
     device = scene.mesh.vertices.device
+    tracer = build_tracer(scene.mesh)
     report = []
     for camera in cameras:
-        frame = render_frame(scene, camera.to(device), settings)
+        frame = render_frame(scene, camera.to(device), settings, tracer)
         write_png(frame, out / f"{camera.name}.png")
         if aov:
             (out / f"{camera.name}.exr").write_bytes(maps_of_frame(frame))
