@@ -233,13 +233,18 @@ def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
 @app.command()
 def serve(
     data: DataFolder = Path("data"),
-    host: Annotated[str, typer.Option()] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 8000,
+    host: Annotated[str, typer.Option(help="An address of this machine alone.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 picks a free one.")] = 8000,
+    captures: Annotated[list[Path] | None, typer.Option(help="Folder below which builds may find captures; may be given again.")] = None,
+    worker: Annotated[bool, typer.Option("--worker/--no-worker", help="Also run a worker for the builds.")] = True,
+    open_browser: Annotated[bool, typer.Option("--open", help="Open the viewer in a browser.")] = False,
+    device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
 ) -> None:
-    """Start the server and a worker for its jobs; prints the address to open."""
+    """Start the server and a worker for its builds; prints the address to open."""
     from server.run import serve as run_server
 
-    run_server(data, host=host, port=port)
+    roots = tuple(path.resolve() for path in captures or ())
+    raise typer.Exit(run_server(data, host, port, with_worker=worker, open_browser=open_browser, capture_roots=roots, device=device.value))
 
 
 @app.command()
