@@ -14,6 +14,8 @@ from drgs.scene.binding import Binding
 from drgs.scene.mesh import TriangleMesh
 from drgs.warp_torch import launch, thread_count, warp_array, warp_device
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.kernel
 def query_closest_faces(
@@ -38,7 +40,7 @@ def bind_gaussians(centers: Tensor, mesh: TriangleMesh) -> Binding:
     """Binding of centres (N, 3) to the closest points of a mesh.
 
     Raises:
-        ValueError: the mesh has no faces, or a centre is not finite.
+        ValueError: the mesh has no faces with area, or a centre is not finite.
     """
     if mesh.faces.shape[0] == 0:
         raise ValueError("cannot bind Gaussians to a mesh without faces")
@@ -64,6 +66,8 @@ def bind_gaussians(centers: Tensor, mesh: TriangleMesh) -> Binding:
         outputs=[warp_array(face), warp_array(barycentric, wp.vec3)],
         device=warp_device(points),
     )
+    if (face < 0).any():
+        raise ValueError("cannot bind Gaussians to a mesh whose faces all have no area")
     barycentric = barycentric.clamp(min=0.0)
     barycentric = barycentric / barycentric.sum(-1, keepdim=True)
     on_face, normal = foot_and_normal(face, barycentric, vertices, faces)

@@ -24,6 +24,8 @@ from drgs.build.extract_mesh.records import DepthMap, MeshSettings
 from drgs.scene.camera import Camera
 from drgs.warp_torch import launch, thread_pool, warp_array, warp_device
 
+wp.set_module_options({"enable_backward": False})
+
 BLOCK = 8
 """Grid points along a block's edge; also the step of the coarse pass."""
 BATCH_BYTES = 192 * 2**20

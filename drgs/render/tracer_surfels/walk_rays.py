@@ -1,0 +1,337 @@
+"""Kernels of the surfel tracer: a ray's transmittance in any order, and its walk from hit to hit in order of distance.
+
+One kernel, `walk_rays`, serves forward and backward, so both visit the same hits in the same order: by t, ties by index.
+It fills a buffer with the nearest HITS_PER_PASS hits behind the last one visited, visits them, and starts again behind
+them until the ray is opaque or nothing is left: no hit is lost or met twice, however many overlap.
+"""
+
+import warp as wp
+
+from drgs.maths.spherical_harmonics import K00, K1, K20, K21, K22, K30, K31, K32, K33, SH_OFFSET
+
+wp.set_module_options({"enable_backward": False})
+
+HITS_PER_PASS = 16
+MIN_TRANSMITTANCE = 1e-3
+"""A ray ends when less than this is left of it: radiance and transmittance are then wrong by at most this share."""
+MAX_ALPHA = 0.99
+"""As in the rasteriser; keeps 1 / (1 - alpha) bounded in the gradient."""
+GRAZING_COSINE = 1e-4
+"""Rays closer to a surfel's plane than this sine miss it: t and the plane coordinates lose their digits there."""
+FURTHER = 1.00001
+"""Slack on the tree's distance limit, so that boxes of hits at the very limit are still opened."""
+
+
+vec16 = wp.types.vector(length=16, dtype=wp.float32)
+
+
+@wp.struct
+class SurfelTable:
+    """SurfelScene as kernels see it; indices count kept surfels."""
+
+    tree: wp.uint64
+    frames: wp.array[wp.vec4]
+    """Three a surfel, see SurfelScene.frames."""
+    radiance: wp.array2d[wp.vec3]
+    degree: int
+    """Of the spherical harmonics; -1: `radiance` is a colour."""
+
+
+@wp.struct
+class SurfelHit:
+    """Where a ray meets a surfel."""
+
+    t: float
+    u: float
+    v: float
+    alpha: float
+    """0 where it does not."""
+    clamped: int
+    """1 where alpha stands at MAX_ALPHA and has no gradient."""
+
+
+@wp.func
+def xyz(row: wp.vec4) -> wp.vec3:
+    return wp.vec3(row[0], row[1], row[2])
+
+
+@wp.func
+def meet_surfel(table: SurfelTable, surfel: int, origin: wp.vec3, direction: wp.vec3) -> SurfelHit:
+    """Solve origin + t direction = centre + u b1 + v b2 by Cramer's rule."""
+    hit = SurfelHit()
+    row0 = table.frames[3 * surfel]
+    row1 = table.frames[3 * surfel + 1]
+    row2 = table.frames[3 * surfel + 2]
+    b1 = xyz(row1)
+    b2 = xyz(row2)
+    normal = wp.cross(b1, b2)
+    slope = wp.dot(normal, direction)
+    if wp.abs(slope) > GRAZING_COSINE * row1[3]:
+        offset = origin - xyz(row0)
+        hit.u = wp.dot(wp.cross(b2, direction), offset) / slope
+        hit.v = wp.dot(wp.cross(direction, b1), offset) / slope
+        rho = hit.u * hit.u + hit.v * hit.v
+        if rho <= row2[3]:
+            hit.t = -wp.dot(normal, offset) / slope
+            hit.alpha = row0[3] * wp.exp(-0.5 * rho)
+            if hit.alpha > MAX_ALPHA:
+                hit.alpha = MAX_ALPHA
+                hit.clamped = 1
+    return hit
+
+
+@wp.func
+def is_before(t_a: float, surfel_a: int, t_b: float, surfel_b: int) -> bool:
+    """The order of hits along a ray."""
+    return t_a < t_b or (t_a == t_b and surfel_a < surfel_b)
+
+
+@wp.func
+def sh_basis_at(d: wp.vec3) -> vec16:
+    """drgs.maths.spherical_harmonics.sh_basis to degree 3."""
+    x = d[0]
+    y = d[1]
+    z = d[2]
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    basis = vec16()
+    basis[0] = K00
+    basis[1] = -K1 * y
+    basis[2] = K1 * z
+    basis[3] = -K1 * x
+    basis[4] = K21 * x * y
+    basis[5] = -K21 * y * z
+    basis[6] = K20 * (2.0 * zz - xx - yy)
+    basis[7] = -K21 * x * z
+    basis[8] = K22 * (xx - yy)
+    basis[9] = -K33 * y * (3.0 * xx - yy)
+    basis[10] = 2.0 * K32 * x * y * z
+    basis[11] = -K31 * y * (4.0 * zz - xx - yy)
+    basis[12] = K30 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
+    basis[13] = -K31 * x * (4.0 * zz - xx - yy)
+    basis[14] = K32 * z * (xx - yy)
+    basis[15] = -K33 * x * (xx - 3.0 * yy)
+    return basis
+
+
+@wp.func
+def radiance_before_clamp(table: SurfelTable, surfel: int, basis: vec16) -> wp.vec3:
+    """Colour of a surfel seen along a direction, not yet clamped at 0."""
+    if table.degree < 0:
+        return table.radiance[surfel, 0]
+    total = wp.vec3(SH_OFFSET, SH_OFFSET, SH_OFFSET)
+    for k in range((table.degree + 1) * (table.degree + 1)):
+        total += basis[k] * table.radiance[surfel, k]
+    return total
+
+
+@wp.func
+def clamp_radiance(radiance: wp.vec3) -> wp.vec3:
+    return wp.vec3(wp.max(radiance[0], 0.0), wp.max(radiance[1], 0.0), wp.max(radiance[2], 0.0))
+
+
+@wp.func
+def where_positive(value: float, gradient: float) -> float:
+    if value > 0.0:
+        return gradient
+    return 0.0
+
+
+@wp.kernel
+def multiply_transmittance(
+    first: int,
+    table: SurfelTable,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_min: float,
+    # outputs
+    transmittance: wp.array[float],
+):
+    """Product of 1 - alpha over all hits beyond t_min, in whatever order the tree gives them."""
+    ray = first + wp.tid()
+    origin = origins[ray]
+    direction = directions[ray]
+    left = float(1.0)
+    surfel = int(0)
+    query = wp.bvh_query_ray(table.tree, origin, direction)
+    while wp.bvh_query_next(query, surfel):
+        hit = meet_surfel(table, surfel, origin, direction)
+        if hit.alpha > 0.0 and hit.t > t_min:
+            left *= 1.0 - hit.alpha
+            if left < MIN_TRANSMITTANCE:
+                break
+    transmittance[ray] = left
+
+
+@wp.struct
+class GradientHits:
+    """What the backward pass notes of every hit, to be summed by surfel afterwards."""
+
+    surfel: wp.array[int]
+    ray: wp.array[int]
+    plane: wp.array[wp.vec3]
+    """u, v and the gradient of the opacity."""
+    center: wp.array[wp.vec3]
+    """Gradient of the centre; times u or v that of a tangent."""
+    radiance: wp.array[wp.vec3]
+    """Gradient of the colour before it was clamped at 0."""
+
+
+@wp.kernel
+def walk_rays(
+    first: int,
+    table: SurfelTable,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_min: float,
+    note_gradients: bool,
+    hit_start: wp.array[wp.int64],
+    grad_radiance: wp.array[wp.vec3],
+    grad_opacity: wp.array[float],
+    grad_depth: wp.array[float],
+    # outputs (read instead of written when gradients are noted)
+    radiance: wp.array[wp.vec3],
+    opacity: wp.array[float],
+    depth: wp.array[float],
+    hit_count: wp.array[int],
+    noted: GradientHits,
+):
+    """Blend front to back; `depth` is the sum of weight times t. When gradients are noted, write them for each hit from hit_start on."""
+    ray = first + wp.tid()
+    origin = origins[ray]
+    direction = directions[ray]
+    basis = vec16()
+    if table.degree >= 0:
+        basis = sh_basis_at(direction)
+
+    # With L the loss: dL/dalpha_i = T_i s_i - (sum of w_j s_j behind i) / (1 - alpha_i), where s_i = dL/dw_i.
+    total_score = float(0.0)
+    prefix_score = float(0.0)
+    g_radiance = wp.vec3()
+    g_opacity = float(0.0)
+    g_depth = float(0.0)
+    if note_gradients:
+        g_radiance = grad_radiance[ray]
+        g_opacity = grad_opacity[ray]
+        g_depth = grad_depth[ray]
+        total_score = wp.dot(g_radiance, radiance[ray]) + g_opacity * opacity[ray] + g_depth * depth[ray]
+
+    left = float(1.0)
+    color = wp.vec3()
+    weighted_t = float(0.0)
+    visited = int(0)
+    last_t = t_min
+    last_surfel = int(2147483647)  # after every surfel at t_min itself: only t > t_min counts
+    near_t = wp.zeros(shape=(HITS_PER_PASS,), dtype=float)
+    near_surfel = wp.zeros(shape=(HITS_PER_PASS,), dtype=int)
+    size = int(HITS_PER_PASS)
+    while size == HITS_PER_PASS and left >= MIN_TRANSMITTANCE:
+        # Gather the nearest hits behind the last one, sorted by insertion.
+        size = int(0)
+        limit = float(wp.inf)
+        surfel = int(0)
+        query = wp.bvh_query_ray(table.tree, origin, direction)
+        while wp.bvh_query_next(query, surfel, limit):
+            hit = meet_surfel(table, surfel, origin, direction)
+            if hit.alpha > 0.0 and is_before(last_t, last_surfel, hit.t, surfel):
+                place = int(size)
+                if size == HITS_PER_PASS:
+                    place = HITS_PER_PASS - 1
+                    if not is_before(hit.t, surfel, near_t[place], near_surfel[place]):
+                        place = -1
+                if place >= 0:
+                    while place > 0 and is_before(hit.t, surfel, near_t[place - 1], near_surfel[place - 1]):
+                        near_t[place] = near_t[place - 1]
+                        near_surfel[place] = near_surfel[place - 1]
+                        place -= 1
+                    near_t[place] = hit.t
+                    near_surfel[place] = surfel
+                    size = wp.min(size + 1, HITS_PER_PASS)
+                    if size == HITS_PER_PASS:
+                        limit = FURTHER * near_t[HITS_PER_PASS - 1]
+
+        # Visit them.
+        k = int(0)
+        while k < size and left >= MIN_TRANSMITTANCE:
+            surfel = near_surfel[k]
+            hit = meet_surfel(table, surfel, origin, direction)
+            raw = radiance_before_clamp(table, surfel, basis)
+            emitted = clamp_radiance(raw)
+            weight = left * hit.alpha
+            if note_gradients:
+                score = wp.dot(g_radiance, emitted) + g_opacity + g_depth * hit.t
+                prefix_score += weight * score
+                g_alpha = left * score - (total_score - prefix_score) / (1.0 - hit.alpha)
+                if hit.clamped == 1:
+                    g_alpha = 0.0
+                b1 = xyz(table.frames[3 * surfel + 1])
+                b2 = xyz(table.frames[3 * surfel + 2])
+                normal = wp.cross(b1, b2)
+                # The inverse transpose of [b1 b2 -direction] takes gradients of (u, v, t) to that of the origin.
+                g_u = -hit.alpha * hit.u * g_alpha
+                g_v = -hit.alpha * hit.v * g_alpha
+                g_origin = g_u * wp.cross(b2, direction) + g_v * wp.cross(direction, b1) - weight * g_depth * normal
+                note = int(hit_start[ray]) + visited
+                noted.surfel[note] = surfel
+                noted.ray[note] = ray
+                noted.plane[note] = wp.vec3(hit.u, hit.v, g_alpha * wp.exp(-0.5 * (hit.u * hit.u + hit.v * hit.v)))
+                noted.center[note] = -g_origin / wp.dot(normal, direction)
+                noted.radiance[note] = weight * wp.vec3(
+                    where_positive(raw[0], g_radiance[0]), where_positive(raw[1], g_radiance[1]), where_positive(raw[2], g_radiance[2])
+                )
+            color += weight * emitted
+            weighted_t += weight * hit.t
+            left *= 1.0 - hit.alpha
+            visited += 1
+            last_t = hit.t
+            last_surfel = surfel
+            k += 1
+
+    if not note_gradients:
+        radiance[ray] = color
+        opacity[ray] = 1.0 - left
+        depth[ray] = weighted_t
+        hit_count[ray] = visited
+
+
+@wp.kernel
+def sum_by_surfel(
+    first: int,
+    degree: int,
+    directions: wp.array[wp.vec3],
+    order: wp.array[wp.int64],
+    start: wp.array[wp.int64],
+    noted: GradientHits,
+    # outputs
+    grad_center: wp.array[wp.vec3],
+    grad_tangent_u: wp.array[wp.vec3],
+    grad_tangent_v: wp.array[wp.vec3],
+    grad_opacity: wp.array[float],
+    grad_radiance: wp.array2d[wp.vec3],
+):
+    """Add up a surfel's hits, in the order of rays: one thread a surfel, so no atomics and the same bits every time."""
+    surfel = first + wp.tid()
+    center = grad_center[surfel]
+    tangent_u = grad_tangent_u[surfel]
+    tangent_v = grad_tangent_v[surfel]
+    g_opacity = grad_opacity[surfel]
+    coefficients = (degree + 1) * (degree + 1)
+    for place in range(int(start[surfel]), int(start[surfel + 1])):
+        note = int(order[place])
+        plane = noted.plane[note]
+        g_center = noted.center[note]
+        center += g_center
+        tangent_u += plane[0] * g_center
+        tangent_v += plane[1] * g_center
+        g_opacity += plane[2]
+        if degree < 0:
+            grad_radiance[surfel, 0] = grad_radiance[surfel, 0] + noted.radiance[note]
+        else:
+            basis = sh_basis_at(directions[noted.ray[note]])
+            for k in range(coefficients):
+                grad_radiance[surfel, k] = grad_radiance[surfel, k] + basis[k] * noted.radiance[note]
+    grad_center[surfel] = center
+    grad_tangent_u[surfel] = tangent_u
+    grad_tangent_v[surfel] = tangent_v
+    grad_opacity[surfel] = g_opacity
