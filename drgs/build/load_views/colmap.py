@@ -72,7 +72,7 @@ def read_colmap(folder: Path) -> Capture:
 
     paths = [images_root / image.name for image in images]
     for path, image in zip(paths, images, strict=True):
-        if not path.resolve().is_relative_to(images_root.resolve()) or ".." in Path(image.name).parts:
+        if Path(image.name).is_absolute() or ".." in Path(image.name).parts:
             raise ValueError(f"{model}/images{suffix}: image name {image.name!r} leads outside {images_root}.")
         if not path.is_file():
             raise ValueError(f"{path}: no such image, but {model.name}/images{suffix} names it.")
@@ -144,7 +144,13 @@ def _images_bin(stem: Path) -> Iterator[_ColmapImage]:
             raise IndexError("an image name has no end")
         name = data[at + 64 : end].decode("utf-8")
         at = end + 1 + 8 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
+        _check_end(at, data)
         yield _ColmapImage(name, numbers[8], numbers[1:5], numbers[5:8])
+
+
+def _check_end(at: int, data: bytes) -> None:
+    if at > len(data):
+        raise IndexError(f"an entry ends at byte {at} of {len(data)}")
 
 
 def _points_bin(stem: Path) -> np.ndarray:
@@ -156,6 +162,7 @@ def _points_bin(stem: Path) -> np.ndarray:
         numbers = row.unpack_from(data, at)
         rows.append(numbers[1:7])
         at += row.size + 8 * numbers[8]
+        _check_end(at, data)
     return np.array(rows, dtype=np.float64).reshape(-1, 6)
 
 

@@ -46,7 +46,7 @@ def _read_points(folder: Path, ply_file_path: object, named_in: Path) -> tuple[n
     if not isinstance(ply_file_path, str):
         return None, None
     path = folder / ply_file_path
-    if not path.resolve().is_relative_to(folder.resolve()):
+    if Path(ply_file_path).is_absolute() or ".." in Path(ply_file_path).parts:
         raise ValueError(f"{named_in}: ply_file_path {ply_file_path!r} leads outside the capture folder.")
     if not path.is_file():
         raise ValueError(f"{path}: no such point file, but {named_in.name} names it as ply_file_path.")
