@@ -173,10 +173,10 @@ def _read_cameras(data: bytes, path: Path, device: torch.device | str) -> tuple[
         frames = json.loads(data)["frames"]
         cameras = []
         for frame in frames:
-            matrices = [torch.tensor(frame[key], dtype=torch.float32, device=device) for key in ("camera_from_world", "intrinsics")]
-            if matrices[0].shape != (4, 4) or matrices[1].shape != (3, 3):
+            pose, k = (torch.tensor(frame[key], dtype=torch.float32, device=device) for key in ("camera_from_world", "intrinsics"))
+            if pose.shape != (4, 4) or k.shape != (3, 3):
                 raise ValueError("a matrix has the wrong shape")
-            cameras.append(Camera(*matrices, int(frame["w"]), int(frame["h"]), str(frame["file_path"])))
+            cameras.append(Camera(pose, k, int(frame["w"]), int(frame["h"]), str(frame["file_path"])))
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: cameras.json is damaged ({error!r})") from error
     return tuple(cameras)

@@ -51,7 +51,9 @@ def pixel_rays_world(camera: Camera) -> tuple[Tensor, Tensor]:
     device = camera.intrinsics.device
     x = torch.arange(camera.width, device=device, dtype=torch.float32) + 0.5
     y = torch.arange(camera.height, device=device, dtype=torch.float32) + 0.5
-    pixels = torch.stack([x.expand(camera.height, -1), y[:, None].expand(-1, camera.width), torch.ones(camera.height, camera.width, device=device)], -1)
+    pixels = torch.stack(
+        [x.expand(camera.height, -1), y[:, None].expand(-1, camera.width), torch.ones(camera.height, camera.width, device=device)], -1
+    )
     camera_from_pixel = torch.linalg.inv(camera.intrinsics)
     world_from_camera_rotation = camera.camera_from_world[:3, :3].T
     directions = pixels @ (world_from_camera_rotation @ camera_from_pixel).T

@@ -27,8 +27,9 @@ def select_vertices(mesh: TriangleMesh, selection: Selection) -> Tensor:
     """
     if selection.all:
         return torch.ones_like(mesh.roughness)
-    if selection.sphere is not None or selection.box is not None:
-        return _weights_at_points(mesh.vertices, selection.sphere or selection.box)
+    solid = selection.sphere or selection.box
+    if solid is not None:
+        return _weights_at_points(mesh.vertices, solid)
     if selection.similar is not None:
         return _flood(mesh, selection.similar)
     if selection.vertex_weights is not None:
@@ -46,8 +47,9 @@ def select_surfels(centers: Tensor, mesh: TriangleMesh, binding: Binding | None,
     """(surfel,) weights 0..1 of surfels at rest centres (surfel, 3), given what `select_vertices` found on the mesh."""
     if selection.all:
         return torch.ones_like(centers[:, 0])
-    if selection.sphere is not None or selection.box is not None:
-        return _weights_at_points(centers, selection.sphere or selection.box)
+    solid = selection.sphere or selection.box
+    if solid is not None:
+        return _weights_at_points(centers, solid)
     if binding is not None:
         weights = (vertex_weights[mesh.faces[binding.face.long()].long()] * binding.barycentric).sum(-1)
         # Barycentrics that sum to 1 up to rounding must not leave a fully selected face at 0.9999999.
