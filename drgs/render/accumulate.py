@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
+import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
@@ -17,8 +18,8 @@ from drgs.render.environment_table import build_environment_table, environment_l
 from drgs.render.lift_points import lift_points
 from drgs.render.rasterize_gbuffer import rasterize_gbuffer
 from drgs.render.records import Frame, GBuffer, Radiance
-from drgs.render.sample_rays import SampleCounts, sample_counts, shading_points
-from drgs.render.shade import PointLight, shade
+from drgs.render.sample_rays import PointArrays, SampleCounts, point_arrays, sample_counts, shading_points
+from drgs.render.shade import shade
 from drgs.render.tonemap import tonemap
 from drgs.render.trace_primary import PrimaryPoints, screen_box, trace_primary_points
 from drgs.render.trace_rays import build_tracer
@@ -26,6 +27,9 @@ from drgs.render.tracer import AbstractTracer
 from drgs.scene.camera import Camera, pixel_rays_world
 from drgs.scene.environment import Environment, environment_radiance
 from drgs.scene.posed_scene import PosedScene
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
 
 
 @dataclass(frozen=True)
@@ -129,13 +133,64 @@ def start_frame(
     return FrameState(scene, camera, settings, tracer, light, counts, fixed, box, gbuffer, *vectors, *numbers, surface, 0, seconds)
 
 
+@wp.kernel
+def add_pass(
+    first: int,
+    pixel: wp.array[int],
+    pass_diffuse: wp.array[wp.vec3],
+    pass_specular: wp.array[wp.vec3],
+    pass_variance: wp.array[float],
+    pass_visibility: wp.array[float],
+    # outputs; each pixel occurs once a pass, so plain adds are exact and ordered
+    diffuse: wp.array[wp.vec3],
+    specular: wp.array[wp.vec3],
+    weight: wp.array[float],
+    luminance: wp.array[float],
+    luminance_squared: wp.array[float],
+    scatter: wp.array[float],
+    visibility: wp.array[float],
+):
+    i = first + wp.tid()
+    p = pixel[i]
+    c = pass_diffuse[i] + pass_specular[i]
+    y = 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2]
+    diffuse[p] = diffuse[p] + pass_diffuse[i]
+    specular[p] = specular[p] + pass_specular[i]
+    weight[p] = weight[p] + 1.0
+    luminance[p] = luminance[p] + y
+    luminance_squared[p] = luminance_squared[p] + y * y
+    scatter[p] = scatter[p] + pass_variance[i]
+    visibility[p] = visibility[p] + pass_visibility[i]
+
+
+@wp.kernel
+def add_surface(
+    first: int,
+    points: PointArrays,
+    depth: wp.array[float],
+    # outputs
+    surface: wp.array2d[float],
+):
+    i = first + wp.tid()
+    p = points.pixel[i]
+    for k in range(3):
+        surface[p, k] = surface[p, k] + points.position[i][k]
+        surface[p, 3 + k] = surface[p, 3 + k] + points.normal[i][k]
+        surface[p, 6 + k] = surface[p, 6 + k] + points.wo[i][k]
+        surface[p, 9 + k] = surface[p, 9 + k] + points.albedo[i][k]
+    surface[p, 12] = surface[p, 12] + points.roughness[i]
+    surface[p, 13] = surface[p, 13] + points.metallic[i]
+    surface[p, 14] = surface[p, 14] + depth[i]
+
+
 def refine_frame(state: FrameState, passes: int = 1) -> FrameState:
     """The frame after `passes` more passes; the given state stays as it is."""
-    diffuse, specular, surface = state.diffuse.clone(), state.specular.clone(), state.surface.clone()
-    weight, luminance, luminance_squared = state.weight.clone(), state.luminance.clone(), state.luminance_squared.clone()
-    scatter, visibility = state.scatter.clone(), state.visibility.clone()
+    names = ("diffuse", "specular", "weight", "luminance", "luminance_squared", "scatter", "visibility")
+    sums = {name: getattr(state, name).clone() for name in names}
+    surface = state.surface if state.fixed is not None else state.surface.clone()
+    arrays = [warp_array(sum_, wp.vec3 if sum_.dim() == 2 else None) for sum_ in sums.values()]
+    device = warp_device(surface)
     seconds = dict(state.seconds)
-    rec709 = diffuse.new_tensor([0.2126, 0.7152, 0.0722])
     for index in range(state.passes, state.passes + passes):
         clock = time.perf_counter()
         primary = state.fixed
@@ -143,31 +198,17 @@ def refine_frame(state: FrameState, passes: int = 1) -> FrameState:
             primary = trace_primary_points(state.tracer, state.camera, state.settings.seed, index, box=state.box)
         points = primary.points
         traced = time.perf_counter()
-        light: PointLight = shade(
-            points, primary.starts, state.light, state.tracer, state.counts, state.settings.bounces, state.settings.seed, index
-        )
+        light = shade(points, primary.starts, state.light, state.tracer, state.counts, state.settings.bounces, state.settings.seed, index)
         shaded = time.perf_counter()
-        # Each pixel occurs once a pass, so plain indexed adds are exact and ordered.
-        pixel = points.pixel.long()
-        y = (light.diffuse + light.specular) @ rec709
-        diffuse.index_add_(0, pixel, light.diffuse)
-        specular.index_add_(0, pixel, light.specular)
-        weight.index_add_(0, pixel, torch.ones_like(y))
-        luminance.index_add_(0, pixel, y)
-        luminance_squared.index_add_(0, pixel, y * y)
-        scatter.index_add_(0, pixel, light.variance)
-        visibility.index_add_(0, pixel, light.visibility)
+        vectors = [warp_array(light.diffuse, wp.vec3), warp_array(light.specular, wp.vec3)]
+        numbers = [warp_array(light.variance), warp_array(light.visibility)]
+        launch(add_pass, len(points.pixel), [warp_array(points.pixel), *vectors, *numbers], arrays, device)
         if state.fixed is None:
-            vectors = [points.position_world, points.normal_world, points.wo_world, points.albedo]
-            numbers = [points.roughness[:, None], points.metallic[:, None], primary.depth[:, None]]
-            surface.index_add_(0, pixel, torch.cat([*vectors, *numbers], -1))
+            launch(add_surface, len(points.pixel), [point_arrays(points), warp_array(primary.depth)], [warp_array(surface)], device)
         ended = time.perf_counter()
         for step, duration in (("trace_primary", traced - clock), ("shade", shaded - traced), ("accumulate", ended - shaded)):
             seconds[step] = seconds.get(step, 0.0) + duration
-    return replace(
-        state, diffuse=diffuse, specular=specular, weight=weight, luminance=luminance, luminance_squared=luminance_squared,
-        scatter=scatter, visibility=visibility, surface=surface, passes=state.passes + passes, seconds=seconds,
-    )  # fmt: skip
+    return replace(state, **sums, surface=surface, passes=state.passes + passes, seconds=seconds)
 
 
 def resolve_frame(state: FrameState) -> Frame:

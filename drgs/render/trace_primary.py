@@ -16,6 +16,7 @@ from torch import Tensor
 
 from drgs.render.random_warp import hash_combine, sobol_2d
 from drgs.render.records import GBuffer, ShadingPoints
+from drgs.render.sample_rays import PointArrays, point_arrays
 from drgs.render.shade import RayStarts
 from drgs.render.trace_indirect import MeshArrays, mesh_arrays, surface_at
 from drgs.render.trace_rays import build_tracer, trace_rays
@@ -69,27 +70,41 @@ def primary_rays(
 @wp.kernel
 def surface_points(
     first: int,
+    ray: wp.array[wp.int64],
     face: wp.array[int],
     barycentric: wp.array[wp.vec2],
+    ray_direction: wp.array[wp.vec3],
     mesh: MeshArrays,
+    center: wp.vec3,
+    view_axis: wp.vec3,
+    image_width: int,
+    left: int,
+    top: int,
+    width: int,
     # outputs
-    position: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
+    points: PointArrays,
     face_normal: wp.array[wp.vec3],
     start: wp.array[wp.vec3],
-    albedo: wp.array[wp.vec3],
-    roughness: wp.array[float],
-    metallic: wp.array[float],
+    depth: wp.array[float],
 ):
     i = first + wp.tid()
-    surface = surface_at(mesh, face[i], barycentric[i])
-    position[i] = surface.position
-    normal[i] = surface.normal
+    r = int(ray[i])
+    surface = surface_at(mesh, face[r], barycentric[r])
+    arriving = ray_direction[r]
+    normal = surface.normal
+    # Seen from the back a triangle is black: a normal that faces away makes it so whatever its vertices say.
+    if wp.dot(surface.face_normal, arriving) > 0.0 and wp.dot(normal, arriving) < 0.0:
+        normal = -normal
+    points.position[i] = surface.position
+    points.normal[i] = normal
+    points.wo[i] = -arriving
+    points.albedo[i] = surface.albedo
+    points.roughness[i] = surface.roughness
+    points.metallic[i] = surface.metallic
+    points.pixel[i] = (r // width + top) * image_width + r % width + left
     face_normal[i] = surface.face_normal
     start[i] = surface.position + mesh.lift * surface.face_normal
-    albedo[i] = surface.albedo
-    roughness[i] = surface.roughness
-    metallic[i] = surface.metallic
+    depth[i] = wp.dot(surface.position - center, view_axis)
 
 
 def _mat33(matrix: Tensor) -> wp.mat33:
@@ -123,37 +138,31 @@ def trace_primary_points(
     ray_count = (right - left) * (bottom - top)
     origin, direction = torch.empty(ray_count, 3, device=device), torch.empty(ray_count, 3, device=device)
     world_from_camera = camera.camera_from_world[:3, :3].T
-    center = wp.vec3(*camera.center_world.tolist())
+    center, view_axis = wp.vec3(*camera.center_world.tolist()), wp.vec3(*camera.camera_from_world[2, :3].tolist())
+    width = max(1, right - left)
     launch(
         primary_rays,
         ray_count,
         [_mat33(torch.linalg.inv(camera.intrinsics.double())), _mat33(world_from_camera), center,
-         camera.width, left, top, max(1, right - left), wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
+         camera.width, left, top, width, wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
         [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3)],
         warp_device(origin),
     )  # fmt: skip
     hits = trace_rays(origin, direction, tracer)
     ray = torch.nonzero(hits.hit).squeeze(-1)
     count = len(ray)
-    vectors = [torch.empty(count, 3, device=device) for _ in range(5)]
-    numbers = [torch.empty(count, device=device) for _ in range(2)]
+    position, normal, wo, albedo, face_normal, start = (torch.empty(count, 3, device=device) for _ in range(6))
+    roughness, metallic, depth = (torch.empty(count, device=device) for _ in range(3))
+    points = ShadingPoints(position, normal, wo, albedo, roughness, metallic, torch.empty(count, dtype=torch.int32, device=device))
     launch(
         surface_points,
         count,
-        [warp_array(hits.face[ray]), warp_array(hits.barycentric[ray], wp.vec2), mesh_arrays(mesh, tracer.lift)],
-        [*(warp_array(t, wp.vec3) for t in vectors), *(warp_array(t) for t in numbers)],
+        [warp_array(ray), warp_array(hits.face), warp_array(hits.barycentric, wp.vec2), warp_array(direction, wp.vec3),
+         mesh_arrays(mesh, tracer.lift), center, view_axis, camera.width, left, top, width],
+        [point_arrays(points), warp_array(face_normal, wp.vec3), warp_array(start, wp.vec3), warp_array(depth)],
         warp_device(origin),
-    )
-    position, normal, face_normal, start, albedo = vectors
-    width = max(1, right - left)
-    pixel = ((ray // width + top) * camera.width + ray % width + left).int()
-    view_axis = camera.camera_from_world[2, :3].to(device)
-    arriving = direction[ray]
-    depth = hits.distance[ray] * (arriving @ view_axis)
-    # Seen from the back a triangle is black: a normal that faces away makes it so whatever its vertices say.
-    behind = (face_normal * arriving).sum(-1) > 0
-    normal = torch.where((behind & ((normal * arriving).sum(-1) < 0))[:, None], -normal, normal)
-    return PrimaryPoints(ShadingPoints(position, normal, -arriving, albedo, *numbers, pixel), RayStarts(start, face_normal), depth)
+    )  # fmt: skip
+    return PrimaryPoints(points, RayStarts(start, face_normal), depth)
 
 
 def trace_primary(

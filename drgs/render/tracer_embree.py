@@ -23,11 +23,14 @@ class EmbreeTracer(AbstractTracer):
 
     def closest_hits(self, origins: Tensor, directions: Tensor) -> Hits:
         found = self._scene.run(origins.numpy(), directions.numpy(), query="INTERSECT", output=True)
-        face = torch.from_numpy(found["primID"])
+        # numpy, not torch: callers run on several threads, and each would start its own OpenMP team.
+        face = found["primID"]
         hit = face >= 0
-        distance = torch.where(hit, torch.from_numpy(found["tfar"]), torch.inf)
-        barycentric = torch.stack([torch.from_numpy(found["u"]), torch.from_numpy(found["v"])], -1)
-        return Hits(hit, distance, face, torch.where(hit[:, None], barycentric, 0.0))
+        distance = np.where(hit, found["tfar"], np.float32(np.inf))
+        barycentric = np.empty((len(face), 2), np.float32)
+        barycentric[:, 0], barycentric[:, 1] = found["u"], found["v"]
+        barycentric[~hit] = 0
+        return Hits(*(torch.from_numpy(values) for values in (hit, distance, face, barycentric)))
 
     def occluded(self, origins: Tensor, directions: Tensor) -> Tensor:
-        return torch.from_numpy(self._scene.run(origins.numpy(), directions.numpy(), query="OCCLUDED")) == 0
+        return torch.from_numpy(self._scene.run(origins.numpy(), directions.numpy(), query="OCCLUDED") == 0)
