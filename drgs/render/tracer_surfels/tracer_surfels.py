@@ -129,10 +129,11 @@ class BlendedRadiance(torch.autograd.Function):
         if scene.tree is not None:
             table = table_of(scene, kept_radiance)
             outputs = [warp_array(x, None if x.ndim == 1 else wp.vec3) for x in sums]
-            results = [x.float().contiguous() for x in output_grads]
-            for rays in chunks_of_rays(hit_count):
-                pieces = [x[rays] for x in (origins, directions, *results, blended, opacity, depth)]
-                sum_chunk(table, pieces, hit_count[rays], ctx.t_min, kept_count, outputs)
+            met = hit_count.nonzero()[:, 0]  # rays without hits have no gradient, and are often most of them
+            per_ray = [x.float()[met] for x in (origins, directions, *output_grads, blended, opacity, depth)]
+            met_count = hit_count[met]
+            for rays in chunks_of_rays(met_count):
+                sum_chunk(table, [x[rays] for x in per_ray], met_count[rays], ctx.t_min, kept_count, outputs)
         grads = [sums[0], torch.stack([sums[1], sums[2]], -1), sums[3], sums[4]]
         scattered = []
         for grad, (shape, dtype) in zip(grads, ctx.shapes, strict=True):
@@ -143,10 +144,10 @@ class BlendedRadiance(torch.autograd.Function):
 
 
 def chunks_of_rays(hit_count: Tensor) -> list[slice]:
-    """Runs of rays with at most HITS_PER_CHUNK hits together (or one ray with more); runs without hits are left out."""
+    """Runs of rays with at most HITS_PER_CHUNK hits together (or one ray with more); every ray has a hit."""
     total = torch.cumsum(hit_count.long(), 0)
     chunks, first, done = [], 0, 0
-    while first < hit_count.shape[0] and done < int(total[-1]):
+    while first < hit_count.shape[0]:
         last = max(first + 1, int(torch.searchsorted(total, done + HITS_PER_CHUNK, right=True)))
         chunks.append(slice(first, last))
         first, done = last, int(total[last - 1])
@@ -161,7 +162,7 @@ def sum_chunk(table: Any, pieces: list[Tensor], hit_count: Tensor, t_min: float,
     """
     origins, directions, grad_radiance, grad_opacity, grad_depth, blended, opacity, depth = (x.contiguous() for x in pieces)
     ends = torch.cumsum(hit_count.long(), 0)
-    noted, tensors = empty_hits(max(1, int(ends[-1])), origins.device)
+    noted, tensors = empty_hits(int(ends[-1]), origins.device)
     device = warp_device(origins)
     launch(
         walk_rays,
@@ -179,8 +180,8 @@ def sum_chunk(table: Any, pieces: list[Tensor], hit_count: Tensor, t_min: float,
         outputs=[warp_array(blended, wp.vec3), warp_array(opacity), warp_array(depth), warp_array(hit_count.contiguous()), noted],
         device=device,
     )
-    order = torch.argsort(tensors["surfel"][: int(ends[-1])], stable=True)
-    per_surfel = torch.bincount(tensors["surfel"][: int(ends[-1])].long(), minlength=kept_count)
+    order = torch.argsort(tensors["surfel"], stable=True)
+    per_surfel = torch.bincount(tensors["surfel"].long(), minlength=kept_count)
     start = torch.cat([per_surfel.new_zeros(1), torch.cumsum(per_surfel, 0)])
     launch(
         sum_by_surfel,
