@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.build.visual_hull import VisualHull, axes_meeting_point, camera_geometry, visual_hull
+from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
 COLOR_VIEWS = 24
@@ -91,8 +92,8 @@ def _from_sparse(
         kept = random.choice(len(points), count, replace=False)
         points, colors = points[kept], colors[kept]
     if hull is None:
-        center, radius = _bounding_sphere(points)
-        return _record(points, None, colors, center, radius, "sparse", None)
+        # Without masks the points are of the whole room; the object is where all cameras look.
+        return _record(points, None, colors, *_seen_by_all(views), "sparse", None)
     center, radius = _bounding_sphere(hull.vertices_world)
     normals = _vertex_normals(hull)[cKDTree(hull.vertices_world).query(points)[1]]
     if len(points) == count:
@@ -125,7 +126,7 @@ def _sparse_points_on_object(views: Views) -> tuple[ndarray, ndarray] | None:
     return points, colors
 
 
-def _project(camera, points: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+def _project(camera: Camera, points: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Pixel column and row (clamped), whether the point is in the picture, and its depth."""
     world_to_pixel = (camera.intrinsics.double() @ camera.camera_from_world.double()[:3]).cpu().numpy().astype(np.float32)
     projected = points.astype(np.float32) @ world_to_pixel[:, :3].T + world_to_pixel[:, 3]
@@ -198,7 +199,7 @@ def _median_colors(views: Views, points: ndarray, normals: ndarray | None, hull:
     return torch.nan_to_num(torch.nanmedian(votes, dim=0).values, nan=0.5).numpy()
 
 
-def _nearest_depth(camera, hull: VisualHull) -> ndarray:
+def _nearest_depth(camera: Camera, hull: VisualHull) -> ndarray:
     """(height, width) depth of the hull's nearest vertex around each pixel, +inf where there is none."""
     column, row, inside, depth = _project(camera, hull.vertices_world)
     # Cells of pixels as wide as two voxels, so that vertices leave no holes.
