@@ -1,0 +1,78 @@
+"""Rows of the database as REST answers."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from server.rest_records import AssetInfo, JobInfo, SessionInfo
+from server.sessions import LiveSession
+from worker.database import AssetRow, JobRow
+from worker.queue import JobStatus
+
+
+def _time(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def job_info(row: JobRow, status: JobStatus) -> JobInfo:
+    """What is stored of a job and what the queue says of it."""
+    error = row.error
+    if status.state == "failed" and error is None:
+        error = (
+            "The worker died three times while it ran this job; it may need more memory than there is."
+            if status.gave_up
+            else "The job failed without a word."
+        )
+    return JobInfo(
+        id=row.id,
+        kind="build",
+        name=row.name,
+        preset=row.preset,
+        state=status.state,  # type: ignore[arg-type]
+        created_at=_time(row.created_at),
+        finished_at=_time(row.finished_at) if row.finished_at is not None else None,
+        stage=row.stage,
+        iteration=row.iteration,
+        iterations=row.iterations,
+        fraction=row.fraction,
+        psnr=row.psnr,
+        eta_seconds=row.eta_seconds if status.state == "running" else None,
+        message=row.message,
+        attempts=row.attempts,
+        asset_id=row.asset_id if status.state == "done" else None,
+        error=error if status.state == "failed" else None,
+        preview_version=row.preview_version,
+    )
+
+
+def job_infos(rows: Sequence[JobRow], statuses: dict[str, JobStatus]) -> list[JobInfo]:
+    return [job_info(row, statuses[row.id]) for row in rows]
+
+
+def asset_info(row: AssetRow, folder: Path) -> AssetInfo:
+    return AssetInfo(
+        id=row.id,
+        name=row.name,
+        created_at=_time(row.created_at),
+        bytes=row.bytes,
+        source=row.source,
+        surfel_count=row.surfel_count,
+        vertex_count=row.vertex_count,
+        face_count=row.face_count,
+        has_thumbnail=(folder / "thumb.jpg").is_file(),
+    )
+
+
+def session_info(session: LiveSession) -> SessionInfo:
+    log = session.log.message()
+    return SessionInfo(
+        id=session.id,
+        asset=session.asset_id,
+        asset_name=session.asset_name,
+        created_at=_time(session.created_at),
+        revision=log.revision,
+        edits=log.edits,
+        can_undo=log.can_undo,
+        can_redo=log.can_redo,
+        viewers=len(session.viewers),
+    )

@@ -1,0 +1,42 @@
+"""What the routes work with: made once by `create_app`, found at `request.app.state.context`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from fastapi import Request
+from sqlalchemy import Engine
+
+from server.environments import EnvironmentStore
+from server.render_thread import RenderThread
+from server.security import Gatekeeper
+from server.sessions import SessionRegistry
+from server.settings import ServerSettings
+from server.viewer import Viewer
+from worker.data_directory import DataDirectory
+from worker.queue import JobQueue
+
+if TYPE_CHECKING:
+    from server.stream import Connection
+
+
+@dataclass(frozen=True, eq=False)
+class ServerContext:
+    """The parts of a running server."""
+
+    settings: ServerSettings
+    directory: DataDirectory
+    engine: Engine
+    queue: JobQueue
+    environments: EnvironmentStore
+    render_thread: RenderThread
+    sessions: SessionRegistry
+    gatekeeper: Gatekeeper
+    connections: dict[Viewer, Connection] = field(default_factory=dict)
+    """Open streams by their viewer."""
+
+
+def context_of(request: Request) -> ServerContext:
+    """Dependency of routes."""
+    return request.app.state.context

@@ -1,0 +1,278 @@
+"""The renderer of the service: drgs' own progressive frames, with everything kept that a change leaves as it was.
+
+    camera or size      the G-buffer is rasterised again
+    environment         nothing but the light is computed again
+    material            no geometry: the tracer's tree stays, its mesh gets the new materials
+    shape               the tree is built again
+    exposure, background  nothing is computed again, the sums are shown anew
+
+Imported only on the render thread, and torch only inside functions: the API process must start fast.
+"""
+
+import copy
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.scene.edits import Edit
+from server.messages import CameraMessage, Settings
+from server.render_session import (
+    AbstractLoadedAsset,
+    AbstractPicture,
+    AbstractPose,
+    AbstractRenderer,
+    Bounds,
+    Picked,
+    Pixels,
+    view_of_bounds,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from drgs.render.accumulate import FrameState
+    from drgs.render.records import Frame, GBuffer
+    from drgs.render.tracer import AbstractTracer
+    from drgs.scene.asset import Asset
+    from drgs.scene.environment import Environment
+    from drgs.scene.posed_scene import PosedScene
+
+SAMPLES_PER_PASS = 4
+"""Rays a pixel of the first, quick picture: two cosine, one GGX, one towards the environment."""
+REFINE_SECONDS = 0.03
+"""A refinement lasts about this long, so that a new input need not wait; never less than one pass."""
+CHANNEL_SAMPLES = 32
+"""Behind a picture of albedo, normals ...: passes are its antialiasing."""
+
+
+class DrgsRenderer(AbstractRenderer):
+    """Final."""
+
+    def __init__(self, device: str = "auto") -> None:
+        self._device = device
+
+    def load(self, folder: Path, environments: Path) -> "LoadedAsset":
+        from drgs.scene.asset import load_asset
+        from drgs.warp_torch import device_from_name
+
+        return LoadedAsset(load_asset(folder, device_from_name(self._device)), environments)
+
+
+class LoadedAsset(AbstractLoadedAsset):
+    """Final."""
+
+    def __init__(self, asset: "Asset", environments: Path) -> None:
+        self.asset = asset
+        self._environments = environments
+        self._light: dict[str, tuple[int, Environment]] = {}
+        low, high = asset.mesh.vertices.amin(0).tolist(), asset.mesh.vertices.amax(0).tolist()
+        self.bounds = Bounds(tuple(low), tuple(high))
+        self.start_view = view_of_bounds(self.bounds)
+
+    def pose(self, edits: Sequence[Edit], previous: AbstractPose | None) -> "Pose":
+        from drgs.deform.pose_scene import pose_scene
+
+        scene = pose_scene(self.asset, edits, self._environments, environments=self._environment, confine=True)
+        return Pose(scene, self._tracer(scene, previous))
+
+    def _tracer(self, scene: "PosedScene", previous: AbstractPose | None) -> "AbstractTracer":
+        from drgs.render.trace_rays import build_tracer
+
+        if not isinstance(previous, Pose) or previous.scene.mesh.vertices is not scene.mesh.vertices:
+            return build_tracer(scene.mesh)
+        if previous.scene.mesh is scene.mesh:
+            return previous.tracer
+        tracer = copy.copy(previous.tracer)  # shares the tree; hits look materials up in `mesh`
+        tracer.mesh = scene.mesh
+        return tracer
+
+    def _environment(self, name: str) -> "Environment":
+        """A stored environment, read once for each version of its file."""
+        import torch
+
+        from drgs.exchange.exr import decode_environment
+        from drgs.scene.environment import Environment
+
+        path = self._environments / name
+        try:
+            stamp = path.stat().st_mtime_ns
+        except FileNotFoundError as error:
+            raise ValueError(f"The environment {name} is no longer stored here.") from error
+        known = self._light.get(name)
+        if known is None or known[0] != stamp:
+            radiance = torch.from_numpy(np.ascontiguousarray(decode_environment(path.read_bytes(), name)))
+            self._light[name] = known = (stamp, Environment(radiance.to(self.asset.mesh.vertices.device)))
+        return known[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Pose(AbstractPose):
+    """Final."""
+
+    scene: "PosedScene"
+    tracer: "AbstractTracer"
+
+    def begin(self, camera: CameraMessage, settings: Settings, width: int, height: int, previous: AbstractPicture | None) -> "Picture":
+        from drgs.render.accumulate import start_frame
+
+        known = previous if isinstance(previous, Picture) else None
+        same_view = known is not None and known.view_key == _view_key(camera, width, height)
+        if known is not None and same_view and known.pose is self and known.rays_key == _rays_key(settings):
+            return known.shown_with(settings)
+        gbuffer = known.gbuffer if known is not None and same_view and _same_surfels(known.pose.scene, self.scene) else None
+        state = start_frame(self.scene, _camera(camera, width, height), _render_settings(settings), self.tracer, gbuffer)
+        return Picture(self, state, settings, _view_key(camera, width, height))
+
+
+class Picture(AbstractPicture):
+    """Final. Wraps the frozen states of drgs.render.accumulate."""
+
+    def __init__(self, pose: Pose, state: "FrameState", settings: Settings, view_key: tuple) -> None:
+        self.pose = pose
+        self.view_key = view_key
+        self.rays_key = _rays_key(settings)
+        self.width, self.height = state.camera.width, state.camera.height
+        self._state = state
+        self._settings = settings
+        self._passes_at_once = 1
+
+    @property
+    def samples(self) -> int:  # type: ignore[override]
+        return self._state.passes * self._state.counts.total
+
+    @property
+    def samples_target(self) -> int:  # type: ignore[override]
+        wanted = self._settings.spp_target if self._settings.channel == "final" else min(CHANNEL_SAMPLES, self._settings.spp_target)
+        if self._settings.channel != "final" and self._state.fixed is not None:
+            wanted = 1  # maps of Gaussians are exact from the first pass on
+        return max(wanted, self._state.counts.total)
+
+    @property
+    def gbuffer(self) -> "GBuffer | None":
+        """Of the Gaussians; None where the mesh is traced."""
+        return self._state.gbuffer
+
+    def shown_with(self, settings: Settings) -> "Picture":
+        """The same sums under another exposure, background, channel or target."""
+        picture = Picture(self.pose, replace(self._state, settings=_render_settings(settings)), settings, self.view_key)
+        picture._passes_at_once = self._passes_at_once
+        return picture
+
+    def refine(self) -> None:
+        from drgs.render.accumulate import refine_frame
+
+        if self.samples >= self.samples_target:
+            return
+        left = -(-(self.samples_target - self.samples) // self._state.counts.total)
+        passes = min(self._passes_at_once, left)
+        start = time.perf_counter()
+        self._state = refine_frame(self._state, passes)
+        seconds = (time.perf_counter() - start) / passes
+        self._passes_at_once = max(1, min(int(REFINE_SECONDS / max(seconds, 1e-4)), 2 * self._passes_at_once))
+
+    def resolve(self) -> Pixels:
+        from drgs.render.accumulate import resolve_frame
+
+        return _pixels(resolve_frame(self._state), self._settings)
+
+    def pick(self, x: float, y: float) -> Picked | None:
+        from drgs.render.accumulate import resolve_frame
+
+        maps = resolve_frame(self._state).gbuffer
+        column, row = min(int(x * self.width), self.width - 1), min(int(y * self.height), self.height - 1)
+        if float(maps.coverage[row, column]) < 0.5:
+            return None
+        return Picked(
+            position=tuple(maps.position_world[row, column].tolist()),
+            normal=tuple(maps.normal_world[row, column].tolist()),
+            albedo=tuple(maps.albedo[row, column].clamp(0, 1).tolist()),
+            roughness=float(maps.roughness[row, column]),
+            metallic=float(maps.metallic[row, column]),
+        )
+
+
+def _view_key(camera: CameraMessage, width: int, height: int) -> tuple:
+    return (camera.world_from_camera, camera.fov_y_degrees, width, height)
+
+
+def _rays_key(settings: Settings) -> tuple:
+    """What of the settings changes the light that is summed, not only how it is shown."""
+    return (settings.bounces if settings.channel == "final" else 0,)
+
+
+def _same_surfels(a: "PosedScene", b: "PosedScene") -> bool:
+    """Whether a G-buffer of one is one of the other; pose_scene keeps what edits leave alone, so identity tells."""
+    if a.surfels is None or b.surfels is None:
+        return False
+    pairs = [(getattr(a.surfels, name), getattr(b.surfels, name)) for name in ("centers", "tangents", "opacities")]
+    pairs += [(getattr(a.surfels.materials, name), getattr(b.surfels.materials, name)) for name in ("albedo", "roughness", "metallic")]
+    return all(left is right for left, right in pairs)
+
+
+def _camera(message: CameraMessage, width: int, height: int):
+    import torch
+
+    from drgs.scene.camera import camera_from_opengl
+
+    focal = height / 2 / np.tan(np.radians(message.fov_y_degrees) / 2)
+    # Rounding may change the aspect of a reduced picture by a pixel: the full one's horizontal angle is kept.
+    focal_x = focal * (width / height) * (message.height / message.width)
+    intrinsics = torch.tensor([[focal_x, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return camera_from_opengl(torch.tensor(message.world_from_camera, dtype=torch.float64), intrinsics, width, height)
+
+
+def _render_settings(settings: Settings):
+    from drgs.render.accumulate import RenderSettings
+
+    background = settings.background
+    if settings.channel != "final":
+        background = "transparent"
+    elif isinstance(background, tuple):
+        background = tuple(_linear(value) for value in background)
+    return RenderSettings(
+        samples_per_pixel=settings.spp_target,
+        samples_per_pass=SAMPLES_PER_PASS,
+        bounces=_rays_key(settings)[0],
+        exposure=settings.exposure_stops,
+        background=background,
+    )
+
+
+def _linear(srgb: float) -> float:
+    srgb = min(max(srgb, 0.0), 1.0)
+    return srgb / 12.92 if srgb <= 0.04045 else ((srgb + 0.055) / 1.055) ** 2.4
+
+
+def _pixels(frame: "Frame", settings: Settings) -> Pixels:
+    import torch
+
+    if settings.channel == "final":
+        rgba = frame.rgba_srgb
+    else:
+        coverage = frame.gbuffer.coverage
+        color = torch.where(coverage[..., None] > 0, _channel(frame.gbuffer, settings.channel), 0.0)
+        rgba = torch.cat([color.clamp(0, 1), coverage.clamp(0, 1)[..., None]], -1)
+    return (rgba.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+
+
+def _channel(maps: "GBuffer", channel: str) -> "Tensor":
+    """(height, width, 3) in 0..1 for showing."""
+    import torch
+
+    from drgs.maths.color import srgb_from_linear
+
+    if channel == "albedo":
+        return srgb_from_linear(maps.albedo.clamp(0, 1))
+    if channel == "normal":
+        return maps.normal_world * 0.5 + 0.5
+    if channel in ("roughness", "metallic"):
+        return getattr(maps, channel)[..., None].expand(-1, -1, 3)
+    depth = maps.depth[maps.coverage > 0.5]
+    near, far = (float(depth.min()), float(depth.max())) if len(depth) else (0.0, 1.0)
+    # Near is bright; the farthest point stays visible before black.
+    shade = 1 - 0.9 * (maps.depth - near) / max(far - near, 1e-6)
+    return torch.nan_to_num(shade, 0.0, 0.0, 0.0)[..., None].expand(-1, -1, 3)

@@ -1,0 +1,121 @@
+"""The stored environments: EXR files in one folder, each with a small tone-mapped picture beside it."""
+
+import re
+import shutil
+import struct
+import threading
+from pathlib import Path
+
+import numpy as np
+import simplejpeg
+
+from server.rest_records import EnvironmentInfo
+
+THUMBNAIL_SIZE = (256, 128)
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,79}\.exr")
+
+
+class EnvironmentStore:
+    """Final. Names are file names of this folder and of the form `letters-digits.exr`; nothing else is ever joined to a path."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self._making = threading.Lock()
+
+    def add_bundled(self, source: Path) -> None:
+        """Copy the EXR files of a folder that are not there yet."""
+        for path in sorted(source.glob("*.exr")) if source.is_dir() else ():
+            if _NAME.fullmatch(path.name) and not (self._folder / path.name).exists():
+                draft = self._folder / f".{path.name}.new"
+                shutil.copyfile(path, draft)
+                draft.rename(self._folder / path.name)
+
+    def has(self, name: str) -> bool:
+        return _NAME.fullmatch(name) is not None and (self._folder / name).is_file()
+
+    def path(self, name: str) -> Path:
+        """
+        Raises:
+            KeyError: there is none of this name.
+        """
+        if not self.has(name):
+            raise KeyError(name)
+        return self._folder / name
+
+    def all(self) -> list[EnvironmentInfo]:
+        """By name; files that are no readable environments are left out."""
+        found = []
+        for path in sorted(self._folder.glob("*.exr")):
+            if _NAME.fullmatch(path.name):
+                try:
+                    found.append(self.info(path.name))
+                except ValueError:
+                    continue
+        return found
+
+    def info(self, name: str) -> EnvironmentInfo:
+        """
+        Raises:
+            KeyError: there is none of this name.
+            ValueError: it cannot be read.
+        """
+        path = self.path(name)
+        if name not in self._sizes:
+            self._sizes[name] = exr_size(path)
+        width, height = self._sizes[name]
+        return EnvironmentInfo(name=name, title=path.stem.replace("_", " ").replace("-", " ").capitalize(), width=width, height=height)
+
+    def free_name(self, wanted: str) -> str:
+        """A name of the wanted kind that no file has."""
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "-", wanted).strip("-_")[:60] or "environment"
+        candidates = (f"{stem}.exr", *(f"{stem}-{k}.exr" for k in range(2, 10_000)))
+        return next(name for name in candidates if not (self._folder / name).exists())
+
+    def thumbnail(self, name: str) -> Path:
+        """The small picture, made when it is first asked for.
+
+        Raises:
+            KeyError: there is no environment of this name.
+            ValueError: it cannot be read.
+        """
+        path = self.path(name)
+        picture = path.with_suffix(".jpg")
+        with self._making:
+            if not picture.exists() or picture.stat().st_mtime < path.stat().st_mtime:
+                draft = picture.with_suffix(".new")
+                draft.write_bytes(environment_thumbnail(path))
+                draft.rename(picture)
+        return picture
+
+
+def environment_thumbnail(path: Path) -> bytes:
+    """JPEG of an environment, exposed so that its median is middle grey, highlights rolled off (Reinhard)."""
+    from drgs.exchange.exr import decode_environment
+
+    radiance = decode_environment(path.read_bytes(), path.name)
+    height, width, _ = radiance.shape
+    rows = (np.arange(THUMBNAIL_SIZE[1]) + 0.5) * height / THUMBNAIL_SIZE[1]
+    columns = (np.arange(THUMBNAIL_SIZE[0]) + 0.5) * width / THUMBNAIL_SIZE[0]
+    small = radiance[rows.astype(int)][:, columns.astype(int)]
+    luminance = small @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    small = small * (0.18 / max(float(np.median(luminance)), 1e-6))
+    small = small / (1 + small)
+    srgb = np.where(small <= 0.0031308, 12.92 * small, 1.055 * np.maximum(small, 0.0031308) ** (1 / 2.4) - 0.055)
+    return simplejpeg.encode_jpeg(np.ascontiguousarray((srgb.clip(0, 1) * 255).astype(np.uint8)), quality=85, colorspace="RGB")
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Width and height from an EXR's header, which is not decoded any further.
+
+    Raises:
+        ValueError: no EXR, or its header has no dataWindow.
+    """
+    with path.open("rb") as file:
+        head = file.read(65536)
+    name = b"dataWindow\0box2i\0"
+    at = head.find(name)
+    if head[:4] != b"\x76\x2f\x31\x01" or at < 0 or len(head) < at + len(name) + 20:
+        raise ValueError(f"{path.name}: expected an OpenEXR file with a dataWindow in its header")
+    left, top, right, bottom = struct.unpack_from("<4i", head, at + len(name) + 4)
+    return right - left + 1, bottom - top + 1

@@ -1,0 +1,107 @@
+"""The door between the service and the renderer: what the stream asks of one loaded asset. All of it runs on the render thread.
+
+`drgs_renderer.py` implements it with drgs; tests do with a painter of flat colours. Nothing here imports torch.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from drgs.scene.edits import Edit
+from server.messages import CameraMessage, Settings, StartView
+from worker.start_view import FOV_Y_DEGREES, start_view
+
+Pixels: TypeAlias = np.ndarray
+"""(height, width, 4) uint8, sRGB, straight alpha."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Of the object at rest [world units]."""
+
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Picked:
+    """The surface under a pixel."""
+
+    position: tuple[float, float, float]
+    normal: tuple[float, float, float]
+    albedo: tuple[float, float, float]
+    roughness: float
+    metallic: float
+
+
+class AbstractPicture(ABC):
+    """One camera's view of one pose, getting better with every refinement."""
+
+    width: int
+    height: int
+    samples: int
+    """Rays a pixel so far."""
+    samples_target: int
+    notes: tuple[str, ...] = ()
+    """What was skipped or reduced, and why."""
+
+    @abstractmethod
+    def refine(self) -> None:
+        """Add the smallest useful number of samples."""
+
+    @abstractmethod
+    def resolve(self) -> Pixels:
+        """What there is so far."""
+
+    @abstractmethod
+    def pick(self, x: float, y: float) -> Picked | None:
+        """At shares of width and height; None where nothing is hit."""
+
+
+class AbstractPose(ABC):
+    """The asset under one list of edits."""
+
+    @abstractmethod
+    def begin(
+        self, camera: CameraMessage, settings: Settings, width: int, height: int, previous: AbstractPicture | None
+    ) -> AbstractPicture:
+        """A picture without samples. What it shares with `previous` (same camera, same geometry) is not computed again."""
+
+
+class AbstractLoadedAsset(ABC):
+    """An asset in memory."""
+
+    bounds: Bounds
+    start_view: StartView
+
+    @abstractmethod
+    def pose(self, edits: Sequence[Edit], previous: AbstractPose | None) -> AbstractPose:
+        """Apply edits. What it shares with `previous` (same geometry) is kept.
+
+        Raises:
+            ValueError: a sentence, when an edit cannot be applied.
+        """
+
+
+class AbstractRenderer(ABC):
+    """Loads assets."""
+
+    @abstractmethod
+    def load(self, folder: Path, environments: Path) -> AbstractLoadedAsset:
+        """
+        Args:
+            environments: folder of the files that environment edits name.
+
+        Raises:
+            ValueError: the folder holds no readable asset.
+        """
+
+
+def view_of_bounds(bounds: Bounds) -> StartView:
+    """The camera of `worker.start_view` as a message."""
+    matrix = start_view(bounds.minimum, bounds.maximum).tolist()
+    return StartView(world_from_camera=tuple(tuple(row) for row in matrix), fov_y_degrees=FOV_Y_DEGREES)

@@ -1,0 +1,127 @@
+"""REST: sessions, their edits, and single pictures of them."""
+
+import asyncio
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Query
+from fastapi.responses import Response
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from server.answers import session_info
+from server.context import ServerContext, context_of
+from server.encode import encode_jpeg, encode_png
+from server.messages import CameraMessage, EditLog, Settings
+from server.problems import ProblemError
+from server.render_session import Pixels
+from server.rest_records import EditRequest, SessionInfo, SessionList, SessionRequest
+
+router = APIRouter(prefix="/api/sessions", tags=["sessions"])
+
+Context = Annotated[ServerContext, Depends(context_of)]
+
+MAX_WORK = 4096 * 4096 * 64
+"""Pixels times samples of one picture."""
+
+
+@router.post("", status_code=201)
+async def open_session(body: SessionRequest, context: Context) -> SessionInfo:
+    return session_info(await context.sessions.create(body.asset))
+
+
+@router.get("")
+async def list_sessions(context: Context) -> SessionList:
+    """Newest first, at most 100."""
+    return SessionList(sessions=[session_info(session) for session in await context.sessions.all()])
+
+
+@router.get("/{session_id}")
+async def read_session(session_id: str, context: Context) -> SessionInfo:
+    return session_info(await context.sessions.get(session_id))
+
+
+@router.delete("/{session_id}", status_code=204)
+async def delete_session(session_id: str, context: Context) -> None:
+    await context.sessions.remove(session_id)
+
+
+@router.post("/{session_id}/edits")
+async def append_edit(session_id: str, body: EditRequest, context: Context) -> EditLog:
+    return await context.sessions.apply(await context.sessions.get(session_id), "edit", body.edit)
+
+
+@router.post("/{session_id}/undo")
+async def undo(session_id: str, context: Context) -> EditLog:
+    return await context.sessions.apply(await context.sessions.get(session_id), "undo")
+
+
+@router.post("/{session_id}/redo")
+async def redo(session_id: str, context: Context) -> EditLog:
+    return await context.sessions.apply(await context.sessions.get(session_id), "redo")
+
+
+class FrameQuery(BaseModel):
+    """Of one picture."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    width: Annotated[int, Field(ge=16, le=4096)] = 512
+    height: Annotated[int, Field(ge=16, le=4096)] = 512
+    spp: Annotated[int, Field(ge=1, le=65535)] = 128
+    bounces: Annotated[int, Field(ge=0, le=8)] = 1
+    exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    background: Literal["environment", "transparent"] = "environment"
+    channel: Literal["final", "albedo", "roughness", "metallic", "normal", "depth"] = "final"
+    world_from_camera: Annotated[str, Field(max_length=1000)] | None = None
+    """16 numbers, rows, separated by commas: OpenGL camera-to-world. The start view when absent."""
+    fov_y_degrees: Annotated[float, Field(gt=0.1, lt=175)] | None = None
+
+
+@router.get("/{session_id}/frame.{suffix}")
+async def read_frame(session_id: str, suffix: Literal["jpg", "png"], context: Context, query: Annotated[FrameQuery, Query()]) -> Response:
+    """One finished picture."""
+    if query.width * query.height * query.spp > MAX_WORK:
+        raise ProblemError(422, f"A picture costs at most {MAX_WORK} samples in all; ask for fewer pixels or a smaller spp.")
+    session = await context.sessions.get(session_id)
+    posed = await context.sessions.load(session)
+    assert session.loaded is not None
+    start = session.loaded.start_view
+    try:
+        camera = CameraMessage(
+            type="camera",
+            world_from_camera=_matrix(query.world_from_camera) if query.world_from_camera else start.world_from_camera,
+            fov_y_degrees=query.fov_y_degrees or start.fov_y_degrees,
+            width=query.width,
+            height=query.height,
+        )
+    except ValidationError as error:
+        raise ProblemError(422, f"{error.errors()[0]['msg']}.") from error
+    settings = Settings(
+        exposure_stops=query.exposure_stops,
+        background=query.background,
+        spp_target=query.spp,
+        bounces=query.bounces,
+        channel=query.channel,
+    )
+    call = context.render_thread.call
+    picture = await asyncio.wrap_future(call(lambda: posed.pose.begin(camera, settings, query.width, query.height, None)))
+    # One call a refinement: viewers get their turns in between.
+    while picture.samples < picture.samples_target:
+        await asyncio.wrap_future(call(picture.refine))
+        await asyncio.sleep(0)
+
+    def finish() -> bytes:
+        pixels: Pixels = picture.resolve()
+        return encode_png(pixels) if suffix == "png" else encode_jpeg(pixels, moving=False)
+
+    media_type = "image/png" if suffix == "png" else "image/jpeg"
+    return Response(await asyncio.wrap_future(call(finish)), media_type=media_type, headers={"x-drgs-revision": str(posed.revision)})
+
+
+def _matrix(text: str) -> tuple[tuple[float, ...], ...]:
+    try:
+        numbers = [float(number) for number in text.split(",")]
+    except ValueError as error:
+        raise ProblemError(422, "world_from_camera must be 16 numbers separated by commas.") from error
+    if len(numbers) != 16:
+        raise ProblemError(422, f"world_from_camera must be 16 numbers; found {len(numbers)}.")
+    return tuple(tuple(numbers[4 * row : 4 * row + 4]) for row in range(4))

@@ -1,0 +1,156 @@
+"""`drgs serve`: the API in this process, the worker in a child that is started again when it dies."""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+import uvicorn
+
+from server.app import create_app
+from server.settings import ServerSettings
+from worker.data_directory import open_data_directory, read_token
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+LONGEST_RESTART_SECONDS = 60.0
+QUICK_DEATH_SECONDS = 10.0
+"""A worker that lived shorter than this is started again later and later."""
+
+log = logging.getLogger(__name__)
+
+
+def serve(
+    data: Path,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    with_worker: bool = True,
+    open_browser: bool = False,
+    ready: Callable[[str], None] | None = None,
+    capture_roots: tuple[Path, ...] = (),
+    device: str = "auto",
+) -> int:
+    """Serve until SIGTERM or Ctrl-C. Returns the exit code.
+
+    Args:
+        port: 0 picks a free one.
+        ready: called once with the address to open, token included, when requests are answered.
+        capture_roots: folders below which a job may name a capture.
+
+    Raises:
+        ValueError: the data directory cannot be used, the host is not this machine's own, or the port is taken.
+    """
+    if host not in LOOPBACK:
+        raise ValueError(
+            f"--host {host}: drgs serve listens on this machine only ({', '.join(LOOPBACK)}), since it has no TLS of its own; "
+            "put a TLS proxy or an SSH tunnel in front of it"
+        )
+    directory = open_data_directory(data)
+    app = create_app(ServerSettings(data=directory.root, host=host, port=port, capture_roots=capture_roots, device=device))
+    # ws_per_message_deflate costs a third of the frame rate at 1080p and gains nothing on JPEG.
+    config = uvicorn.Config(
+        app,
+        host=host,
+        port=port,
+        log_level="warning",
+        ws="websockets-sansio",
+        ws_max_size=1 << 20,
+        ws_max_queue=32,
+        ws_per_message_deflate=False,
+        server_header=False,
+        timeout_graceful_shutdown=5,
+        limit_concurrency=512,
+    )
+    server = _Server(config, lambda bound: _announce(bound, host, read_token(directory), open_browser, ready))
+    worker = WorkerProcess(directory.root, device) if with_worker else None
+    if worker:
+        worker.start()
+    try:
+        server.run()
+    except SystemExit as error:
+        raise ValueError(f"port {port} of {host} cannot be used; is a server running there already? Pick another with --port") from error
+    finally:
+        if worker:
+            worker.stop()
+    return 0
+
+
+def _announce(port: int, host: str, token: str, open_browser: bool, ready: Callable[[str], None] | None) -> None:
+    name = f"[{host}]" if ":" in host else host
+    address = f"http://{name}:{port}/#token={token}"
+    if ready is None:
+        print(f"DR-GS is at {address}", flush=True)
+    else:
+        ready(address)
+    if open_browser:
+        webbrowser.open(address)
+
+
+class _Server(uvicorn.Server):
+    """Says on which port it listens, once it does."""
+
+    def __init__(self, config: uvicorn.Config, started: Callable[[int], None]) -> None:
+        super().__init__(config)
+        self._told = started
+
+    async def startup(self, sockets=None) -> None:
+        await super().startup(sockets)
+        if self.started:
+            self._told(self.servers[0].sockets[0].getsockname()[1])
+
+
+class WorkerProcess:
+    """Final. Keeps one worker running; a thread starts it again when it dies, more slowly if it dies at once."""
+
+    def __init__(self, data: Path, device: str) -> None:
+        self._data = data
+        self._device = device
+        self._stopping = threading.Event()
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen | None = None
+        self._thread = threading.Thread(target=self._keep, name="worker-keeper", daemon=True)
+
+    @property
+    def pid(self) -> int | None:
+        process = self._process
+        return process.pid if process and process.poll() is None else None
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the worker to write its checkpoint and end; after 40 s it is killed."""
+        with self._lock:
+            self._stopping.set()
+            process = self._process
+        if process and process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(40)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._thread.join(5)
+
+    def _keep(self) -> None:
+        pause = 0.5
+        while not self._stopping.is_set():
+            started = time.monotonic()
+            with self._lock:
+                if self._stopping.is_set():
+                    return
+                command = [sys.executable, "-m", "worker", "--data", str(self._data), "--device", self._device]
+                command += ["--parent-pid", str(os.getpid())]
+                # A session of its own: Ctrl-C in the terminal reaches the server alone, which then ends the worker in order.
+                self._process = subprocess.Popen(command, start_new_session=True)
+            code = self._process.wait()
+            if self._stopping.is_set():
+                return
+            pause = 0.5 if time.monotonic() - started > QUICK_DEATH_SECONDS else min(2 * pause, LONGEST_RESTART_SECONDS)
+            log.warning("the worker ended with code %s; it is started again in %.1f s", code, pause)
+            self._stopping.wait(pause)

@@ -1,0 +1,245 @@
+"""Live sessions: one asset, one ordered log of edits, any number of viewers. The log is on disk before an edit is acknowledged.
+
+Loaded assets are kept while memory allows (`Limits.loaded_assets`); a session whose asset was unloaded, or whose server died, comes
+back from its log the next time somebody looks at it.
+"""
+
+import asyncio
+import time
+import uuid
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from sqlalchemy import Engine, delete, select
+from sqlalchemy.orm import Session as DatabaseSession
+
+from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, parse_edits
+from server import messages
+from server.edit_log import EditLog, EventKind
+from server.environments import EnvironmentStore
+from server.problems import ProblemError
+from server.render_session import AbstractLoadedAsset, AbstractRenderer
+from server.render_thread import RenderThread
+from server.settings import Limits
+from server.viewer import Posed, Viewer
+from worker.data_directory import DataDirectory
+from worker.database import AssetRow, SessionEventRow, SessionRow, now
+
+COALESCE_SECONDS = 0.5
+"""Edits with the same key, closer together than this, are one step of undo."""
+
+
+@dataclass(eq=False)
+class LiveSession:
+    """State of one session in this process. Everything but `posed` is touched on the event loop only."""
+
+    id: str
+    asset_id: str
+    asset_name: str
+    created_at: float
+    log: EditLog
+    posed: Posed | None = None
+    """None while the asset is not in memory; read by the render thread."""
+    loaded: AbstractLoadedAsset | None = None
+    viewers: set[Viewer] = field(default_factory=set)
+    listeners: set[Callable[[messages.EditLog], None]] = field(default_factory=set)
+    """Told of every change of the log."""
+    coalesce: str | None = None
+    coalesce_at: float = 0.0
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """Held while the log changes: edits are applied in the order in which they came."""
+
+
+class SessionRegistry:
+    """Final. All methods are called on the event loop."""
+
+    def __init__(
+        self,
+        directory: DataDirectory,
+        engine: Engine,
+        renderer: AbstractRenderer,
+        render_thread: RenderThread,
+        environments: EnvironmentStore,
+        limits: Limits,
+    ) -> None:
+        self._directory = directory
+        self._engine = engine
+        self._renderer = renderer
+        self._thread = render_thread
+        self._environments = environments
+        self._limits = limits
+        self._live: dict[str, LiveSession] = {}
+        self._loaded: OrderedDict[str, AbstractLoadedAsset] = OrderedDict()
+        self._loading = asyncio.Lock()
+
+    async def create(self, asset_id: str) -> LiveSession:
+        """
+        Raises:
+            ProblemError: no such asset, or too many sessions.
+        """
+        return await asyncio.to_thread(self._create, asset_id)
+
+    def _create(self, asset_id: str) -> LiveSession:
+        with DatabaseSession(self._engine) as database, database.begin():
+            asset = database.get(AssetRow, asset_id)
+            if asset is None:
+                raise ProblemError(404, f"No asset has the id {asset_id[:64]!r}.")
+            if len(database.scalars(select(SessionRow.id)).all()) >= self._limits.sessions:
+                raise ProblemError(429, f"There are {self._limits.sessions} sessions already; delete one first.")
+            row = SessionRow(id=uuid.uuid4().hex, asset_id=asset_id, created_at=now())
+            database.add(row)
+            session = LiveSession(row.id, asset_id, asset.name, row.created_at, EditLog())
+        self._live[session.id] = session
+        return session
+
+    async def get(self, session_id: str) -> LiveSession:
+        """The live one, or one replayed from its log.
+
+        Raises:
+            ProblemError: 404.
+        """
+        found = self._live.get(session_id)
+        if found is None:
+            replayed = await asyncio.to_thread(self._replay, session_id)
+            found = self._live.setdefault(session_id, replayed)
+        return found
+
+    def _replay(self, session_id: str) -> LiveSession:
+        with DatabaseSession(self._engine) as database:
+            row = database.get(SessionRow, session_id)
+            asset = database.get(AssetRow, row.asset_id) if row else None
+            if row is None or asset is None:
+                raise ProblemError(404, f"No session has the id {session_id[:64]!r}.")
+            events = database.scalars(
+                select(SessionEventRow).where(SessionEventRow.session_id == session_id).order_by(SessionEventRow.revision)
+            ).all()
+            log = EditLog()
+            for event in events:
+                log = log.after(event.kind, parse_edits([event.edit])[0] if event.edit is not None else None)  # type: ignore[arg-type]
+            return LiveSession(row.id, row.asset_id, asset.name, row.created_at, log)
+
+    async def all(self) -> list[LiveSession]:
+        """Newest first."""
+
+        def ids() -> list[str]:
+            with DatabaseSession(self._engine) as database:
+                return list(database.scalars(select(SessionRow.id).order_by(SessionRow.created_at.desc()).limit(100)))
+
+        return [await self.get(session_id) for session_id in await asyncio.to_thread(ids)]
+
+    async def remove(self, session_id: str) -> None:
+        """
+        Raises:
+            ProblemError: 404, or 409 while somebody looks at it.
+        """
+        session = await self.get(session_id)
+        if session.viewers:
+            raise ProblemError(409, "Somebody is looking at this session; close the viewer first.")
+        self._live.pop(session_id, None)
+
+        def forget() -> None:
+            with DatabaseSession(self._engine) as database, database.begin():
+                database.execute(delete(SessionEventRow).where(SessionEventRow.session_id == session_id))
+                database.execute(delete(SessionRow).where(SessionRow.id == session_id))
+
+        await asyncio.to_thread(forget)
+
+    def viewer_count(self) -> int:
+        return sum(len(session.viewers) for session in self._live.values())
+
+    def uses(self, asset_id: str) -> bool:
+        """Whether somebody looks at this asset."""
+        return any(session.asset_id == asset_id and session.viewers for session in self._live.values())
+
+    def forget_asset(self, asset_id: str) -> None:
+        """The asset was deleted, and its sessions with it."""
+        self._loaded.pop(asset_id, None)
+        for session_id in [session.id for session in self._live.values() if session.asset_id == asset_id]:
+            del self._live[session_id]
+
+    async def load(self, session: LiveSession) -> Posed:
+        """Bring the asset and the pose into memory.
+
+        Raises:
+            ProblemError: the asset cannot be read, or its edits no longer apply.
+        """
+        async with session.lock:
+            return await self._load(session)
+
+    async def _load(self, session: LiveSession) -> Posed:
+        if session.posed is not None:
+            return session.posed
+        async with self._loading:
+            loaded = self._loaded.get(session.asset_id)
+            if loaded is None:
+                folder, environments = self._directory.asset(session.asset_id), self._directory.environments
+                loaded = await self._call(lambda: self._renderer.load(folder, environments))
+                self._loaded[session.asset_id] = loaded
+            self._loaded.move_to_end(session.asset_id)
+            self._unload_some()
+        edits = session.log.done
+        pose = await self._call(lambda: loaded.pose(edits, None))
+        session.loaded, session.posed = loaded, Posed(session.log.revision, pose)
+        return session.posed
+
+    def _unload_some(self) -> None:
+        for asset_id in list(self._loaded)[: -self._limits.loaded_assets]:
+            if not self.uses(asset_id):
+                del self._loaded[asset_id]
+                for session in self._live.values():
+                    if session.asset_id == asset_id:
+                        session.loaded = session.posed = None
+
+    async def _call(self, function: Callable) -> object:
+        try:
+            return await asyncio.wrap_future(self._thread.call(function))
+        except ValueError as error:
+            raise ProblemError(422, str(error)) from error
+
+    async def apply(self, session: LiveSession, kind: EventKind, edit: Edit | None = None, coalesce: str | None = None) -> messages.EditLog:
+        """One change of the log: posed, then stored, then shown to all viewers.
+
+        Raises:
+            ProblemError: a sentence; the log is as before.
+        """
+        if edit is not None:
+            self._check(edit)
+        async with session.lock:
+            posed = await self._load(session)
+            same_drag = coalesce is not None and coalesce == session.coalesce and time.monotonic() - session.coalesce_at < COALESCE_SECONDS
+            if kind == "edit" and same_drag and session.log.done:
+                kind = "replace"
+            if kind == "edit" and len(session.log.done) >= self._limits.edits:
+                raise ProblemError(422, f"A session has at most {self._limits.edits} edits in force.")
+            try:
+                log = session.log.after(kind, edit)
+            except ValueError as error:
+                raise ProblemError(409, str(error)) from error
+            loaded = session.loaded
+            assert loaded is not None
+            pose = await self._call(lambda: loaded.pose(log.done, posed.pose))
+            await asyncio.to_thread(self._store, session.id, log.revision, kind, edit)
+            session.log, session.posed = log, Posed(log.revision, pose)
+            session.coalesce, session.coalesce_at = coalesce, time.monotonic()
+        for viewer in session.viewers:
+            viewer.scene_changed()
+        self._thread.wake()
+        message = log.message()
+        for listener in list(session.listeners):
+            listener(message)
+        return message
+
+    def _store(self, session_id: str, revision: int, kind: str, edit: Edit | None) -> None:
+        values = edit.model_dump(mode="json", exclude_none=True) if edit is not None else None
+        with DatabaseSession(self._engine) as database, database.begin():
+            database.add(SessionEventRow(session_id=session_id, revision=revision, kind=kind, edit=values))
+
+    def _check(self, edit: Edit) -> None:
+        """Edits from a network name nothing but what the server keeps."""
+        if isinstance(edit, EnvironmentEdit) and edit.file is not None and not self._environments.has(edit.file):
+            raise ProblemError(422, f"No environment is called {edit.file[:100]!r}; GET /api/environments lists them.")
+        if isinstance(edit, DeformEdit) and edit.vertices is not None:
+            raise ProblemError(
+                422, "A deform edit over the network has a `map`; `vertices` names a file and works with `drgs render` only."
+            )

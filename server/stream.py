@@ -1,0 +1,276 @@
+"""WebSocket /api/sessions/{id}/stream: one connection between a client and the viewer made for it (docs/protocol.md)."""
+
+import asyncio
+import logging
+from contextlib import suppress
+
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from pydantic import BaseModel, ValidationError
+from sqlalchemy.exc import SQLAlchemyError
+
+from drgs import __version__
+from server import messages
+from server.context import ServerContext
+from server.messages import (
+    CLOSE_POLICY,
+    CLOSE_VERSION_MISMATCH,
+    PROTOCOL_VERSION,
+    AcceptedMessage,
+    AckMessage,
+    CameraMessage,
+    ClientHello,
+    EditMessage,
+    ErrorMessage,
+    PickedMessage,
+    PickMessage,
+    RedoMessage,
+    RejectedMessage,
+    ServerHello,
+    SettingsMessage,
+    StateMessage,
+    StatusMessage,
+    UndoMessage,
+    VisibilityMessage,
+    client_message,
+)
+from server.problems import ProblemError
+from server.sessions import LiveSession
+from server.viewer import Viewer
+
+HELLO_SECONDS = 20.0
+MAX_WAITING_CHANGES = 256
+"""Edits that a client may have under way; beyond that its messages wait in its own socket."""
+MAX_WAITING_MESSAGES = 2000
+"""Unsent text messages after which a client that does not read is let go."""
+MAX_BAD_MESSAGES = 50
+
+log = logging.getLogger(__name__)
+router = APIRouter()
+
+Change = EditMessage | UndoMessage | RedoMessage
+
+
+@router.websocket("/api/sessions/{session_id}/stream")
+async def stream(socket: WebSocket, session_id: str) -> None:
+    """Frames out, camera and edits in, until one side goes away."""
+    context: ServerContext = socket.app.state.context
+    await socket.accept()
+    try:
+        hello = await _receive_hello(socket)
+        if hello is None:
+            return
+        session = await context.sessions.get(session_id)
+        if context.sessions.viewer_count() >= context.settings.limits.viewers:
+            raise ProblemError(429, "As many viewers as this server takes are connected; close one.")
+        await socket.send_text(_loading().model_dump_json())
+        await context.sessions.load(session)
+    except ProblemError as problem:
+        await _refuse(socket, problem.detail, CLOSE_POLICY)
+        return
+    except (WebSocketDisconnect, RuntimeError):
+        return
+    await Connection(context, socket, session, hello).run()
+
+
+async def _receive_hello(socket: WebSocket) -> ClientHello | None:
+    try:
+        text = await asyncio.wait_for(socket.receive_text(), HELLO_SECONDS)
+        message = client_message.validate_json(text)
+    except (ValidationError, TimeoutError, KeyError):
+        await _refuse(socket, 'The first message must be {"type": "hello", "v": ' + str(PROTOCOL_VERSION) + "}.", CLOSE_POLICY)
+        return None
+    if not isinstance(message, ClientHello):
+        await _refuse(socket, f"The first message must be `hello`; found `{message.type}`.", CLOSE_POLICY)
+        return None
+    if message.v != PROTOCOL_VERSION:
+        sentence = f"The page speaks protocol {message.v}, the server {PROTOCOL_VERSION}; reload the page."
+        await _refuse(socket, sentence, CLOSE_VERSION_MISMATCH)
+        return None
+    return message
+
+
+async def _refuse(socket: WebSocket, sentence: str, code: int) -> None:
+    with suppress(WebSocketDisconnect, RuntimeError):
+        await socket.send_text(ErrorMessage(message=sentence, fatal=True).model_dump_json())
+        # A close frame carries at most 123 bytes of reason.
+        await socket.close(code, sentence.encode()[:120].decode(errors="ignore"))
+
+
+def _loading() -> StatusMessage:
+    return StatusMessage(phase="loading", width=0, height=0, scale=1, spp=0, spp_target=0, frames_per_second=0, render_ms=0)
+
+
+class Connection:
+    """Final. Four tasks: read messages, apply changes in order, write what waits, and keep an eye on the client's pace."""
+
+    def __init__(self, context: ServerContext, socket: WebSocket, session: LiveSession, hello: ClientHello) -> None:
+        self._context = context
+        self._socket = socket
+        self._session = session
+        self._loop = asyncio.get_running_loop()
+        self._outgoing: asyncio.Queue[str | bytes] = asyncio.Queue()
+        self._changes: asyncio.Queue[Change] = asyncio.Queue(MAX_WAITING_CHANGES)
+        self._overrun = asyncio.Event()
+        self._bad_messages = 0
+        self.viewer = Viewer(self._deliver, lambda: session.posed, decodes_png="png" in hello.codecs)
+
+    async def run(self) -> None:
+        """Until one side goes away."""
+        session, thread = self._session, self._context.render_thread
+        loaded = session.loaded
+        if loaded is None:
+            return
+        self._say(
+            ServerHello(
+                server=__version__,
+                session=session.id,
+                asset=session.asset_id,
+                minimum=loaded.bounds.minimum,
+                maximum=loaded.bounds.maximum,
+                start_view=loaded.start_view,
+                log=session.log.message(),
+                settings=self.viewer.settings,
+            )
+        )
+        session.viewers.add(self.viewer)
+        session.listeners.add(self._log_changed)
+        self._context.connections[self.viewer] = self
+        thread.add(self.viewer)
+        tasks = [asyncio.create_task(work) for work in (self._read(), self._apply_changes(), self._write(), self._overrun.wait())]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            thread.remove(self.viewer)
+            session.viewers.discard(self.viewer)
+            session.listeners.discard(self._log_changed)
+            self._context.connections.pop(self.viewer, None)
+            # Changes that the client has sent are applied even though it will not hear of them: an edit is never dropped.
+            if not self._changes.empty() and not tasks[1].done():
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._changes.join(), 10)
+            for task in tasks:
+                task.cancel()
+            for outcome in await asyncio.gather(*tasks, return_exceptions=True):
+                if isinstance(outcome, Exception):
+                    log.error("a stream ended with an error", exc_info=outcome)
+            with suppress(WebSocketDisconnect, RuntimeError):
+                await self._socket.close(CLOSE_POLICY if self._overrun.is_set() else 1000)
+
+    def tell_error(self, sentence: str) -> None:
+        """From any thread."""
+        self._loop.call_soon_threadsafe(self._say, ErrorMessage(message=sentence))
+
+    def _deliver(self, out: bytes | StatusMessage) -> None:
+        """From the render thread."""
+        self._loop.call_soon_threadsafe(self._enqueue, out if isinstance(out, bytes) else out.model_dump_json())
+
+    def _say(self, message: BaseModel) -> None:
+        self._enqueue(message.model_dump_json())
+
+    def _enqueue(self, out: str | bytes) -> None:
+        self._outgoing.put_nowait(out)
+        if self._outgoing.qsize() > MAX_WAITING_MESSAGES:
+            self._overrun.set()
+
+    def _log_changed(self, log: messages.EditLog) -> None:
+        self._say(StateMessage(log=log))
+
+    async def _write(self) -> None:
+        with suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                out = await self._outgoing.get()
+                await (self._socket.send_bytes(out) if isinstance(out, bytes) else self._socket.send_text(out))
+
+    async def _read(self) -> None:
+        with suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                received = await self._socket.receive()
+                if received["type"] == "websocket.disconnect":
+                    return
+                try:
+                    message = client_message.validate_json(received.get("text") or "")
+                except ValidationError as error:
+                    if not self._complain(error):
+                        return
+                    continue
+                await self._take(message)
+
+    def _complain(self, error: ValidationError) -> bool:
+        """Say what is wrong with a message; False once there were too many of them."""
+        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "message"
+        self._bad_messages += 1
+        self._say(ErrorMessage(message=f"{place}: {first['msg']}.", fatal=self._bad_messages >= MAX_BAD_MESSAGES))
+        return self._bad_messages < MAX_BAD_MESSAGES
+
+    async def _take(self, message: messages.ClientMessage) -> None:
+        viewer = self.viewer
+        match message:
+            case CameraMessage():
+                viewer.set_camera(message)
+            case SettingsMessage():
+                viewer.set_settings(message.settings)
+            case AckMessage():
+                viewer.acknowledge(message.frame_id)
+            case VisibilityMessage():
+                viewer.set_visible(message.visible)
+                if not message.visible:
+                    self._say(_loading().model_copy(update={"phase": "paused"}))
+            case EditMessage() | UndoMessage() | RedoMessage():
+                await self._changes.put(message)
+            case PickMessage():
+                await self._pick(message)
+            case ClientHello():
+                self._say(ErrorMessage(message="`hello` was said already."))
+        self._context.render_thread.wake()
+
+    async def _apply_changes(self) -> None:
+        following: Change | None = None
+        while True:
+            change, following = following or await self._changes.get(), None
+            answered = [change.id]
+            # A drag sends edits faster than they can be posed: those that the next one replaces anyway are answered with it.
+            while isinstance(change, EditMessage) and change.coalesce is not None and not self._changes.empty():
+                following = self._changes.get_nowait()
+                if not isinstance(following, EditMessage) or following.coalesce != change.coalesce:
+                    break
+                change, following = following, None
+                answered.append(change.id)
+            try:
+                if isinstance(change, EditMessage):
+                    state = await self._context.sessions.apply(self._session, "edit", change.edit, change.coalesce)
+                else:
+                    state = await self._context.sessions.apply(self._session, change.type)
+            except ProblemError as problem:
+                for number in answered:
+                    self._say(RejectedMessage(id=number, reason=problem.detail))
+            except SQLAlchemyError as error:
+                log.error("an edit could not be stored", exc_info=error)
+                for number in answered:
+                    self._say(RejectedMessage(id=number, reason="The edit could not be stored; is the disk full?"))
+            else:
+                for number in answered:
+                    self._say(AcceptedMessage(id=number, revision=state.revision))
+            finally:
+                for _ in answered:
+                    self._changes.task_done()
+
+    async def _pick(self, message: PickMessage) -> None:
+        picture = self.viewer.picture
+        picked = None
+        if picture is not None:
+            picked = await asyncio.wrap_future(self._context.render_thread.call(lambda: picture.pick(message.x, message.y)))
+        if picked is None:
+            self._say(PickedMessage(id=message.id, hit=False))
+        else:
+            self._say(
+                PickedMessage(
+                    id=message.id,
+                    hit=True,
+                    position=picked.position,
+                    normal=picked.normal,
+                    albedo=picked.albedo,
+                    roughness=picked.roughness,
+                    metallic=picked.metallic,
+                )
+            )

@@ -1,0 +1,52 @@
+"""A server in this process, with a painter instead of a renderer and no worker."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from painter import Painter
+from sqlalchemy.orm import Session
+from starlette.testclient import TestClient
+
+from server.app import create_app
+from server.context import ServerContext
+from server.settings import ServerSettings
+from worker.data_directory import read_token
+from worker.database import AssetRow, now
+
+
+class Service:
+    """A running app and what tests need to talk to it."""
+
+    def __init__(self, root: Path, painter: Painter | None = None, **settings: object) -> None:
+        self.painter = painter or Painter()
+        self.settings = ServerSettings(data=root / "data", bundled_environments=root / "none", static_folder=root / "none", **settings)
+        self.app = create_app(self.settings, self.painter)
+        self.context: ServerContext = self.app.state.context
+        self.token = read_token(self.context.directory)
+        self.anonymous = TestClient(self.app, base_url="http://127.0.0.1:8000")
+        self.client = TestClient(self.app, base_url="http://127.0.0.1:8000", headers={"Authorization": f"Bearer {self.token}"})
+
+    def add_asset(self, asset_id: str = "a" * 32, name: str = "ball") -> str:
+        folder = self.context.directory.asset(asset_id)
+        folder.mkdir()
+        (folder / "asset.json").write_text(json.dumps({"counts": {"surfels": 0, "vertices": 8, "faces": 12}}))
+        (folder / "mesh.glb").write_bytes(b"glTF")
+        with Session(self.context.engine) as session, session.begin():
+            session.add(
+                AssetRow(id=asset_id, name=name, created_at=now(), source="upload", bytes=10, surfel_count=0, vertex_count=8, face_count=12)
+            )
+        return asset_id
+
+    def open_session(self) -> str:
+        response = self.client.post("/api/sessions", json={"asset": self.add_asset()})
+        assert response.status_code == 201, response.text
+        return response.json()["id"]
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    service = Service(tmp_path)
+    with service.client:
+        yield service

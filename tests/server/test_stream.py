@@ -1,0 +1,275 @@
+"""The stream protocol, spoken by a test client to a server that paints."""
+
+import io
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from conftest import Service
+from painter import Painter
+from PIL import Image
+from starlette.websockets import WebSocketDisconnect
+
+from server import messages
+from server.messages import FLAG_ALPHA, FLAG_CONVERGED, FLAG_MOVING, FrameHeader, unpack_frame
+
+IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
+PATIENCE_SECONDS = 10.0
+
+
+def camera(number: int = 0, x: float = 0.0, width: int = 64, height: int = 48) -> dict:
+    matrix = [row[:] for row in IDENTITY]
+    matrix[0][3] = x
+    return {"type": "camera", "number": number, "world_from_camera": matrix, "fov_y_degrees": 40, "width": width, "height": height}
+
+
+def material(roughness: float) -> dict:
+    return {"op": "material", "select": {"all": True}, "set": {"roughness": roughness}}
+
+
+class Talk:
+    """One connection; frames are acknowledged as they come unless told otherwise."""
+
+    def __init__(self, socket, acknowledge: bool = True) -> None:
+        self.socket = socket
+        self.acknowledge = acknowledge
+        self.frames: list[tuple[FrameHeader, bytes]] = []
+        self.texts: list[dict] = []
+
+    def send(self, **message: object) -> None:
+        self.socket.send_json(message)
+
+    def next(self) -> FrameHeader | dict:
+        raw = self.socket.receive()
+        if raw["type"] == "websocket.close":
+            raise WebSocketDisconnect(raw["code"], raw.get("reason"))
+        if raw.get("bytes") is not None:
+            header, picture = unpack_frame(raw["bytes"])
+            self.frames.append((header, picture))
+            if self.acknowledge:
+                self.send(type="ack", frame_id=header.frame_id)
+            return header
+        import json
+
+        self.texts.append(json.loads(raw["text"]))
+        return self.texts[-1]
+
+    def until(self, wanted: Callable[[FrameHeader | dict], bool]) -> FrameHeader | dict:
+        start = time.monotonic()
+        while time.monotonic() - start < PATIENCE_SECONDS:
+            found = self.next()
+            if wanted(found):
+                return found
+        raise AssertionError("waited too long")
+
+    def text(self, kind: str) -> dict:
+        return self.until(lambda found: isinstance(found, dict) and found["type"] == kind)  # type: ignore[return-value]
+
+    def frame(self, flag: int = 0) -> FrameHeader:
+        return self.until(lambda found: isinstance(found, FrameHeader) and (found.flags & flag or not flag))  # type: ignore[return-value]
+
+    def pixels(self) -> np.ndarray:
+        return np.asarray(Image.open(io.BytesIO(self.frames[-1][1])))
+
+
+@contextmanager
+def talk(service: Service, session: str, hello: dict | None = None, **options: bool) -> Iterator[Talk]:
+    with service.client.websocket_connect(f"/api/sessions/{session}/stream", headers={"Host": "127.0.0.1:8000"}) as socket:
+        conversation = Talk(socket, **options)
+        conversation.send(type="hello", **{"v": 1, **(hello or {})})
+        yield conversation
+
+
+def test_hello_is_answered_with_all_that_a_client_needs(service: Service) -> None:
+    session = service.open_session()
+    with talk(service, session) as client:
+        assert client.next()["phase"] == "loading"
+        hello = messages.ServerHello.model_validate(client.text("hello"))
+    assert (hello.session, hello.minimum, hello.maximum, hello.log.revision) == (session, (-1, -1, -1), (1, 1, 1), 0)
+    assert hello.max_in_flight == 2
+
+
+def test_another_version_is_told_so_and_let_go(service: Service) -> None:
+    with talk(service, service.open_session(), {"v": 99}) as client:
+        error = client.text("error")
+        assert error["fatal"] and "99" in error["message"]
+        with pytest.raises(WebSocketDisconnect) as closed:
+            client.next()
+    assert closed.value.code == 1002
+
+
+def test_an_unknown_session_is_refused_with_a_sentence(service: Service) -> None:
+    with talk(service, "0" * 32) as client:
+        assert "No session" in client.text("error")["message"]
+
+
+def test_the_picture_moves_then_refines_then_converges_and_then_nothing_is_sent(service: Service) -> None:
+    with talk(service, service.open_session()) as client:
+        client.send(type="settings", settings={"spp_target": 40})
+        client.socket.send_json(camera(number=0x1FE))
+        last = client.frame(FLAG_CONVERGED)
+        first = client.frames[0][0]
+        assert first.flags & FLAG_MOVING and first.spp == 4
+        assert (last.spp, last.spp_target, last.width, last.height) == (40, 40, 64, 48)
+        assert last.codec == 1 and last.flags >> 8 == 0xFE and last.render_us > 0
+        assert [header.frame_id for header, _ in client.frames] == list(range(1, len(client.frames) + 1))
+        samples = [header.spp for header, _ in client.frames]
+        assert samples == sorted(samples)
+        assert client.text("status")["phase"] in ("moving", "still", "converged")
+        # The same camera again changes nothing, so the next thing that comes is the answer to the pick.
+        client.socket.send_json(camera(number=0x1FF))
+        time.sleep(0.5)
+        count = len(client.frames)
+        client.send(type="pick", id=5, x=0.25, y=0.5)
+        picked = client.text("picked")
+        assert picked["id"] == 5 and picked["hit"] and picked["position"][0] == 0.25
+        assert len(client.frames) == count
+        client.send(type="pick", id=6, x=0.75, y=0.5)
+        assert not client.text("picked")["hit"]
+
+
+def test_rendering_runs_on_the_render_thread_only(service: Service) -> None:
+    with talk(service, service.open_session()) as client:
+        client.socket.send_json(camera())
+        client.frame()
+    assert service.painter.threads == {"render"}
+
+
+def test_edits_are_answered_in_order_and_shown_with_their_revision(service: Service) -> None:
+    with talk(service, service.open_session(), {"codecs": ["jpeg", "png"]}) as client:
+        client.socket.send_json(camera())
+        client.frame()
+        for k in range(1, 21):
+            client.send(type="edit", id=100 + k, edit=material(k / 20))
+        client.send(type="undo", id=200)
+        client.until(lambda found: isinstance(found, dict) and found.get("id") == 200)
+        answers = [text for text in client.texts if text["type"] == "accepted"]
+        assert [(text["id"], text["revision"]) for text in answers] == [*((100 + k, k) for k in range(1, 21)), (200, 21)]
+        client.until(lambda found: isinstance(found, FrameHeader) and found.state_rev == 21 and bool(found.flags & FLAG_CONVERGED))
+        assert client.pixels()[0, 0, 0] == 19  # the painter's red is the number of edits in force
+        revisions = [header.state_rev for header, _ in client.frames]
+        assert revisions == sorted(revisions)
+        assert client.texts[-1]["type"] == "status" or client.texts
+
+
+def test_a_wrong_edit_is_rejected_with_a_reason_and_the_rest_goes_on(service: Service) -> None:
+    with talk(service, service.open_session()) as client:
+        client.send(type="edit", id=1, edit={"op": "deform", "map": {"type": "stretch", "factor": 2}})
+        assert client.text("rejected") == {"type": "rejected", "id": 1, "reason": "This asset is made of stone."}
+        client.send(type="edit", id=2, edit={"op": "environment", "file": "../token"})
+        assert "No environment" in client.text("rejected")["reason"]
+        client.send(type="edit", id=3, edit=material(0.5))
+        assert client.text("accepted")["revision"] == 1
+        client.send(type="redo", id=4)
+        assert client.text("rejected")["reason"] == "There is nothing to redo."
+
+
+def test_nonsense_is_complained_about_and_finally_ends_the_connection(service: Service) -> None:
+    with talk(service, service.open_session()) as client:
+        client.text("hello")
+        for nonsense in ("{", "[]", '{"type": "camera"}', '{"type": "launch"}', '{"type":"ack","frame_id":-1}', "null", "\x00"):
+            client.socket.send_text(nonsense)
+            assert client.text("error")["message"]
+        broken = camera()
+        broken["world_from_camera"][0][0] = 7
+        client.socket.send_json(broken)
+        assert "orthonormal" in client.text("error")["message"]
+        client.socket.send_text('{"type":"settings","settings":{"exposure_stops":NaN}}')
+        assert not client.text("error")["fatal"]
+        for _ in range(60):
+            client.socket.send_text("?")
+        client.until(lambda found: isinstance(found, dict) and found.get("fatal", False))
+
+
+def test_a_client_that_never_acknowledges_gets_two_frames(service: Service) -> None:
+    session = service.open_session()
+    with talk(service, session, acknowledge=False) as silent, talk(service, session) as quick:
+        silent.socket.send_json(camera())
+        for k in range(10):
+            quick.socket.send_json(camera(k, x=k))
+            quick.frame()
+        quick.frame(FLAG_CONVERGED)
+        silent.send(type="pick", id=1, x=0, y=0)
+        silent.text("picked")
+        assert [header.frame_id for header, _ in silent.frames] == [1, 2]
+        silent.send(type="ack", frame_id=2)
+        silent.acknowledge = True
+        silent.frame(FLAG_CONVERGED)
+
+
+def test_viewers_share_edits_but_not_cameras_or_settings(service: Service) -> None:
+    session = service.open_session()
+    with talk(service, session) as one, talk(service, session) as two:
+        one.socket.send_json(camera(width=64, height=64))
+        two.socket.send_json(camera(width=32, height=96))
+        two.send(type="settings", settings={"exposure_stops": 2, "spp_target": 8})
+        assert (one.frame(FLAG_CONVERGED).width, two.frame(FLAG_CONVERGED).width) == (64, 32)
+        one.send(type="edit", id=1, edit=material(0.1))
+        assert two.text("state")["log"]["revision"] == 1
+        two.until(lambda found: isinstance(found, FrameHeader) and found.state_rev == 1 and bool(found.flags & FLAG_CONVERGED))
+        assert two.pixels()[0, 0].tolist() == [1, 148, 8]
+        one.until(lambda found: isinstance(found, FrameHeader) and found.state_rev == 1 and bool(found.flags & FLAG_CONVERGED))
+        assert one.pixels()[0, 0].tolist() == [1, 128, 255]
+        assert service.painter.loads == 1
+
+
+def test_a_hidden_page_gets_no_frames(service: Service) -> None:
+    with talk(service, service.open_session()) as client:
+        client.socket.send_json(camera())
+        client.frame(FLAG_CONVERGED)
+        client.send(type="visibility", visible=False)
+        client.until(lambda found: isinstance(found, dict) and found.get("phase") == "paused")
+        count = len(client.frames)
+        client.socket.send_json(camera(1, x=1))
+        time.sleep(0.3)
+        client.send(type="pick", id=1, x=0, y=0)
+        client.text("picked")
+        assert len(client.frames) == count
+        client.send(type="visibility", visible=True)
+        client.frame(FLAG_CONVERGED)
+
+
+def test_transparency_arrives_as_png_with_alpha(service: Service) -> None:
+    with talk(service, service.open_session()) as client:
+        client.send(type="settings", settings={"background": "transparent", "spp_target": 8})
+        client.socket.send_json(camera())
+        header = client.frame(FLAG_CONVERGED)
+        assert header.flags & FLAG_ALPHA and client.pixels().shape == (48, 64, 4)
+
+
+def test_a_client_without_png_gets_jpeg_only(service: Service) -> None:
+    with talk(service, service.open_session(), {"codecs": ["jpeg"]}) as client:
+        client.socket.send_json(camera())
+        client.frame(FLAG_CONVERGED)
+        assert {header.codec for header, _ in client.frames} == {0}
+
+
+def test_a_slow_machine_sends_smaller_pictures_while_moving_and_full_ones_when_still(tmp_path) -> None:
+    service = Service(tmp_path, Painter(pass_seconds=0.15))
+    with service.client, talk(service, service.open_session()) as client:
+        client.send(type="settings", settings={"spp_target": 4})
+        client.socket.send_json(camera(width=640, height=512))
+        client.frame(FLAG_CONVERGED)
+        for k in range(1, 4):
+            client.socket.send_json(camera(k, x=k, width=640, height=512))
+            assert client.frame(FLAG_MOVING).width == 320
+        last = client.frame(FLAG_CONVERGED)
+        assert (last.width, last.height) == (640, 512)
+        reduced = [text for text in client.texts if text["type"] == "status" and text["scale"] < 1]
+        assert reduced and "50%" in reduced[-1]["notes"][-1]
+
+
+def test_one_picture_over_rest(service: Service) -> None:
+    url = f"/api/sessions/{service.open_session()}"
+    service.client.post(f"{url}/edits", json={"edit": material(0.3)})
+    response = service.client.get(f"{url}/frame.png?width=40&height=30&spp=16&exposure_stops=1")
+    assert response.headers["content-type"] == "image/png" and response.headers["x-drgs-revision"] == "1"
+    picture = np.asarray(Image.open(io.BytesIO(response.content)))
+    assert picture.shape == (30, 40, 3) and picture[0, 0].tolist() == [1, 138, 16]
+    assert service.client.get(f"{url}/frame.jpg").headers["content-type"] == "image/jpeg"
+    bad = service.client.get(f"{url}/frame.png?world_from_camera=1,2")
+    assert bad.status_code == 422 and "16 numbers" in bad.json()["detail"]
+    assert service.client.get(f"{url}/frame.png?width=100000").status_code == 422
+    assert service.client.get(f"{url}/frame.png?width=4096&height=4096&spp=60000").status_code == 422

@@ -1,0 +1,125 @@
+"""`python -m worker.file_tool`: read or write one untrusted file in a process of its own, with bounded memory.
+
+The server calls it (`run_file_tool`), so that a decoder that crashes or swallows memory takes no server down.
+Exit code 2 and one sentence on stderr for wrong input. Commands:
+    asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
+    environment SOURCE OUT      EXR or Radiance HDR -> EXR
+    export ASSET OUT FORMAT     asset folder -> ply, ply3, glb, env (file formats) or zip (the asset itself)
+"""
+
+import asyncio
+import resource
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worker.start_view import FOV_Y_DEGREES, start_view
+
+if TYPE_CHECKING:
+    from drgs.scene.asset import Asset
+
+THUMBNAIL_SIDE = 256
+"""Pixels."""
+MEMORY_BYTES = 16 << 30
+"""Of address space; torch alone reserves a few GiB."""
+TIMEOUT_SECONDS = 300
+
+
+class FileToolError(ValueError):
+    """The input is wrong; the text is a sentence."""
+
+
+async def run_file_tool(*arguments: str) -> None:
+    """Run the tool and wait.
+
+    Raises:
+        FileToolError: with the tool's own sentence, or one that says that it crashed or took too long.
+    """
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "worker.file_tool", *arguments, stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE
+    )
+    try:
+        _, errors = await asyncio.wait_for(process.communicate(), TIMEOUT_SECONDS)
+    except TimeoutError as error:
+        raise FileToolError(f"The file took more than {TIMEOUT_SECONDS} s to read; it is too large or damaged.") from error
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    if process.returncode == 2:
+        raise FileToolError(errors.decode(errors="replace").strip().splitlines()[-1][:1000])
+    if process.returncode != 0:
+        raise FileToolError("The file could not be read; it is damaged, or too large for this machine's memory.")
+
+
+def make_asset(source: Path, out: Path) -> None:
+    """A zipped asset is read and written anew, so that nothing else of the archive arrives."""
+    from drgs.build.import_mesh import import_mesh
+    from drgs.scene.asset import load_asset, save_asset
+
+    asset = load_asset(source) if source.suffix == ".zip" else import_mesh(source)
+    save_asset(asset, out, thumbnail_jpeg=thumbnail(asset))
+
+
+def thumbnail(asset: "Asset") -> bytes:
+    """A small picture of an asset under its own light, over grey."""
+    import numpy as np
+    import simplejpeg
+    import torch
+
+    from drgs.deform.pose_scene import pose_scene
+    from drgs.render.accumulate import RenderSettings
+    from drgs.render.render_frame import render_frame
+    from drgs.scene.camera import camera_from_opengl
+
+    low, high = asset.mesh.vertices.amin(0).tolist(), asset.mesh.vertices.amax(0).tolist()
+    focal = THUMBNAIL_SIDE / 2 / np.tan(np.radians(FOV_Y_DEGREES) / 2)
+    intrinsics = torch.tensor([[focal, 0, THUMBNAIL_SIDE / 2], [0, focal, THUMBNAIL_SIDE / 2], [0, 0, 1]])
+    camera = camera_from_opengl(torch.from_numpy(start_view(low, high)), intrinsics, THUMBNAIL_SIDE, THUMBNAIL_SIDE)
+    settings = RenderSettings(samples_per_pixel=64, background=(0.18, 0.18, 0.18))
+    rgba = render_frame(pose_scene(asset, []), camera, settings).rgba_srgb
+    pixels = (rgba[..., :3].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    return simplejpeg.encode_jpeg(np.ascontiguousarray(pixels), quality=85, colorspace="RGB")
+
+
+def make_environment(source: Path, out: Path) -> None:
+    from drgs.exchange.exr import decode_environment, encode_environment
+
+    out.write_bytes(encode_environment(decode_environment(source.read_bytes(), source.name)))
+
+
+def export(asset_folder: Path, out: Path, format: str) -> None:
+    from drgs.scene.asset import load_asset
+
+    asset = load_asset(asset_folder)
+    if format == "zip":
+        from drgs.scene.asset import save_asset
+
+        picture = asset_folder / "thumb.jpg"
+        save_asset(asset, out, thumbnail_jpeg=picture.read_bytes() if picture.exists() else None)
+    else:
+        from drgs.build.export_asset import export_asset
+
+        export_asset(asset, out, format)
+
+
+def main(arguments: list[str]) -> int:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    try:
+        match arguments:
+            case ["asset", source, out]:
+                make_asset(Path(source), Path(out))
+            case ["environment", source, out]:
+                make_environment(Path(source), Path(out))
+            case ["export", asset, out, format]:
+                export(Path(asset), Path(out), format)
+            case _:
+                raise ValueError(f"expected asset, environment or export with their arguments; found {arguments}")
+    except ValueError as error:
+        print(str(error).replace("\n", " "), file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,21 @@
+"""Where to look from at first: the camera of thumbnails and of new viewers."""
+
+import numpy as np
+
+FOV_Y_DEGREES = 40.0
+FILL = 0.92
+"""Distance as a share of that at which the bounding box's sphere fits the picture; objects rarely fill their box."""
+
+
+def start_view(minimum: tuple[float, float, float], maximum: tuple[float, float, float]) -> np.ndarray:
+    """(4, 4) OpenGL camera-to-world, from the front right (+x -y) and a little above, with the whole box in sight [world units]."""
+    center = np.add(minimum, maximum) / 2
+    radius = max(float(np.linalg.norm(np.subtract(maximum, minimum))) / 2, 1e-6)
+    backward = np.array([0.55, -0.75, 0.45])
+    backward /= np.linalg.norm(backward)
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    right /= np.linalg.norm(right)
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3] = np.stack([right, np.cross(backward, right), backward], -1)
+    world_from_camera[:3, 3] = center + backward * radius / np.sin(np.radians(FOV_Y_DEGREES / 2)) * FILL
+    return world_from_camera
