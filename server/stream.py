@@ -4,6 +4,7 @@ import asyncio
 import logging
 from contextlib import suppress
 
+import anyio
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import BaseModel, ValidationError
 from sqlalchemy.exc import SQLAlchemyError
@@ -101,7 +102,7 @@ def _loading() -> StatusMessage:
 
 
 class Connection:
-    """Final. Four tasks: read messages, apply changes in order, write what waits, and keep an eye on the client's pace."""
+    """Final. Its tasks: read messages, apply changes in order, write what waits, and let go of a client that does not read."""
 
     def __init__(self, context: ServerContext, socket: WebSocket, session: LiveSession, hello: ClientHello) -> None:
         self._context = context
@@ -109,7 +110,8 @@ class Connection:
         self._session = session
         self._loop = asyncio.get_running_loop()
         self._outgoing: asyncio.Queue[str | bytes] = asyncio.Queue()
-        self._changes: asyncio.Queue[Change] = asyncio.Queue(MAX_WAITING_CHANGES)
+        self._changes: asyncio.Queue[Change | None] = asyncio.Queue(MAX_WAITING_CHANGES)
+        """None: no more will come."""
         self._overrun = asyncio.Event()
         self._bad_messages = 0
         self.viewer = Viewer(self._deliver, lambda: session.posed, decodes_png="png" in hello.codecs)
@@ -136,25 +138,22 @@ class Connection:
         session.listeners.add(self._log_changed)
         self._context.connections[self.viewer] = self
         thread.add(self.viewer)
-        tasks = [asyncio.create_task(work) for work in (self._read(), self._apply_changes(), self._write(), self._overrun.wait())]
         try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            async with anyio.create_task_group() as group:
+                group.start_soon(self._write)
+                group.start_soon(self._apply_changes, group.cancel_scope)
+                async with anyio.create_task_group() as readers:
+                    readers.start_soon(self._read, readers.cancel_scope)
+                    readers.start_soon(self._watch_overrun, readers.cancel_scope)
+                # Changes that the client has sent are applied even though it will not hear of them: an edit is never dropped.
+                await self._changes.put(None)
         finally:
             thread.remove(self.viewer)
             session.viewers.discard(self.viewer)
             session.listeners.discard(self._log_changed)
             self._context.connections.pop(self.viewer, None)
-            # Changes that the client has sent are applied even though it will not hear of them: an edit is never dropped.
-            if not self._changes.empty() and not tasks[1].done():
-                with suppress(TimeoutError):
-                    await asyncio.wait_for(self._changes.join(), 10)
-            for task in tasks:
-                task.cancel()
-            for outcome in await asyncio.gather(*tasks, return_exceptions=True):
-                if isinstance(outcome, Exception):
-                    log.error("a stream ended with an error", exc_info=outcome)
-            with suppress(WebSocketDisconnect, RuntimeError):
-                await self._socket.close(CLOSE_POLICY if self._overrun.is_set() else 1000)
+        with suppress(WebSocketDisconnect, RuntimeError):
+            await self._socket.close(CLOSE_POLICY if self._overrun.is_set() or self._bad_messages >= MAX_BAD_MESSAGES else 1000)
 
     def tell_error(self, sentence: str) -> None:
         """From any thread."""
@@ -181,8 +180,12 @@ class Connection:
                 out = await self._outgoing.get()
                 await (self._socket.send_bytes(out) if isinstance(out, bytes) else self._socket.send_text(out))
 
-    async def _read(self) -> None:
-        with suppress(WebSocketDisconnect, RuntimeError):
+    async def _watch_overrun(self, readers: anyio.CancelScope) -> None:
+        await self._overrun.wait()
+        readers.cancel()
+
+    async def _read(self, readers: anyio.CancelScope) -> None:
+        try:
             while True:
                 received = await self._socket.receive()
                 if received["type"] == "websocket.disconnect":
@@ -194,6 +197,10 @@ class Connection:
                         return
                     continue
                 await self._take(message)
+        except (WebSocketDisconnect, RuntimeError):
+            return
+        finally:
+            readers.cancel()
 
     def _complain(self, error: ValidationError) -> bool:
         """Say what is wrong with a message; False once there were too many of them."""
@@ -224,14 +231,18 @@ class Connection:
                 self._say(ErrorMessage(message="`hello` was said already."))
         self._context.render_thread.wake()
 
-    async def _apply_changes(self) -> None:
+    async def _apply_changes(self, connection: anyio.CancelScope) -> None:
         following: Change | None = None
-        while True:
+        last = False
+        while not last or following is not None:
             change, following = following or await self._changes.get(), None
+            if change is None:
+                break
             answered = [change.id]
             # A drag sends edits faster than they can be posed: those that the next one replaces anyway are answered with it.
             while isinstance(change, EditMessage) and change.coalesce is not None and not self._changes.empty():
                 following = self._changes.get_nowait()
+                last = following is None
                 if not isinstance(following, EditMessage) or following.coalesce != change.coalesce:
                     break
                 change, following = following, None
@@ -251,9 +262,7 @@ class Connection:
             else:
                 for number in answered:
                     self._say(AcceptedMessage(id=number, revision=state.revision))
-            finally:
-                for _ in answered:
-                    self._changes.task_done()
+        connection.cancel()
 
     async def _pick(self, message: PickMessage) -> None:
         picture = self.viewer.picture
