@@ -95,24 +95,25 @@ def sh_basis_at(d: wp.vec3) -> vec16:
     xx = x * x
     yy = y * y
     zz = z * z
-    basis = vec16()
-    basis[0] = K00
-    basis[1] = -K1 * y
-    basis[2] = K1 * z
-    basis[3] = -K1 * x
-    basis[4] = K21 * x * y
-    basis[5] = -K21 * y * z
-    basis[6] = K20 * (2.0 * zz - xx - yy)
-    basis[7] = -K21 * x * z
-    basis[8] = K22 * (xx - yy)
-    basis[9] = -K33 * y * (3.0 * xx - yy)
-    basis[10] = 2.0 * K32 * x * y * z
-    basis[11] = -K31 * y * (4.0 * zz - xx - yy)
-    basis[12] = K30 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
-    basis[13] = -K31 * x * (4.0 * zz - xx - yy)
-    basis[14] = K32 * z * (xx - yy)
-    basis[15] = -K33 * x * (xx - 3.0 * yy)
-    return basis
+    # All at once: assigning entry by entry copies the vector every time.
+    return vec16(
+        K00,
+        -K1 * y,
+        K1 * z,
+        -K1 * x,
+        K21 * x * y,
+        -K21 * y * z,
+        K20 * (2.0 * zz - xx - yy),
+        -K21 * x * z,
+        K22 * (xx - yy),
+        -K33 * y * (3.0 * xx - yy),
+        2.0 * K32 * x * y * z,
+        -K31 * y * (4.0 * zz - xx - yy),
+        K30 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        -K31 * x * (4.0 * zz - xx - yy),
+        K32 * z * (xx - yy),
+        -K33 * x * (xx - 3.0 * yy),
+    )
 
 
 @wp.func
@@ -201,9 +202,7 @@ def walk_rays(
     ray = first + wp.tid()
     origin = origins[ray]
     direction = directions[ray]
-    basis = vec16()
-    if table.degree >= 0:
-        basis = sh_basis_at(direction)
+    basis = vec16()  # filled at the first hit: most rays have none
 
     # With L the loss: dL/dalpha_i = T_i s_i - (sum of w_j s_j behind i) / (1 - alpha_i), where s_i = dL/dw_i.
     total_score = float(0.0)
@@ -256,6 +255,8 @@ def walk_rays(
         while k < size and left >= MIN_TRANSMITTANCE:
             surfel = near_surfel[k]
             hit = meet_surfel(table, surfel, origin, direction)
+            if visited == 0 and table.degree >= 0:
+                basis = sh_basis_at(direction)
             raw = radiance_before_clamp(table, surfel, basis)
             emitted = clamp_radiance(raw)
             weight = left * hit.alpha
