@@ -6,7 +6,7 @@ surface each pass also looks through another place of the pixel. State is a froz
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from drgs.render.environment_table import build_environment_table, environment_light
 from drgs.render.lift_points import lift_points
+from drgs.render.plan import RenderPlan, plan_frame
 from drgs.render.rasterize_gbuffer import rasterize_gbuffer
 from drgs.render.records import Frame, GBuffer, Radiance
 from drgs.render.sample_rays import PointArrays, SampleCounts, point_arrays, sample_counts, shading_points
@@ -47,6 +48,8 @@ class RenderSettings:
     primary: Literal["gaussians", "mesh"] | None = None
     """What the camera sees; None: the Gaussians where the scene has any."""
     denoise: Literal["none", "svgf", "oidn"] = "none"
+    skip: bool = True
+    """Leave out what the scene does not need (drgs/render/plan.py)."""
     seed: int = 0
     exposure: float = 0.0
     """[stops]."""
@@ -64,7 +67,7 @@ class FrameState:
     tracer: AbstractTracer
     light: Any
     """EnvironmentLight struct."""
-    counts: SampleCounts
+    plan: RenderPlan
     fixed: PrimaryPoints | None
     """The points of every pass, when the camera sees Gaussians."""
     box: tuple[int, int, int, int]
@@ -125,12 +128,13 @@ def start_frame(
     else:
         gbuffer = None
         box = screen_box(scene.mesh, camera)
-    counts = settings.counts or sample_counts(settings.samples_per_pass or (32 if primary == "gaussians" else 8))
+    counts = samples_a_pass(settings, primary == "mesh")
+    plan = plan_frame(scene.environment, scene.environment_intensity, counts, settings.bounces, settings.skip)
     pixels = camera.width * camera.height
     vectors = [torch.zeros(pixels, 3, device=device) for _ in range(2)]
     numbers = [torch.zeros(pixels, device=device) for _ in range(5)]
     surface = torch.zeros(pixels, 15, device=device)
-    return FrameState(scene, camera, settings, tracer, light, counts, fixed, box, gbuffer, *vectors, *numbers, surface, 0, seconds)
+    return FrameState(scene, camera, settings, tracer, light, plan, fixed, box, gbuffer, *vectors, *numbers, surface, 0, seconds)
 
 
 @wp.kernel
@@ -198,7 +202,8 @@ def refine_frame(state: FrameState, passes: int = 1) -> FrameState:
             primary = trace_primary_points(state.tracer, state.camera, state.settings.seed, index, box=state.box)
         points = primary.points
         traced = time.perf_counter()
-        light = shade(points, primary.starts, state.light, state.tracer, state.counts, state.settings.bounces, state.settings.seed, index)
+        plan, seed = state.plan, state.settings.seed
+        light = shade(points, primary.starts, state.light, state.tracer, plan.counts, plan.bounces, seed, index, plan.by_material)
         shaded = time.perf_counter()
         vectors = [warp_array(light.diffuse, wp.vec3), warp_array(light.specular, wp.vec3)]
         numbers = [warp_array(light.variance), warp_array(light.visibility)]
@@ -228,7 +233,7 @@ def resolve_frame(state: FrameState) -> Frame:
         (state.specular / weight[:, None]).reshape(*shape, 3),
         variance.reshape(shape),
         (state.visibility / weight).reshape(shape),
-        state.passes * state.counts.total,
+        state.passes * samples_a_pass(state.settings, state.fixed is None).total,
     )
     linear = radiance.diffuse + radiance.specular
     rgba = tonemap(linear, gbuffer.coverage, settings.exposure, _background(state))
@@ -237,16 +242,27 @@ def resolve_frame(state: FrameState) -> Frame:
         "samples": radiance.samples,
         "passes": state.passes,
         "bounces": settings.bounces,
-        "counts": {"cosine": state.counts.cosine, "ggx": state.counts.ggx, "environment": state.counts.environment},
+        "counts": asdict(state.plan.counts),
+        "skipped": [asdict(skip) for skip in state.plan.skips],
         "primary": "mesh" if state.fixed is None else "gaussians",
         "milliseconds": {step: round(1000 * duration, 3) for step, duration in seconds.items()},
     }
     return Frame(rgba, linear, gbuffer, radiance, metadata)
 
 
+def samples_a_pass(settings: RenderSettings, mesh: bool) -> SampleCounts:
+    """Samples of each strategy that a pass is asked for, before the plan moves any.
+
+    Args:
+        mesh: whether the camera sees the mesh.
+    """
+    return settings.counts or sample_counts(settings.samples_per_pass or (8 if mesh else 32))
+
+
 def passes_needed(state: FrameState) -> int:
     """Passes that the settings' samples a pixel ask for, in all."""
-    return max(1, -(-state.settings.samples_per_pixel // state.counts.total))
+    total = samples_a_pass(state.settings, state.fixed is None).total
+    return max(1, -(-state.settings.samples_per_pixel // total))
 
 
 def _mean_gbuffer(state: FrameState) -> GBuffer:

@@ -85,19 +85,46 @@ class SampleSet:
     cosine: int
     ggx: int
     environment: int
+    by_material: int
+    """1: each point shares the same total out by its material (split_at)."""
     round: int
     """Samples already taken: rounds of the same counts."""
     seed: wp.uint32
 
 
 @wp.func
-def strategy_of(samples: SampleSet, slot: int) -> wp.vec2i:
+def split_at(samples: SampleSet, points: PointArrays, point: int) -> wp.vec3i:
+    """Cosine, GGX and environment samples of one point; their sum is the same everywhere.
+
+    Cosine samples in proportion to the diffuse share of the reflected energy: bare metal gets none. Of the others, GGX gets more the
+    more mirror-like a metal is: an environment sample hardly ever falls into a narrow lobe. Any split is unbiased.
+    """
+    if samples.by_material == 0:
+        return wp.vec3i(samples.cosine, samples.ggx, samples.environment)
+    total = samples.cosine + samples.ggx + samples.environment
+    metallic = points.metallic[point]
+    base = wp.max(points.albedo[point])
+    diffuse = (1.0 - metallic) * base
+    specular = 0.04 * (1.0 - metallic) + metallic * base
+    share = diffuse / wp.max(diffuse + specular, 1.0e-6)
+    cosine = wp.min(int(float(samples.cosine) * share + 0.5), total - 1)
+    rest = total - cosine
+    if samples.environment == 0:
+        return wp.vec3i(cosine, rest, 0)
+    even = float(samples.ggx) / float(samples.ggx + samples.environment)
+    mirror = (1.0 - share) * wp.clamp(1.0 - 4.0 * points.roughness[point], 0.0, 1.0)
+    ggx = wp.clamp(int(float(rest) * (even + (1.0 - even) * mirror) + 0.5), 1, rest)
+    return wp.vec3i(cosine, ggx, rest - ggx)
+
+
+@wp.func
+def strategy_of(split: wp.vec3i, samples_round: int, slot: int) -> wp.vec2i:
     """(strategy, index in its sequence) of a point's slot-th sample."""
-    if slot < samples.cosine:
-        return wp.vec2i(0, samples.round * samples.cosine + slot)
-    if slot < samples.cosine + samples.ggx:
-        return wp.vec2i(1, samples.round * samples.ggx + slot - samples.cosine)
-    return wp.vec2i(2, samples.round * samples.environment + slot - samples.cosine - samples.ggx)
+    if slot < split[0]:
+        return wp.vec2i(0, samples_round * split[0] + slot)
+    if slot < split[0] + split[1]:
+        return wp.vec2i(1, samples_round * split[1] + slot - split[0])
+    return wp.vec2i(2, samples_round * split[2] + slot - split[0] - split[1])
 
 
 @wp.func
@@ -106,9 +133,11 @@ def strategy_seed(samples: SampleSet, pixel: int, strategy: int) -> wp.uint32:
 
 
 @wp.func
-def sampled_direction(samples: SampleSet, light: EnvironmentLight, pixel: int, slot: int, wo: wp.vec3, n: wp.vec3, alpha: float) -> wp.vec3:
+def sampled_direction(
+    samples: SampleSet, split: wp.vec3i, light: EnvironmentLight, pixel: int, slot: int, wo: wp.vec3, n: wp.vec3, alpha: float
+) -> wp.vec3:
     """World direction of a point's slot-th sample; possibly below the horizon."""
-    place = strategy_of(samples, slot)
+    place = strategy_of(split, samples.round, slot)
     u = sobol_2d(wp.uint32(place[1]), strategy_seed(samples, pixel, place[0]))
     if place[0] == 0:
         return cosine_direction(u, n)
@@ -119,14 +148,14 @@ def sampled_direction(samples: SampleSet, light: EnvironmentLight, pixel: int, s
 
 @wp.func
 def balance_weight(
-    samples: SampleSet, light: EnvironmentLight, wi: wp.vec3, wo: wp.vec3, n: wp.vec3, alpha: float, table_uv: wp.vec3
+    split: wp.vec3i, light: EnvironmentLight, wi: wp.vec3, wo: wp.vec3, n: wp.vec3, alpha: float, table_uv: wp.vec3
 ) -> float:
     """1 / sum_k n_k p_k of a direction above the horizon."""
-    density = float(samples.cosine) * wp.dot(n, wi) / PI
-    if samples.ggx > 0:
-        density += float(samples.ggx) * ggx_pdf(wi, wo, n, alpha)
-    if samples.environment > 0:
-        density += float(samples.environment) * lookup_pdf(light, table_uv)
+    density = float(split[0]) * wp.dot(n, wi) / PI
+    if split[1] > 0:
+        density += float(split[1]) * ggx_pdf(wi, wo, n, alpha)
+    if split[2] > 0:
+        density += float(split[2]) * lookup_pdf(light, table_uv)
     if density <= 0.0:
         return 0.0
     return 1.0 / density
@@ -151,9 +180,10 @@ def sample_directions(
     wi = n
     w = wp.float32(0.0)
     if wp.dot(n, wo) > 0.0:
-        wi = sampled_direction(samples, light, points.pixel[point], i % count, wo, n, alpha)
+        split = split_at(samples, points, point)
+        wi = sampled_direction(samples, split, light, points.pixel[point], i % count, wo, n, alpha)
         if wp.dot(n, wi) > 0.0:
-            w = balance_weight(samples, light, wi, wo, n, alpha, table_place(light, wi))
+            w = balance_weight(split, light, wi, wo, n, alpha, table_place(light, wi))
     direction[i] = wi
     weight[i] = w
 
@@ -171,9 +201,10 @@ def point_arrays(points: ShadingPoints) -> Any:
     return arrays
 
 
-def sample_set(counts: SampleCounts, seed: int, samples_round: int = 0) -> Any:
+def sample_set(counts: SampleCounts, seed: int, samples_round: int = 0, by_material: bool = False) -> Any:
     """The struct that kernels read."""
     samples = SampleSet()
+    samples.by_material = int(by_material)
     samples.cosine, samples.ggx, samples.environment = counts.cosine, counts.ggx, counts.environment
     samples.round = samples_round
     samples.seed = seed & 0xFFFFFFFF

@@ -19,7 +19,16 @@ from torch import Tensor
 from drgs.render.brdf_warp import PI, alpha_of, specular_brdf
 from drgs.render.environment_table import EnvironmentLight, lookup_radiance, table_place
 from drgs.render.records import ShadingPoints
-from drgs.render.sample_rays import PointArrays, SampleCounts, SampleSet, balance_weight, point_arrays, sample_set, sampled_direction
+from drgs.render.sample_rays import (
+    PointArrays,
+    SampleCounts,
+    SampleSet,
+    balance_weight,
+    point_arrays,
+    sample_set,
+    sampled_direction,
+    split_at,
+)
 from drgs.render.trace_indirect import mesh_arrays, scatter_hits, trace_indirect
 from drgs.render.trace_rays import over_slices
 from drgs.render.tracer import AbstractTracer
@@ -84,14 +93,15 @@ def start_rays(
     f = wp.vec3(0.0, 0.0, 0.0)
     seen = wp.vec3(0.0, 0.0, 0.0)
     if wp.dot(n, wo) > 0.0:
-        candidate = sampled_direction(samples, light, points.pixel[point], (first + i) % count, wo, n, alpha)
+        split = split_at(samples, points, point)
+        candidate = sampled_direction(samples, split, light, points.pixel[point], (first + i) % count, wo, n, alpha)
         if wp.dot(n, candidate) > 0.0 and wp.dot(surface_normals[point], candidate) > 0.0:
             place = table_place(light, candidate)
             seen = lookup_radiance(light, place)
             if keep_dark != 0 or wp.max(seen) > 0.0:
                 start = starts[point]
                 wi = candidate
-                w = balance_weight(samples, light, wi, wo, n, alpha, place) * wp.dot(n, wi)
+                w = balance_weight(split, light, wi, wo, n, alpha, place) * wp.dot(n, wi)
                 f = w * specular_brdf(wi, wo, n, alpha, points.albedo[point], points.metallic[point])
     origin[i] = start
     direction[i] = wi
@@ -131,13 +141,10 @@ def sum_samples(
     open_sum = wp.float32(0.0)
     all_sum = wp.float32(0.0)
     count = samples.cosine + samples.ggx + samples.environment
+    split = split_at(samples, points, point)
     slot = wp.int32(0)
     for strategy in range(3):
-        size = samples.cosine
-        if strategy == 1:
-            size = samples.ggx
-        if strategy == 2:
-            size = samples.environment
+        size = split[strategy]
         total = wp.float32(0.0)
         total_squares = wp.float32(0.0)
         for _ in range(size):
@@ -159,7 +166,7 @@ def sum_samples(
             y = luminance(d + s)
             total += y
             total_squares += y * y
-        if size > 1:
+        if size > 1:  # independent samples would scatter like this; stratified ones do better
             variance += wp.max(total_squares - total * total / float(size), 0.0) * float(size) / float(size - 1)
         else:
             variance += total_squares
@@ -178,12 +185,14 @@ def shade(
     bounces: int,
     seed: int,
     samples_round: int = 0,
+    by_material: bool = False,
 ) -> PointLight:
     """Outgoing light of all points, one estimate of `counts.total` rays each.
 
     Args:
         light: EnvironmentLight struct (environment_table.environment_light).
         bounces: surfaces that light may meet between the environment and the points.
+        by_material: each point shares its samples out by its material (sample_rays.split_at).
         samples_round: how many estimates of the same counts and seed came before; continues their sequences.
     """
     device = points.normal_world.device
@@ -197,7 +206,7 @@ def shade(
     if point_count == 0 or counts.total == 0:
         return result
     warp_dev = warp_device(result.diffuse)
-    arrays, samples = point_arrays(points), sample_set(counts, seed, samples_round)
+    arrays, samples = point_arrays(points), sample_set(counts, seed, samples_round, by_material)
     start_arrays = [warp_array(starts.origin_world, wp.vec3), warp_array(starts.surface_normal_world, wp.vec3)]
     mesh = mesh_arrays(tracer.mesh, tracer.lift)
     sums = [
