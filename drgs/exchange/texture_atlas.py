@@ -11,7 +11,7 @@ import numpy as np
 import xatlas
 from scipy.ndimage import distance_transform_edt
 
-MAX_UNWRAP_FACES = 80_000
+MAX_UNWRAP_FACES = 60_000
 MIN_SIZE, MAX_SIZE = 64, 4096
 TEXELS_PER_FACE = 40
 """What a face gets on average; values are linear within a face, so more would add nothing."""
@@ -38,8 +38,8 @@ class Atlas:
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_face: int = TEXELS_PER_FACE) -> Atlas:
     """Atlas of a mesh with vertices (vertex, 3) and faces (face, 3); the picture's size follows from the number of faces."""
-    # Charts fill about 0.65 of the picture; the size is a power of two.
-    size = int(np.clip(2 ** np.ceil(np.log2(np.sqrt(len(faces) * texels_per_face / 0.65))), MIN_SIZE, MAX_SIZE))
+    # Charts fill about 0.65 of the picture; the size is the nearest power of two.
+    size = int(np.clip(2 ** np.round(np.log2(np.sqrt(len(faces) * texels_per_face / 0.65))), MIN_SIZE, MAX_SIZE))
     if len(faces) > MAX_UNWRAP_FACES:
         return _cells(faces)
     atlas = xatlas.Atlas()
