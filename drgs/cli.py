@@ -227,7 +227,16 @@ def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
     """Check a capture before time is spent on it."""
     from drgs.build.doctor import doctor as examine
 
-    _print_document(examine(dataset), as_json)
+    report = examine(dataset)
+    if as_json:
+        print(json.dumps(report))
+    elif report["ok"]:
+        _print_document({name: value for name, value in report.items() if name not in ("findings", "advice")}, as_json)
+        for line in [f"{finding['level']}: {finding['sentence']}" for finding in report["findings"]] + report["advice"]:
+            print(line)
+    else:
+        raise ValueError(report["findings"][0]["sentence"])
+    raise typer.Exit(0 if report["ok"] else 2)
 
 
 @app.command()
