@@ -110,13 +110,14 @@ def _read_ply(path: Path) -> list[_Part]:
     def constant(key: str, value: float) -> np.ndarray:
         return found[key] if key in found else np.full(vertex.rows, value, np.float32)
 
+    vertices = np.stack([found[key] for key in "xyz"], -1)
     albedo = columns(["albedo_r", "albedo_g", "albedo_b"])
     colors = columns(["red", "green", "blue"])
     if albedo is None and colors is not None:
         albedo = _linear(colors / 255 if colors.dtype == np.uint8 else colors)
     if albedo is None:
         albedo = np.full((vertex.rows, 3), DEFAULT_ALBEDO, np.float32)
-    vertices, normals = columns(["x", "y", "z"]), columns(["nx", "ny", "nz"])
+    normals = columns(["nx", "ny", "nz"])
     faces = triangles_from_faces(ply, vertex.rows, str(path))
     return [_Part(vertices, faces, normals, albedo, constant("roughness", DEFAULT_ROUGHNESS), constant("metallic", DEFAULT_METALLIC))]
 
@@ -167,7 +168,9 @@ def _parts_from_scene(scene: trimesh.Scene, root: np.ndarray, factors: dict[str,
 
 
 def _vertex_materials(mesh: trimesh.Trimesh, factors: dict[str, dict], name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    count, own, visual = len(mesh.vertices), mesh.vertex_attributes, mesh.visual
+    count = len(mesh.vertices)
+    own: Any = mesh.vertex_attributes
+    visual: Any = mesh.visual
     albedo = np.full((count, 3), DEFAULT_ALBEDO)
     roughness, metallic = np.full(count, DEFAULT_ROUGHNESS), np.full(count, DEFAULT_METALLIC)
     material, uv = getattr(visual, "material", None), getattr(visual, "uv", None)
@@ -202,7 +205,10 @@ def _sample_texture(image: Any, uv: np.ndarray, name: str) -> np.ndarray:
     width, height = image.size
     if width * height > MAX_TEXTURE_PIXELS:
         raise ValueError(f"{name}: has a texture of {width}x{height} pixels; the limit is {MAX_TEXTURE_PIXELS} pixels")
-    texels = np.asarray(image.convert("RGB"), np.float32) / 255
+    try:
+        texels = np.asarray(image.convert("RGB"), np.float32) / 255
+    except (OSError, SyntaxError) as error:  # what Pillow raises for damaged pictures
+        raise ValueError(f"{name}: holds a damaged texture ({error})") from error
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise ValueError(f"{name}: holds texture coordinates that are not finite")

@@ -72,7 +72,7 @@ def pose_scene(
         mesh = replace(mesh, albedo=vertex_materials.albedo, roughness=vertex_materials.roughness, metallic=vertex_materials.metallic)
     if deform:
         mesh = replace(mesh, vertices=shape.vertices, normals=shape.normals)
-    if surfel_materials is not None:
+    if surfel_materials is not None and shape.centers is not None and shape.tangents is not None:
         surfels = PosedSurfels(shape.centers, shape.tangents, _rest(asset).opacities, surfel_materials)
     environment, rotation, intensity = asset.environment, 0.0, 1.0
     for edit in edits:

@@ -5,7 +5,9 @@ Files come from strangers, so sizes are checked before pixels are decoded.
 Source: OpenEXR 3; Ward 1991, "Real Pixels" and the Radiance file format notes for RGBE and its run lengths.
 """
 
+import contextlib
 import io
+import sys
 import warnings
 
 import numpy as np
@@ -98,7 +100,8 @@ def decode_exr(data: bytes, name: str = "EXR") -> dict[str, np.ndarray]:
             or any(c.xSampling != 1 or c.ySampling != 1 for c in channels)
         ):
             raise ValueError(f"{name}: has {parts} parts, deep data or subsampled channels; expected one flat picture")
-        with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
+        # The binding prints its troubles on stdout, which belongs to --json.
+        with contextlib.redirect_stdout(sys.stderr), OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
             pixels = {key: np.asarray(channel.pixels).astype(np.float32) for key, channel in file.channels().items()}
     except (RuntimeError, OverflowError) as error:
         raise ValueError(f"{name}: is not a readable OpenEXR file ({error})") from error

@@ -200,7 +200,8 @@ class _BinaryBody:
 
     def _equal_lists(self, element: str, rows: int, properties: list[_Property]) -> PlyElement | None:
         """All rows have lists as long as the first row's (a triangle mesh): one structured read. None if they do not."""
-        start, dtype = self.position, []
+        start = self.position
+        dtype: list[tuple] = []
         for p in properties:
             if p.count_dtype:
                 first = self._table(element, 1, [*dtype, ("count of " + p.name, self.order + p.count_dtype)])

@@ -104,3 +104,9 @@ def test_wrong_or_damaged_pictures_are_refused_with_a_sentence():
     for data, sentence in cases:
         with pytest.raises(ValueError, match=f"^sky: .*{sentence}"):
             decode_environment(data, "sky")
+
+
+def test_a_damaged_file_prints_nothing_on_stdout(capsys):
+    with pytest.raises(ValueError, match="OpenEXR"):
+        decode_environment(encode_environment(sky(32))[:-200])
+    assert capsys.readouterr().out == ""
