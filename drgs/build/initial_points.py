@@ -114,7 +114,7 @@ def _sparse_points_on_object(views: Views) -> tuple[ndarray, ndarray] | None:
     if views.has_masks and len(points):
         seen, on_mask = np.zeros(len(points)), np.zeros(len(points))
         for camera, coverage in zip(views.cameras, views.coverage.cpu().numpy(), strict=True):
-            column, row, inside, _ = _project(camera, points)
+            column, row, inside, _ = project_points(camera, points)
             seen += inside
             on_mask += inside & (coverage[row, column] > 127)
         kept = (seen >= 2) & (on_mask >= SMALLEST_MASK_AGREEMENT * seen)
@@ -126,7 +126,7 @@ def _sparse_points_on_object(views: Views) -> tuple[ndarray, ndarray] | None:
     return points, colors
 
 
-def _project(camera: Camera, points: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+def project_points(camera: Camera, points: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Pixel column and row (clamped), whether the point is in the picture, and its depth."""
     world_to_pixel = (camera.intrinsics.double() @ camera.camera_from_world.double()[:3]).cpu().numpy().astype(np.float32)
     projected = points.astype(np.float32) @ world_to_pixel[:, :3].T + world_to_pixel[:, 3]
@@ -187,7 +187,7 @@ def _median_colors(views: Views, points: ndarray, normals: ndarray | None, hull:
     votes = torch.full((len(chosen), len(points), 3), float("nan"))
     for vote, index in zip(votes, chosen, strict=True):
         camera = views.cameras[index]
-        column, row, visible, depth = _project(camera, points)
+        column, row, visible, depth = project_points(camera, points)
         visible &= views.coverage[index].cpu().numpy()[row, column] > 200
         if normals is not None:
             to_camera = camera.center_world.cpu().numpy() - points
@@ -201,7 +201,7 @@ def _median_colors(views: Views, points: ndarray, normals: ndarray | None, hull:
 
 def _nearest_depth(camera: Camera, hull: VisualHull) -> ndarray:
     """(height, width) depth of the hull's nearest vertex around each pixel, +inf where there is none."""
-    column, row, inside, depth = _project(camera, hull.vertices_world)
+    column, row, inside, depth = project_points(camera, hull.vertices_world)
     # Cells of pixels as wide as two voxels, so that vertices leave no holes.
     stride = max(1, int(np.ceil(2 * hull.cell * float(camera.intrinsics[0, 0]) / max(float(np.median(depth)), 1e-6))))
     rows, columns = -(-camera.height // stride), -(-camera.width // stride)
