@@ -2,8 +2,10 @@
 
 import sys
 from importlib import import_module
+from pathlib import Path
 
-NAMES = ("rasterize", "build")
+NAMES = tuple(sorted(path.stem for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")))
+"""Each file here is a benchmark with a `main(arguments)`."""
 
 
 def main(arguments: list[str]) -> None:
