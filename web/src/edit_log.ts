@@ -61,7 +61,7 @@ export function describeEdit(edit: Edit): string {
       return `${edit.select.all ? '' : 'Part: '}${parts.join(', ')}${times}`.replace(/^./, (first) => first.toUpperCase());
     }
     case 'environment': {
-      const parts = [edit.file ? `${edit.file}` : 'Light'];
+      const parts = [edit.file ? edit.file.replace(/\.(exr|hdr)$/i, '') : 'Light'];
       if (edit.rotation) parts.push(`${Math.round(edit.rotation)}°`);
       if ((edit.intensity ?? 1) !== 1) parts.push(`× ${rounded(edit.intensity!)}`);
       return parts.join(', ');

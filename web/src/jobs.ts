@@ -2,7 +2,7 @@
 
 import * as api from './api';
 import type { AssetInfo, JobInfo } from './protocol.gen';
-import { openAsset } from './session';
+import { editLight, openAsset } from './session';
 import { assets, attempt, environments, jobs, notify, session, workersAlive } from './state';
 
 const BUSY_MS = 1000;
@@ -85,6 +85,7 @@ export async function takeFile(file: File, preset: Preset, onProgress: (share: n
     const added = await attempt(api.uploadEnvironment(file, onProgress));
     if (!added) return null;
     await attempt(refreshEnvironments());
+    editLight({ file: added.name });
     return 'environment';
   }
   if (/\.(glb|obj|ply)$/.test(name)) {

@@ -80,7 +80,7 @@ export class LocalPicture {
   }
 
   resize(width: number, height: number, pixelRatio: number): void {
-    this.renderer.setPixelRatio(pixelRatio);
+    if (this.renderer.getPixelRatio() !== pixelRatio) this.renderer.setPixelRatio(pixelRatio);
     this.renderer.setSize(width, height, false);
   }
 
@@ -127,16 +127,17 @@ export class LocalPicture {
     this.applyBackground();
   }
 
-  render(worldFromCamera: Matrix4, verticalFov: number, aspect: number, near: number, far: number, rotationDegrees: number, intensity: number, stops: number): void {
+  /** Draw what `camera` sees (world, z up). */
+  render(camera: PerspectiveCamera, near: number, far: number, rotationDegrees: number, intensity: number, stops: number): void {
     const lightFromWorld = new Matrix4().makeRotationZ((-rotationDegrees * Math.PI) / 180).premultiply(lightFromYUp);
     this.root.matrix.copy(lightFromWorld);
     this.root.matrixWorldNeedsUpdate = true;
-    this.eye.fov = verticalFov;
-    this.eye.aspect = aspect;
+    this.eye.fov = camera.fov;
+    this.eye.aspect = camera.aspect;
     this.eye.near = near;
     this.eye.far = far;
     this.eye.updateProjectionMatrix();
-    this.eye.matrix.multiplyMatrices(lightFromWorld, worldFromCamera);
+    this.eye.matrix.multiplyMatrices(lightFromWorld, camera.matrixWorld);
     this.eye.matrixWorldNeedsUpdate = true;
     this.renderer.toneMappingExposure = 2 ** stops;
     this.scene.environmentIntensity = intensity;

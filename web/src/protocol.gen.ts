@@ -339,6 +339,8 @@ export interface Settings {
   /** Indirect bounces; 0 is direct light with shadows only. */
   bounces?: number;
   channel?: "final" | "albedo" | "roughness" | "metallic" | "normal" | "depth";
+  /** Filter what is left of the noise; the filter follows the measured variance, so it fades as samples add up. */
+  denoise?: boolean;
 }
 
 export interface SettingsMessage {

@@ -3,7 +3,7 @@
 import { batch } from '@preact/signals';
 import * as api from './api';
 import { environmentEdit, type Light } from './edit_log';
-import type { Edit, EditLog, FrameHeader, MaterialValues, PickedMessage, ServerHello, Settings } from './protocol.gen';
+import type { Edit, EditLog, FrameHeader, MaterialValues, PickedMessage, ServerHello, SessionInfo, Settings } from './protocol.gen';
 import { attempt, captured, connection, light, log, notify, pending, session, settings, status } from './state';
 import { Stream } from './stream';
 
@@ -12,12 +12,14 @@ const DRAG_INTERVAL_MS = 40;
 
 let stream: Stream | null = null;
 let helloListener: ((hello: ServerHello) => void) | null = null;
+let lastHello: ServerHello | null = null;
 let frameListener: ((header: FrameHeader, picture: ImageBitmap, cameraNumber: number) => void) | null = null;
 
-/** The viewport's two ears; set once. */
+/** The viewport's two ears; set once. The viewport may come later than the first hello, which it is then told. */
 export function listen(onHello: (hello: ServerHello) => void, onFrame: (header: FrameHeader, picture: ImageBitmap, cameraNumber: number) => void): void {
   helloListener = onHello;
   frameListener = onFrame;
+  if (lastHello) onHello(lastHello);
 }
 
 const storageKey = (asset: string) => `drgs.session.${asset}`;
@@ -26,10 +28,11 @@ const storageKey = (asset: string) => `drgs.session.${asset}`;
 export async function openAsset(id: string): Promise<void> {
   const earlier = localStorage.getItem(storageKey(id));
   let info = earlier ? await api.getSession(earlier).catch(() => null) : null;
-  if (info?.asset !== id) info = await attempt(api.openSession(id));
+  if (info?.asset !== id) info = await attempt(freshSession(id));
   if (!info) return;
   localStorage.setItem(storageKey(id), info.id);
   stream?.close();
+  lastHello = null;
   batch(() => {
     session.value = { id: info.id, asset: info.asset, assetName: info.asset_name };
     log.value = { revision: info.revision, edits: info.edits, can_undo: info.can_undo, can_redo: info.can_redo };
@@ -41,6 +44,18 @@ export async function openAsset(id: string): Promise<void> {
   document.title = `${info.asset_name} · DR-GS`;
   stream = new Stream(info.id, events(info.asset));
   stream.sendSettings(settings.value);
+}
+
+/** A new session; where the server takes no more, the newest that it has on this asset. */
+async function freshSession(asset: string): Promise<SessionInfo> {
+  try {
+    return await api.openSession(asset);
+  } catch (error) {
+    const full = error instanceof api.ApiError && error.status === 429;
+    const other = full ? (await api.listSessions()).sessions.find((known) => known.asset === asset) : undefined;
+    if (!other) throw error;
+    return other;
+  }
 }
 
 export function closeAsset(): void {
@@ -57,6 +72,7 @@ function events(asset: string): ConstructorParameters<typeof Stream>[1] {
     connection: (state) => (connection.value = state),
     hello: (hello) => {
       takeLog(hello.log);
+      lastHello = hello;
       helloListener?.(hello);
     },
     message: (message) => {

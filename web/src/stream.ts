@@ -52,12 +52,15 @@ export class Stream {
   private outbox: Ordered[] = [];
   private camera: CameraMessage | null = null;
   private cameraNumber = 0;
+  private pose = '';
   private cameraSentAt = 0;
   private cameraTimer = 0;
   private settings: Settings | null = null;
   private settingsTimer = 0;
   private picks = new Map<number, (picked: PickedMessage) => void>();
   private newestFrame = 0;
+  /** Of the log, as far as the server has told. */
+  private revision = 0;
 
   constructor(
     private session: string,
@@ -74,8 +77,14 @@ export class Stream {
     this.events.connection('closed');
   }
 
-  /** Number by which frames will name this camera (low 8 bits). */
+  /**
+   * Number by which frames will name this camera (low 8 bits). A camera that looks the same keeps its number: the server would not
+   * render it again, so no frame would carry a new one.
+   */
   sendCamera(camera: Omit<CameraMessage, 'type' | 'number'>): number {
+    const pose = JSON.stringify(camera);
+    if (pose === this.pose) return this.cameraNumber & 0xff;
+    this.pose = pose;
     this.cameraNumber = (this.cameraNumber + 1) >>> 0;
     this.camera = { type: 'camera', number: this.cameraNumber, ...camera };
     if (!this.cameraTimer) {
@@ -113,8 +122,15 @@ export class Stream {
     });
   }
 
-  get unanswered(): number {
-    return this.outbox.length;
+  /**
+   * After a reconnection nobody knows whether the server got what it had not answered. An edit sets values, so sending it twice is
+   * harmless and losing it is not; a second undo would take back one step too many, so it is sent again only if nothing changed.
+   */
+  private sendAgain(revision: number): void {
+    const unchanged = revision === this.revision;
+    this.outbox = this.outbox.filter((waiting) => waiting.type === 'edit' || unchanged);
+    this.revision = revision;
+    for (const waiting of this.outbox) this.send(waiting);
   }
 
   private order(message: Ordered): number {
@@ -168,12 +184,15 @@ export class Stream {
         this.flushSettings();
         this.flushCamera();
         if (document.hidden) this.onVisibility();
-        for (const waiting of this.outbox) this.send(waiting);
+        this.sendAgain(message.log.revision);
         return;
       case 'picked':
         this.picks.get(message.id)?.(message);
         this.picks.delete(message.id);
         return;
+      case 'state':
+        this.revision = message.log.revision;
+        break;
       case 'accepted':
       case 'rejected':
         this.outbox = this.outbox.filter((waiting) => waiting.id !== message.id);

@@ -18,27 +18,41 @@ CameraControls.install({ THREE: { MOUSE, Vector2, Vector3, Vector4, Quaternion, 
 
 const DEGREES_PER_PIXEL = 0.4;
 const MOVING_MS = 120;
+/** Room around a framed object: 1 is none. */
+const MARGIN = 1.06;
+/** Sharpness of the local picture while it moves, as shares of the screen's own; slow machines go down this list. */
+const LOCAL_SCALES = [1, 0.75, 0.55, 0.4, 0.3];
+const SLOW_FRAME_MS = 40;
+const AIMED_FRAME_MS = 25;
+const QUICK_FRAME_MS = 17.5;
+const FRAMES_BEFORE_STEP = 4;
 const PIXEL_BUDGET = { low: 200_000, medium: 500_000, full: MAX_PIXELS };
 /** A fresh picture with fewer samples a pixel than this is too noisy to replace the local one. */
-const SHOW_FROM_SAMPLES = 4;
+const SHOW_FROM_SAMPLES = 16;
 
 export class Viewport {
   private readonly camera = new PerspectiveCamera(40, 1, 0.01, 100);
   private readonly controls: CameraControls;
   private readonly traced: CanvasRenderingContext2D;
   private local: LocalPicture | null = null;
-  private bounds = new Sphere(new Vector3(), 1);
-  private home: { eye: Vector3; target: Vector3 } | null = null;
+  private readonly box = new Box3();
+  private readonly bounds = new Sphere(new Vector3(), 1);
+  /** From the object to where the first picture is taken from. */
+  private homeDirection: Vector3 | null = null;
   private framedSession = '';
   private lastTick = performance.now();
   private movedAt = -Infinity;
-  private sentPose = '';
   private cameraNumber = 0;
   private newestFrame = 0;
   /** Set by changes that no camera number or revision tells: settings. Frames up to this id may still show the old ones. */
   private staleUpTo = 0;
   private fresh = false;
   private localDirty = true;
+  /** Index into LOCAL_SCALES, and the running mean of the time between two moving pictures. */
+  private localScale = 0;
+  private localSharp = true;
+  private frameMs = AIMED_FRAME_MS;
+  private framesMeasured = 0;
   private localMesh = '';
   private localEnvironment = '';
   private turning: { pointer: number; x: number; rotation: number } | null = null;
@@ -69,15 +83,13 @@ export class Viewport {
     requestAnimationFrame(this.tick);
   }
 
+  /** Show the whole object in the part of the window that no panel covers, from where the camera is. */
   frame(): void {
-    void this.controls.fitToSphere(this.bounds, true);
+    this.showAll(this.camera.position.clone().sub(this.controls.getTarget(new Vector3())), true);
   }
 
   reset(): void {
-    if (!this.home) return;
-    const { eye, target } = this.home;
-    void this.controls.setLookAt(eye.x, eye.y, eye.z, target.x, target.y, target.z, true);
-    void this.controls.setFocalOffset(0, 0, 0, true);
+    if (this.homeDirection) this.showAll(this.homeDirection, true);
   }
 
   /** The traced picture as PNG; null while there is none. */
@@ -88,28 +100,44 @@ export class Viewport {
   // ---- from the server ---------------------------------------------------------------------------------------------------
 
   private onHello = (hello: ServerHello) => {
-    const box = new Box3(new Vector3(...hello.minimum), new Vector3(...hello.maximum));
-    box.getBoundingSphere(this.bounds);
+    this.box.set(new Vector3(...hello.minimum), new Vector3(...hello.maximum));
+    this.box.getBoundingSphere(this.bounds);
     this.controls.minDistance = 0.05 * this.bounds.radius;
     this.controls.maxDistance = 60 * this.bounds.radius;
     this.newestFrame = 0;
     this.staleUpTo = 0;
-    this.sentPose = '';
     if (this.framedSession === hello.asset) return; // a reconnection keeps the view
     this.framedSession = hello.asset;
     this.stage.removeAttribute('data-picture');
     const m = hello.start_view.world_from_camera;
-    const eye = new Vector3(m[0][3], m[1][3], m[2][3]);
-    const forward = new Vector3(-m[0][2], -m[1][2], -m[2][2]);
-    const distance = Math.max(this.bounds.center.clone().sub(eye).dot(forward), 0.1 * this.bounds.radius);
-    this.home = { eye, target: eye.clone().addScaledVector(forward, distance) };
+    this.homeDirection = new Vector3(m[0][2], m[1][2], m[2][2]);
     this.camera.fov = hello.start_view.fov_y_degrees;
     this.camera.updateProjectionMatrix();
-    const { target } = this.home;
-    void this.controls.setLookAt(eye.x, eye.y, eye.z, target.x, target.y, target.z, false);
-    void this.controls.setFocalOffset(0, 0, 0, false);
+    this.showAll(this.homeDirection, false);
     this.controls.update(0);
   };
+
+  /** Look at the centre of the object from `direction`, so near that its bounding box fills the free part of the window. */
+  private showAll(direction: Vector3, smooth: boolean): void {
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    const free = freeArea(width, height);
+    const tangent = Math.tan((this.camera.fov * Math.PI) / 360); // of half the height
+    const center = this.box.getCenter(new Vector3());
+    const back = direction.clone().normalize();
+    const right = new Vector3().crossVectors(this.camera.up, back).normalize();
+    const up = new Vector3().crossVectors(back, right);
+    let distance = 0;
+    for (let corner = 0; corner < 8; corner++) {
+      const { min, max } = this.box;
+      const p = new Vector3(corner & 1 ? max.x : min.x, corner & 2 ? max.y : min.y, corner & 4 ? max.z : min.z).sub(center);
+      const across = Math.max(Math.abs(p.dot(right)) / free.width, Math.abs(p.dot(up)) / free.height);
+      distance = Math.max(distance, p.dot(back) + (MARGIN * across * height) / tangent);
+    }
+    const eye = back.multiplyScalar(distance).add(center);
+    const unitsPerPixel = (2 * tangent * distance) / height;
+    void this.controls.setLookAt(eye.x, eye.y, eye.z, center.x, center.y, center.z, smooth);
+    void this.controls.setFocalOffset((width / 2 - free.x) * unitsPerPixel, (height / 2 - free.y) * unitsPerPixel, 0, smooth);
+  }
 
   private onFrame = (header: FrameHeader, picture: ImageBitmap, cameraNumber: number) => {
     this.newestFrame = header.frameId;
@@ -139,6 +167,7 @@ export class Viewport {
 
   private setFresh(fresh: boolean): void {
     this.fresh = fresh;
+    this.stage.dataset.fresh = String(fresh);
     this.updateLayers();
   }
 
@@ -174,8 +203,9 @@ export class Viewport {
       this.localDirty = true;
     });
     effect(() => {
-      resolution.value;
-      this.sentPose = '';
+      session.value;
+      this.cameraNumber = -1; // a new stream counts anew
+      this.setFresh(false);
     });
     effect(() => {
       const asset = session.value?.asset;
@@ -217,43 +247,70 @@ export class Viewport {
 
   private tick = (now: number) => {
     requestAnimationFrame(this.tick);
-    const moved = this.controls.update((now - this.lastTick) / 1000);
+    const elapsed = now - this.lastTick;
     this.lastTick = now;
+    const moved = this.controls.update(elapsed / 1000);
+    if (moved && now - this.movedAt < MOVING_MS) this.paceLocal(elapsed);
     if (!session.value) return;
     if (moved) {
       this.movedAt = now;
       this.localDirty = true;
     }
     this.sendPose();
-    if (this.localDirty && this.localShows) {
-      this.localDirty = false;
-      const distance = this.camera.position.distanceTo(this.bounds.center);
-      const near = Math.max(0.002 * this.bounds.radius, distance - 4 * this.bounds.radius);
-      const turned = light.value;
-      this.local!.render(this.camera.matrixWorld, this.camera.fov, this.camera.aspect, near, distance + 4 * this.bounds.radius, turned.rotation, turned.intensity, settings.value.exposure_stops);
-      this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
-    }
+    this.drawLocal(now, moved);
     this.stage.dataset.moving = String(now - this.movedAt < MOVING_MS);
   };
+
+  private drawLocal(now: number, moved: boolean): void {
+    if (!this.localShows) return;
+    const sharp = !moved && now - this.movedAt > MOVING_MS;
+    if (sharp !== this.localSharp && (this.localDirty || (sharp && !this.fresh))) {
+      this.localSharp = sharp;
+      this.resizeLocal();
+    }
+    if (!this.localDirty) return;
+    this.localDirty = false;
+    const { radius, center } = this.bounds;
+    const distance = this.camera.position.distanceTo(center);
+    const { rotation, intensity } = light.value;
+    this.local!.render(this.camera, Math.max(0.002 * radius, distance - 1.5 * radius), distance + 1.5 * radius, rotation, intensity, settings.value.exposure_stops);
+    this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
+  }
+
+  /** Fewer pixels where moving pictures come too slowly, more where there is room: time goes with the number of pixels. */
+  private paceLocal(elapsed: number): void {
+    this.frameMs += 0.4 * (Math.min(elapsed, 500) - this.frameMs);
+    if (++this.framesMeasured < FRAMES_BEFORE_STEP || (this.frameMs < SLOW_FRAME_MS && this.frameMs > QUICK_FRAME_MS)) return;
+    const wanted = LOCAL_SCALES[this.localScale]! * Math.sqrt(AIMED_FRAME_MS / this.frameMs);
+    const fitting = LOCAL_SCALES.findIndex((scale) => scale <= wanted * 1.05);
+    const next = fitting < 0 ? LOCAL_SCALES.length - 1 : Math.max(fitting, this.localScale - 1);
+    this.framesMeasured = 0;
+    if (next === this.localScale) return;
+    this.localScale = next;
+    this.frameMs = AIMED_FRAME_MS; // measure anew before the next step
+    this.resizeLocal();
+  }
+
+  private resizeLocal(): void {
+    const scale = this.localSharp ? 1 : LOCAL_SCALES[this.localScale]!;
+    this.local?.resize(this.stage.clientWidth, this.stage.clientHeight, scale * pixelRatio());
+    this.localDirty = true;
+  }
 
   private sendPose(): void {
     const { width, height } = this.pictureSize();
     if (width < 16 || height < 16) return;
     const e = this.camera.matrixWorld.elements; // columns
     const row = (i: number): [number, number, number, number] => [e[i]!, e[4 + i]!, e[8 + i]!, e[12 + i]!];
-    const pose = `${e.map((value) => value.toPrecision(7)).join()},${width},${height},${this.camera.fov}`;
-    if (pose === this.sentPose) return;
     const number = sendCamera({ world_from_camera: [row(0), row(1), row(2), [0, 0, 0, 1]], fov_y_degrees: this.camera.fov, width, height });
-    if (number === null) return;
-    this.sentPose = pose;
+    if (number === null || number === this.cameraNumber) return;
     this.cameraNumber = number;
     this.setFresh(false);
   }
 
   private pictureSize(): { width: number; height: number } {
-    const ratio = Math.min(window.devicePixelRatio || 1, 2);
-    const width = this.stage.clientWidth * ratio;
-    const height = this.stage.clientHeight * ratio;
+    const width = this.stage.clientWidth * pixelRatio();
+    const height = this.stage.clientHeight * pixelRatio();
     const scale = Math.min(1, Math.sqrt(PIXEL_BUDGET[resolution.value] / Math.max(1, width * height)), MAX_SIDE / Math.max(width, height, 1));
     return { width: Math.floor(width * scale), height: Math.floor(height * scale) };
   }
@@ -263,8 +320,7 @@ export class Viewport {
     if (!width || !height) return;
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
-    this.local?.resize(width, height, Math.min(window.devicePixelRatio || 1, 2));
-    this.localDirty = true;
+    this.resizeLocal();
   };
 
   // ---- pointers ----------------------------------------------------------------------------------------------------------
@@ -321,4 +377,17 @@ export class Viewport {
       move();
     });
   }
+}
+
+const pixelRatio = () => Math.min(window.devicePixelRatio || 1, 2);
+
+/** Centre and size of what bars and open panels leave of the window [CSS pixels]. */
+function freeArea(width: number, height: number): { x: number; y: number; width: number; height: number } {
+  const edge = (selector: string, side: 'left' | 'right' | 'top' | 'bottom') => document.querySelector(selector)?.getBoundingClientRect()[side];
+  const narrow = width < 620; // panels lie below the picture then
+  const left = narrow ? 0 : (edge('.library', 'right') ?? 0);
+  const right = narrow ? width : (edge('.inspector', 'left') ?? width);
+  const top = edge('.topbar', 'bottom') ?? 0;
+  const bottom = narrow ? (edge('.panel', 'top') ?? height) : (edge('.hud', 'top') ?? height);
+  return { x: (left + right) / 2, y: (top + bottom) / 2, width: right - left, height: bottom - top };
 }

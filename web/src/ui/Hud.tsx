@@ -12,10 +12,10 @@ export function Hud() {
   const kind = link !== 'open' ? 'away' : now?.phase === 'converged' ? 'done' : 'busy';
   const scale = now && now.scale < 0.995 ? ` (${Math.round(100 * now.scale)} %)` : '';
   return (
-    <div class="hud" data-state={link === 'open' ? now?.phase ?? 'loading' : link}>
+    <section class="hud" aria-label="State of the picture" data-state={link === 'open' ? (now?.phase ?? 'loading') : link}>
       <span class={`lamp ${kind}`} aria-hidden="true" />
       <span role="status">{state}</span>
-      {now && link === 'open' && (
+      {now && now.width > 0 && link === 'open' && (
         <>
           {settings.value.channel === 'final' && (
             <span class="hud-samples">
@@ -40,6 +40,6 @@ export function Hud() {
           <div style={{ width: `${(100 * now.spp) / Math.max(1, now.spp_target)}%` }} />
         </div>
       )}
-    </div>
+    </section>
   );
 }

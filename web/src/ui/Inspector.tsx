@@ -35,7 +35,7 @@ function Material() {
   return (
     <Section title="Material">
       <p class="hint">Applies to the whole object. A dimmed value is the captured average.</p>
-      <ColorField label="Base colour" value={color} unset={albedo.value === null} onChange={(value) => editMaterial({ albedo: value })} onReset={albedo.value ? () => editMaterial({ albedo: mean.albedo }) : undefined} />
+      <ColorField label="Colour" value={color} unset={albedo.value === null} onChange={(value) => editMaterial({ albedo: value })} onReset={albedo.value ? () => editMaterial({ albedo: mean.albedo }) : undefined} />
       <Slider
         label="Roughness"
         value={at(roughness, mean.roughness)}

@@ -67,8 +67,18 @@ export function NewBuild() {
         }}
       />
       <p class="hint">Or drop a capture (.zip of posed photos), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr) anywhere on this page.</p>
-      {uploading.value && <Bar label={`Uploading ${uploading.value.name}`} share={uploading.value.share} />}
+      {uploading.value && <Upload {...uploading.value} />}
     </Section>
+  );
+}
+
+function Upload({ name, share }: { name: string; share: number }) {
+  const label = share < 1 ? `Uploading ${name}` : `The server is reading ${name}…`;
+  return (
+    <div role="status">
+      <p class="facts">{label}</p>
+      <Bar label={label} share={share} />
+    </div>
   );
 }
 

@@ -1,0 +1,160 @@
+"""The viewer in a real browser on a real server: what the user does shows in pixels and in the server's state.
+
+The tests run in this order on one page; each undoes its edits.
+"""
+
+import io
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from playwright.sync_api import expect
+
+from tests.web.conftest import RunningServer, Viewer, wait_until
+
+TOO_SMALL_TO_SEE = 6.0
+"""Euclidean difference of mean sRGB colours that noise between two pictures of the same thing stays below."""
+
+
+def difference(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    return math.dist(a, b)
+
+
+def test_the_token_leaves_the_address_bar_and_a_chosen_mesh_opens(viewer: Viewer, ball_file: Path) -> None:
+    expect(viewer.page.get_by_text("No asset is open")).to_be_visible()
+    assert "token" not in viewer.page.url
+    viewer.page.get_by_label("Capture or mesh").set_input_files(ball_file)
+    expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=40_000)
+    color = viewer.settled_color()
+    assert color[0] > 1.5 * color[2], "the ball's red side faces the first camera"
+    assert "asset=" in viewer.page.url
+
+
+def test_the_local_picture_agrees_with_the_traced_one(viewer: Viewer) -> None:
+    traced = viewer.settled_color()
+    # A WebGL canvas may be read only within the frame in which it was drawn: a screenshot reads what is shown.
+    viewer.page.evaluate("document.querySelector('canvas.traced').style.visibility = 'hidden'")
+    box = viewer.page.evaluate(
+        "(() => { const s = document.querySelector('.stage'); const a = 0.2 * s.clientHeight;"
+        " return { x: (s.clientWidth - a) / 2, y: (s.clientHeight - a) / 2, width: a, height: a }; })()"
+    )
+    local = mean_color(viewer, box)
+    viewer.page.evaluate("document.querySelector('canvas.traced').style.visibility = ''")
+    assert difference(local, traced) < 12, f"local {local}, traced {traced}"
+
+
+def test_orbiting_changes_the_picture_and_reset_brings_it_back(viewer: Viewer) -> None:
+    before = viewer.settled_color()
+    viewer.page.mouse.move(380, 150)
+    viewer.page.mouse.down()
+    viewer.page.mouse.move(290, 150, steps=4)
+    viewer.page.mouse.up()
+    assert difference(viewer.settled_color(), before) > 5 * TOO_SMALL_TO_SEE
+    viewer.page.keyboard.press("Shift+F")
+    wait_until(lambda: difference(viewer.settled_color(), before) < TOO_SMALL_TO_SEE, "the first view")
+
+
+def test_a_color_edit_reaches_pixels_and_log_and_undo_restores_both(viewer: Viewer) -> None:
+    before = viewer.settled_color()
+    field = viewer.page.get_by_label("Colour, sRGB hex")
+    field.fill("#2050e0")
+    field.press("Enter")
+    (edit,) = viewer.wait_for_edits(1)
+    assert edit["op"] == "material" and edit["select"]["all"]
+    assert [round(value, 3) for value in edit["set"]["albedo"]] == [0.014, 0.08, 0.745]
+    assert (after := viewer.settled_color())[2] > 1.5 * after[0]
+    viewer.page.get_by_role("button", name="Undo", exact=True).click()
+    viewer.wait_for_edits(0)
+    assert difference(viewer.settled_color(), before) < TOO_SMALL_TO_SEE
+
+
+def test_a_slider_drag_is_one_undo_step(viewer: Viewer) -> None:
+    slider = viewer.page.get_by_label("Roughness", exact=True)
+    box = slider.bounding_box()
+    assert box is not None
+    y = box["y"] + box["height"] / 2
+    viewer.page.mouse.move(box["x"] + 0.6 * box["width"], y)
+    viewer.page.mouse.down()
+    for share in (0.5, 0.4, 0.3, 0.2):
+        viewer.page.mouse.move(box["x"] + share * box["width"], y)
+        viewer.page.wait_for_timeout(60)
+    viewer.page.mouse.up()
+    viewer.wait_for_edits(1)
+    wait_until(lambda: viewer.edits()[0]["set"]["roughness"] < 0.3, "the end of the drag")
+    viewer.page.keyboard.press("Control+z")
+    assert viewer.wait_for_edits(0) == []
+    viewer.page.keyboard.press("Control+Shift+Z")
+    (again,) = viewer.wait_for_edits(1)
+    assert again["set"]["roughness"] < 0.3
+    viewer.page.keyboard.press("Control+z")
+    viewer.wait_for_edits(0)
+
+
+def test_light_is_chosen_from_the_gallery_and_turned_by_alt_drag(viewer: Viewer) -> None:
+    before = viewer.settled_color()
+    viewer.page.locator(".gallery input").first.check()
+    (chosen,) = viewer.wait_for_edits(1)
+    assert chosen["op"] == "environment" and chosen["file"].endswith(".exr")
+    lit = viewer.settled_color()
+    assert difference(lit, before) > TOO_SMALL_TO_SEE
+    viewer.page.keyboard.down("Alt")
+    viewer.page.mouse.move(380, 150)
+    viewer.page.mouse.down()
+    viewer.page.mouse.move(480, 150, steps=3)
+    viewer.page.mouse.up()
+    viewer.page.keyboard.up("Alt")
+    _, turned = viewer.wait_for_edits(2)
+    wait_until(lambda: viewer.edits()[1]["rotation"] == 40.0, "a turn by 100 pixels, 0.4 degrees each")
+    assert turned["file"] == chosen["file"]
+    viewer.page.get_by_role("button", name="As captured").click()
+    viewer.wait_for_edits(0)
+
+
+def test_channels_show_what_they_name(viewer: Viewer) -> None:
+    viewer.page.keyboard.press("2")
+    albedo = wait_until(lambda: (color := viewer.settled_color())[0] > 200 and color, "the albedo picture")
+    # sRGB of the linear albedo (0.8, 0.1, 0.1)
+    assert difference(albedo, (231, 89, 89)) < 12
+    viewer.page.keyboard.press("1")
+    wait_until(lambda: difference(viewer.settled_color(), albedo) > TOO_SMALL_TO_SEE, "the final picture")
+
+
+def test_help_lists_the_shortcut_table(viewer: Viewer) -> None:
+    viewer.page.keyboard.press("?")
+    table = Path(__file__).resolve().parents[2].joinpath("web/src/shortcuts.ts").read_text()
+    texts = re.findall(r"text: '([^']+)'", table)
+    assert len(texts) > 15
+    for text in texts:
+        expect(viewer.page.locator("dialog.help dd", has_text=text).first).to_be_visible()
+    viewer.page.keyboard.press("Escape")
+    expect(viewer.page.locator("dialog.help")).to_be_hidden()
+
+
+def test_edits_survive_a_reload_and_the_page_logged_no_errors(viewer: Viewer) -> None:
+    number = viewer.page.get_by_label("Metallic, exact value")
+    number.fill("1")
+    number.press("Enter")
+    viewer.wait_for_edits(1)
+    viewer.page.reload()
+    expect(viewer.page.get_by_label("Metallic, exact value")).to_have_value("1.00", timeout=20_000)
+    viewer.settled_color()
+    assert viewer.complaints == []
+
+
+def test_the_page_comes_back_after_a_server_restart_with_its_edits(viewer: Viewer, server: RunningServer) -> None:
+    server.stop()
+    expect(viewer.page.get_by_text("Reconnecting…")).to_be_visible()
+    server.start()
+    expect(viewer.page.get_by_text("Reconnecting…")).to_be_hidden(timeout=20_000)
+    assert len(viewer.edits()) == 1
+    viewer.settled_color()
+    viewer.page.keyboard.press("Control+z")
+    viewer.wait_for_edits(0)
+
+
+def mean_color(viewer: Viewer, clip: dict) -> tuple[float, ...]:
+    """Of a part of what the page shows, sRGB 0..255."""
+    picture = Image.open(io.BytesIO(viewer.page.screenshot(clip=clip))).convert("RGB")
+    return tuple(np.asarray(picture, float).mean((0, 1)))
