@@ -44,6 +44,9 @@ def bind_gaussians(centers: Tensor, mesh: TriangleMesh) -> Binding:
     """
     if mesh.faces.shape[0] == 0:
         raise ValueError("cannot bind Gaussians to a mesh without faces")
+    corners = mesh.vertices[mesh.faces.long()]
+    if not torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any():
+        raise ValueError("cannot bind Gaussians to a mesh whose faces all have no area")
     finite = torch.isfinite(centers).all(-1)
     if not finite.all():
         raise ValueError(f"cannot bind Gaussians: {int((~finite).sum())} of {centers.shape[0]} centres are not finite")
@@ -66,8 +69,6 @@ def bind_gaussians(centers: Tensor, mesh: TriangleMesh) -> Binding:
         outputs=[warp_array(face), warp_array(barycentric, wp.vec3)],
         device=warp_device(points),
     )
-    if (face < 0).any():
-        raise ValueError("cannot bind Gaussians to a mesh whose faces all have no area")
     barycentric = barycentric.clamp(min=0.0)
     barycentric = barycentric / barycentric.sum(-1, keepdim=True)
     on_face, normal = foot_and_normal(face, barycentric, vertices, faces)

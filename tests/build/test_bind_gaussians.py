@@ -120,6 +120,8 @@ def test_bad_input_is_refused():
         bind_gaussians(torch.tensor([[0.0, 0, 0], [0, torch.nan, 0]]), mesh)
     with pytest.raises(ValueError, match="without faces"):
         bind_gaussians(torch.zeros(1, 3), triangle_mesh(mesh.vertices, torch.zeros(0, 3, dtype=torch.int32)))
+    with pytest.raises(ValueError, match="no area"):
+        bind_gaussians(torch.ones(1, 3), triangle_mesh(mesh.vertices, torch.zeros(2, 3, dtype=torch.int32)))
 
 
 def test_no_centers_give_an_empty_binding():
