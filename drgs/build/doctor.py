@@ -28,7 +28,7 @@ WIDE_GAP = 50.0
 SMALL_COVERAGE, LARGE_COVERAGE = 0.03, 0.8
 CLIPPED_BYTE = 254
 MUCH_CLIPPED = 0.05
-VARIED_BRIGHTNESS = 0.3
+VARIED_BRIGHTNESS = 0.35
 """Standard deviation of the views' exposures [stops], measured on points that several views share."""
 POOR_AGREEMENT = 0.85
 """Intersection over union of a mask with what all masks together say."""

@@ -8,7 +8,7 @@ Source: Laurentini 1994, "The visual hull concept"; marching cubes by scikit-ima
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 from drgs.warp_torch import launch, warp_array, warp_device
 
@@ -34,6 +35,8 @@ class VisualHullSettings:
     """Cells along the longest axis of the box that holds the object."""
     wrong_mask_share: float = 0.03
     """Share of the views whose masks may be wrong."""
+    mask_side: int = 512
+    """Larger masks are averaged down to at most this [pixels]: finer ones outdo the grid."""
     level: float = 0.4
     """Coverage that counts as object; below one half so that details as wide as a cell survive."""
     smallest_part: float = 0.002
@@ -68,7 +71,7 @@ def outvote(
     width = masks.shape[2]
     height = masks.shape[1]
     smallest = wp.vec4(1.0, 1.0, 1.0, 1.0)
-    seen = int(0)  # noqa: RUF046  Warp: a variable changed in a loop must not be a constant
+    seen = int(0)  # Warp: a variable that a loop changes must not be a constant
     for view in range(masks.shape[0]):
         depth = wp.dot(pixel_from_world[3 * view + 2], point)
         if depth > 1.0e-6:
@@ -97,6 +100,7 @@ def outvote(
 
 def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings()) -> VisualHull | None:
     """Carve the hull; None where the masks have no common shape."""
+    views = _with_small_masks(views, settings.mask_side)
     carver = _Carver(views, settings)
     box = _first_box(views)
     if box is None:
@@ -136,6 +140,23 @@ def camera_geometry(views: Views) -> tuple[ndarray, ndarray, ndarray]:
     intrinsics = torch.stack([camera.intrinsics for camera in views.cameras]).double().cpu().numpy()
     centers = -np.einsum("vji,vj->vi", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3])
     return camera_from_world, intrinsics, centers
+
+
+def _with_small_masks(views: Views, side: int) -> Views:
+    """Masks averaged over squares of whole pixels, cameras to match; the pictures are left alone, nothing here reads them."""
+    factor = math.ceil(max(views.coverage.shape[1:]) / side)
+    if factor == 1:
+        return views
+    small = [
+        torch.nn.functional.avg_pool2d(mask.float()[None], factor, ceil_mode=True)[0].round().to(torch.uint8)
+        for mask in views.coverage.cpu()
+    ]
+    height, width = small[0].shape
+    shrink = torch.diag(torch.tensor([1 / factor, 1 / factor, 1.0]))
+    cameras = tuple(Camera(c.camera_from_world.cpu(), shrink @ c.intrinsics.cpu(), width, height, c.name) for c in views.cameras)
+    return replace(
+        views, cameras=cameras, coverage=torch.stack(small), images_srgb=torch.zeros(len(small), height, width, 3, dtype=torch.uint8)
+    )
 
 
 def _first_box(views: Views) -> tuple[ndarray, ndarray] | None:

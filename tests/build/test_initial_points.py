@@ -9,7 +9,7 @@ import torch
 
 from drgs.build.initial_points import initial_points
 from drgs.build.load_views import load_views
-from drgs.build.visual_hull import axes_meeting_point, visual_hull
+from drgs.build.visual_hull import VisualHullSettings, axes_meeting_point, visual_hull
 from drgs.scene.views import Views
 
 COUNT = 3000
@@ -73,6 +73,15 @@ def test_the_hull_is_a_closed_surface_wound_outward(sphere: Views) -> None:
     volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
     exact = 4 / 3 * np.pi * tiny.SPHERE_RADIUS**3
     assert 0.97 * exact < volume < 1.2 * exact
+
+
+def test_large_masks_give_the_hull_of_their_averages(sphere: Views) -> None:
+    hull = visual_hull(sphere, VisualHullSettings(mask_side=36))
+    assert hull is not None
+    radii = np.linalg.norm(hull.vertices_world - tiny.SPHERE_CENTER, axis=1) / tiny.SPHERE_RADIUS
+    # Pixels are 0.12 radii wide now.
+    assert radii.min() > 0.93 and np.median(radii) < 1.07
+    np.testing.assert_allclose((hull.vertices_world.min(0) + hull.vertices_world.max(0)) / 2, tiny.SPHERE_CENTER, atol=0.05)
 
 
 @pytest.mark.parametrize("fill", [0, 255])
