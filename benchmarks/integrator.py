@@ -5,7 +5,7 @@
 DIR holds mesh.ply, cameras.json, env_*.exr, `<env>_<direct|bounce1>_<camera>.exr` (linear, premultiplied, many
 samples) and `*_se.npy` (standard error of each pixel's mean). relmse = mean over covered pixels and channels of
 (x - ref)^2 / (ref^2 + 0.01); bias = (sum x - sum ref) / sum ref; its error bar has both sides' noise.
-within_4se = share of covered pixels whose RGB mean is within four standard errors (both sides' noise).
+seconds is wall time from a built tracer on, cpu_seconds the sum over threads (steadier on a busy machine). within_4se = share of covered pixels whose RGB mean is within four standard errors (both sides' noise).
 """
 
 import argparse
@@ -122,16 +122,17 @@ def main(argv: list[str] | None = None) -> None:
                     bounces=int(light == "bounce1"), primary="mesh", seed=arguments.seed, counts=counts, skip=not arguments.no_skip
                 )
                 refine_frame(start_frame(scene, camera, settings, tracer))  # compile and warm up
-                started = time.perf_counter()
+                started, cpu_started = time.perf_counter(), time.process_time()
                 state = start_frame(scene, camera, settings, tracer)
                 for spp in sorted(arguments.spp):
                     state = refine_frame(state, max(0, -(-spp // samples_a_pass(settings, True).total) - state.passes))
-                    seconds = time.perf_counter() - started
+                    seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
                     frame = resolve_frame(state)
                     coverage = frame.gbuffer.coverage
                     mean = (frame.radiance_linear * coverage[..., None]).numpy()
                     variance = (frame.radiance.variance * coverage**2).numpy()
                     row = {"env": env, "light": light, "camera": number, "spp": frame.radiance.samples, "seconds": round(seconds, 4)}
+                    row["cpu_seconds"] = round(cpu_seconds, 4)
                     row |= compare(mean, variance, reference, standard_error)
                     rows.append(row)
                     if not arguments.json:

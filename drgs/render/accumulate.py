@@ -14,6 +14,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from drgs.render.denoise import denoise
 from drgs.render.environment_table import build_environment_table, environment_light
 from drgs.render.lift_points import lift_points
 from drgs.render.plan import RenderPlan, plan_frame
@@ -48,6 +49,7 @@ class RenderSettings:
     primary: Literal["gaussians", "mesh"] | None = None
     """What the camera sees; None: the Gaussians where the scene has any."""
     denoise: Literal["none", "svgf", "oidn"] = "none"
+    """Of what resolve_frame shows; the sums stay as they are."""
     skip: bool = True
     """Leave out what the scene does not need (drgs/render/plan.py)."""
     seed: int = 0
@@ -80,8 +82,8 @@ class FrameState:
     """Passes that found a surface."""
     luminance: Float[Tensor, "pixel"]
     luminance_squared: Float[Tensor, "pixel"]
-    scatter: Float[Tensor, "pixel"]
-    """Sum of the passes' own variance estimates."""
+    scatter: Float[Tensor, "pixel 3"]
+    """Sum of the passes' own variance estimates: whole luminance, diffuse, specular."""
     visibility: Float[Tensor, "pixel"]
     surface: Float[Tensor, "pixel 15"]
     """Sums of position, normal, wo, albedo, roughness, metallic, depth."""
@@ -132,9 +134,10 @@ def start_frame(
     plan = plan_frame(scene.environment, scene.environment_intensity, counts, settings.bounces, settings.skip)
     pixels = camera.width * camera.height
     vectors = [torch.zeros(pixels, 3, device=device) for _ in range(2)]
-    numbers = [torch.zeros(pixels, device=device) for _ in range(5)]
-    surface = torch.zeros(pixels, 15, device=device)
-    return FrameState(scene, camera, settings, tracer, light, plan, fixed, box, gbuffer, *vectors, *numbers, surface, 0, seconds)
+    weight, luminance, luminance_squared, visibility = (torch.zeros(pixels, device=device) for _ in range(4))
+    scatter, surface = torch.zeros(pixels, 3, device=device), torch.zeros(pixels, 15, device=device)
+    sums = [*vectors, weight, luminance, luminance_squared, scatter, visibility, surface]
+    return FrameState(scene, camera, settings, tracer, light, plan, fixed, box, gbuffer, *sums, 0, seconds)
 
 
 @wp.kernel
@@ -143,7 +146,7 @@ def add_pass(
     pixel: wp.array[int],
     pass_diffuse: wp.array[wp.vec3],
     pass_specular: wp.array[wp.vec3],
-    pass_variance: wp.array[float],
+    pass_variance: wp.array[wp.vec3],
     pass_visibility: wp.array[float],
     # outputs; each pixel occurs once a pass, so plain adds are exact and ordered
     diffuse: wp.array[wp.vec3],
@@ -151,7 +154,7 @@ def add_pass(
     weight: wp.array[float],
     luminance: wp.array[float],
     luminance_squared: wp.array[float],
-    scatter: wp.array[float],
+    scatter: wp.array[wp.vec3],
     visibility: wp.array[float],
 ):
     i = first + wp.tid()
@@ -206,7 +209,7 @@ def refine_frame(state: FrameState, passes: int = 1) -> FrameState:
         light = shade(points, primary.starts, state.light, state.tracer, plan.counts, plan.bounces, seed, index, plan.by_material)
         shaded = time.perf_counter()
         vectors = [warp_array(light.diffuse, wp.vec3), warp_array(light.specular, wp.vec3)]
-        numbers = [warp_array(light.variance), warp_array(light.visibility)]
+        numbers = [warp_array(light.variance, wp.vec3), warp_array(light.visibility)]
         launch(add_pass, len(points.pixel), [warp_array(points.pixel), *vectors, *numbers], arrays, device)
         if state.fixed is None:
             launch(add_surface, len(points.pixel), [point_arrays(points), warp_array(primary.depth)], [warp_array(surface)], device)
@@ -227,17 +230,23 @@ def resolve_frame(state: FrameState) -> Frame:
     # Straight (alpha-normalised) radiance; the variance is that of the mean of one pixel's passes.
     mean = state.luminance / passes
     between = (state.luminance_squared / passes - mean * mean).clamp(min=0) / max(1, passes - 1)
-    variance = (between if passes > 1 else state.scatter) * (passes / weight) ** 2
+    variance = (between if passes > 1 else state.scatter[:, 0]) * (passes / weight) ** 2
+    scatter = state.scatter / (weight * weight)[:, None]
     radiance = Radiance(
         (state.diffuse / weight[:, None]).reshape(*shape, 3),
         (state.specular / weight[:, None]).reshape(*shape, 3),
         variance.reshape(shape),
         (state.visibility / weight).reshape(shape),
         state.passes * samples_a_pass(state.settings, state.fixed is None).total,
+        scatter[:, 1].reshape(shape),
+        scatter[:, 2].reshape(shape),
     )
-    linear = radiance.diffuse + radiance.specular
+    seconds = dict(state.seconds)
+    shown = denoise(radiance, gbuffer, camera, settings.denoise)
+    seconds["denoise"] = time.perf_counter() - clock
+    linear = shown.diffuse + shown.specular
     rgba = tonemap(linear, gbuffer.coverage, settings.exposure, _background(state))
-    seconds = {**state.seconds, "resolve": time.perf_counter() - clock}
+    seconds["resolve"] = time.perf_counter() - clock - seconds["denoise"]
     metadata = {
         "samples": radiance.samples,
         "passes": state.passes,
@@ -247,7 +256,7 @@ def resolve_frame(state: FrameState) -> Frame:
         "primary": "mesh" if state.fixed is None else "gaussians",
         "milliseconds": {step: round(1000 * duration, 3) for step, duration in seconds.items()},
     }
-    return Frame(rgba, linear, gbuffer, radiance, metadata)
+    return Frame(rgba, linear, gbuffer, shown, metadata)
 
 
 def samples_a_pass(settings: RenderSettings, mesh: bool) -> SampleCounts:

@@ -2,9 +2,11 @@
 
 Points that Gaussians cover lie near the mesh, in front of it or behind it. A ray from a point inside the mesh would meet the
 mesh from within at once (shadow acne), one from far outside would miss contact shadows. So each point is carried to the
-mesh along its own viewing ray; where that ray meets none of it within TOLERANCE_OF_EXTENT, along its normal; where that
-fails too there is no mesh near, and the point itself, lifted, will do. The start then stands the tracer's lift outside the triangle,
-and shade lets no light in from below that triangle: no ray can meet the surface it starts on.
+mesh: along its own viewing ray, else along its normal, each within NEAR of it and onto a triangle that faces as the
+point does; else, where splats of two surfaces blend to a depth between them, along the viewing ray to the first surface within FAR.
+A point whose viewing ray meets no mesh lies outside the mesh's outline, hence outside the mesh, and stays where it is. The start
+then stands the tracer's lift outside the triangle, and shade lets no light in from below that triangle: no ray can
+meet the surface it starts on.
 """
 
 import torch
@@ -14,25 +16,27 @@ from drgs.render.shade import RayStarts
 from drgs.render.trace_rays import trace_rays
 from drgs.render.tracer import AbstractTracer
 
-TOLERANCE_OF_EXTENT = 0.02
-"""How far a splatted point may be from the mesh [share of the mesh's diagonal]."""
+NEAR = 0.01
+"""How far splats may be from the mesh that they show [share of the mesh's diagonal]."""
+FAR = 0.25
+FACING = 0.2
+"""Smallest cosine between a point's normal and that of the triangle it is carried to."""
 
 
 def lift_points(points: ShadingPoints, tracer: AbstractTracer) -> RayStarts:
     """Ray starts of shading points; carries no gradient."""
     mesh = tracer.mesh
     position, normal, wo = points.position_world.detach(), points.normal_world.detach(), points.wo_world.detach()
-    reach = TOLERANCE_OF_EXTENT * tracer.extent
     corners = mesh.vertices.detach()[mesh.faces.long()]
     face_normals = torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
 
     start, surface_normal = position + tracer.lift * normal, normal.clone()
     left = torch.arange(len(position), device=position.device)
-    for axis in (wo, normal):  # first along the viewing ray, then along the normal
-        away = axis[left]
+    for axis, share, facing in ((wo, NEAR, FACING), (normal, NEAR, FACING), (wo, FAR, -1.0)):
+        reach, away = share * tracer.extent, axis[left]
         hits = trace_rays(position[left] + reach * away, -away, tracer)
-        near = hits.hit & (hits.distance < 2 * reach)
         outward = face_normals[hits.face.clamp(min=0).long()]
+        near = hits.hit & (hits.distance < 2 * reach) & ((outward * normal[left]).sum(-1) > facing)
         near &= (outward * away).sum(-1) > 0  # the outside of the surface
         chosen = left[near]
         met = position[chosen] + (reach - hits.distance[near])[:, None] * away[near]

@@ -78,6 +78,9 @@ class Radiance:
     """Share of cosine-weighted sky that is open, 0..1."""
     samples: int
     """Rays a pixel behind the mean."""
+    diffuse_variance: Float[Tensor, "height width"] | None = None
+    """Of the mean diffuse luminance, from the scatter of samples; what the denoiser goes by."""
+    specular_variance: Float[Tensor, "height width"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,8 +58,8 @@ class PointLight:
 
     diffuse: Float[Tensor, "point 3"]
     specular: Float[Tensor, "point 3"]
-    variance: Float[Tensor, "point"]
-    """Of the luminance of this one estimate, from the scatter of its samples within each strategy."""
+    variance: Float[Tensor, "point 3"]
+    """Of the luminance of this one estimate, from the scatter of its samples within each strategy: whole, diffuse, specular."""
     visibility: Float[Tensor, "point"]
     """Open share of the cosine-weighted sky, 0..1."""
 
@@ -129,7 +129,7 @@ def sum_samples(
     # outputs
     diffuse_out: wp.array[wp.vec3],
     specular_out: wp.array[wp.vec3],
-    variance_out: wp.array[float],
+    variance_out: wp.array[wp.vec3],
     visibility_out: wp.array[float],
 ):
     i = wp.tid()
@@ -137,7 +137,7 @@ def sum_samples(
     diffuse_brdf = points.albedo[point] * ((1.0 - points.metallic[point]) / PI)
     diffuse_sum = wp.vec3(0.0, 0.0, 0.0)
     specular_sum = wp.vec3(0.0, 0.0, 0.0)
-    variance = wp.float32(0.0)
+    variance = wp.vec3(0.0, 0.0, 0.0)
     open_sum = wp.float32(0.0)
     all_sum = wp.float32(0.0)
     count = samples.cosine + samples.ggx + samples.environment
@@ -145,8 +145,8 @@ def sum_samples(
     slot = wp.int32(0)
     for strategy in range(3):
         size = split[strategy]
-        total = wp.float32(0.0)
-        total_squares = wp.float32(0.0)
+        total = wp.vec3(0.0, 0.0, 0.0)
+        total_squares = wp.vec3(0.0, 0.0, 0.0)
         for _ in range(size):
             ray = i * count + slot
             slot += 1
@@ -163,11 +163,12 @@ def sum_samples(
             s = wp.cw_mul(specular[ray], incoming)
             diffuse_sum += d
             specular_sum += s
-            y = luminance(d + s)
+            y = wp.vec3(luminance(d + s), luminance(d), luminance(s))
             total += y
-            total_squares += y * y
+            total_squares += wp.cw_mul(y, y)
         if size > 1:  # independent samples would scatter like this; stratified ones do better
-            variance += wp.max(total_squares - total * total / float(size), 0.0) * float(size) / float(size - 1)
+            scatter = total_squares - wp.cw_mul(total, total) / float(size)
+            variance += wp.max(scatter, wp.vec3(0.0, 0.0, 0.0)) * (float(size) / float(size - 1))
         else:
             variance += total_squares
     diffuse_out[point] = diffuse_sum
@@ -200,7 +201,7 @@ def shade(
     result = PointLight(
         torch.zeros(point_count, 3, device=device),
         torch.zeros(point_count, 3, device=device),
-        torch.zeros(point_count, device=device),
+        torch.zeros(point_count, 3, device=device),
         torch.zeros(point_count, device=device),
     )
     if point_count == 0 or counts.total == 0:
@@ -212,7 +213,7 @@ def shade(
     sums = [
         warp_array(result.diffuse, wp.vec3),
         warp_array(result.specular, wp.vec3),
-        warp_array(result.variance),
+        warp_array(result.variance, wp.vec3),
         warp_array(result.visibility),
     ]
     for kernel in (start_rays, scatter_hits, query_any):
