@@ -139,17 +139,19 @@ class Picture(AbstractPicture):
         self._state = state
         self._settings = settings
         self._passes_at_once = 1
+        self._samples_a_pass = _samples_a_pass(state)
+        self.notes = tuple(f"{skip.what} left out: {skip.why}" for skip in state.plan.skips)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        return self._state.passes * self._state.counts.total
+        return self._state.passes * self._samples_a_pass
 
     @property
     def samples_target(self) -> int:  # type: ignore[override]
         wanted = self._settings.spp_target if self._settings.channel == "final" else min(CHANNEL_SAMPLES, self._settings.spp_target)
         if self._settings.channel != "final" and self._state.fixed is not None:
             wanted = 1  # maps of Gaussians are exact from the first pass on
-        return max(wanted, self._state.counts.total)
+        return max(wanted, self._samples_a_pass)
 
     @property
     def gbuffer(self) -> "GBuffer | None":
@@ -167,7 +169,7 @@ class Picture(AbstractPicture):
 
         if self.samples >= self.samples_target:
             return
-        left = -(-(self.samples_target - self.samples) // self._state.counts.total)
+        left = -(-(self.samples_target - self.samples) // self._samples_a_pass)
         passes = min(self._passes_at_once, left)
         start = time.perf_counter()
         self._state = refine_frame(self._state, passes)
@@ -193,6 +195,12 @@ class Picture(AbstractPicture):
             roughness=float(maps.roughness[row, column]),
             metallic=float(maps.metallic[row, column]),
         )
+
+
+def _samples_a_pass(state: "FrameState") -> int:
+    from drgs.render.accumulate import samples_a_pass
+
+    return samples_a_pass(state.settings, state.fixed is None).total
 
 
 def _view_key(camera: CameraMessage, width: int, height: int) -> tuple:
@@ -237,6 +245,7 @@ def _render_settings(settings: Settings):
         samples_per_pixel=settings.spp_target,
         samples_per_pass=SAMPLES_PER_PASS,
         bounces=_rays_key(settings)[0],
+        denoise="svgf" if settings.denoise and settings.channel == "final" else "none",
         exposure=settings.exposure_stops,
         background=background,
     )

@@ -125,6 +125,8 @@ class Settings(_Message):
     bounces: Annotated[int, Field(ge=0, le=8)] = 1
     """Indirect bounces; 0 is direct light with shadows only."""
     channel: Channel = "final"
+    denoise: bool = True
+    """Filter what is left of the noise; the filter follows the measured variance, so it fades as samples add up."""
 
 
 class SettingsMessage(_Message):

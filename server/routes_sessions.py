@@ -71,6 +71,7 @@ class FrameQuery(BaseModel):
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
     background: Literal["environment", "transparent"] = "environment"
     channel: Literal["final", "albedo", "roughness", "metallic", "normal", "depth"] = "final"
+    denoise: bool = False
     world_from_camera: Annotated[str, Field(max_length=1000)] | None = None
     """16 numbers, rows, separated by commas: OpenGL camera-to-world. The start view when absent."""
     fov_y_degrees: Annotated[float, Field(gt=0.1, lt=175)] | None = None
@@ -101,6 +102,7 @@ async def read_frame(session_id: str, suffix: Literal["jpg", "png"], context: Co
         spp_target=query.spp,
         bounces=query.bounces,
         channel=query.channel,
+        denoise=query.denoise,
     )
     call = context.render_thread.call
     picture = await asyncio.wrap_future(call(lambda: posed.pose.begin(camera, settings, query.width, query.height, None)))

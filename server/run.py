@@ -8,7 +8,8 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import uvicorn
@@ -50,6 +51,8 @@ def serve(
             f"--host {host}: drgs serve listens on this machine only ({', '.join(LOOPBACK)}), since it has no TLS of its own; "
             "put a TLS proxy or an SSH tunnel in front of it"
         )
+    # torch's idle threads would otherwise spin, and server and worker share the cores; read when torch is first imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     directory = open_data_directory(data)
     app = create_app(ServerSettings(data=directory.root, host=host, port=port, capture_roots=capture_roots, device=device))
     # ws_per_message_deflate costs a third of the frame rate at 1080p and gains nothing on JPEG.
@@ -71,13 +74,28 @@ def serve(
     if worker:
         worker.start()
     try:
-        server.run()
+        with _quiet_signals():
+            server.run()
     except SystemExit as error:
         raise ValueError(f"port {port} of {host} cannot be used; is a server running there already? Pick another with --port") from error
     finally:
         if worker:
             worker.stop()
     return 0
+
+
+@contextmanager
+def _quiet_signals() -> Iterator[None]:
+    """uvicorn shuts down on SIGTERM and SIGINT and then raises them again, which would end this process before its worker."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, lambda _number, _frame: None) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _announce(port: int, host: str, token: str, open_browser: bool, ready: Callable[[str], None] | None) -> None:

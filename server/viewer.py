@@ -180,10 +180,7 @@ class Viewer:
                 progress.picture.refine()
         picture = progress.picture
         converged = picture.samples >= picture.samples_target and progress.scale == 1
-        seconds = self._clock() - start
-        self._rendered_seconds += seconds
-        if begun:
-            self._pace.measured(picture.width, picture.height, progress.scale, seconds)
+        self._rendered_seconds += self._clock() - start
         if not (begun or converged or self._worth_a_frame(progress)):
             return
         with self._lock:
@@ -192,6 +189,8 @@ class Viewer:
         if overtaken and not begun:
             return
         self._send(progress, moving and begun, converged and not overtaken)
+        if begun:
+            self._pace.measured(picture.width, picture.height, progress.scale, self._clock() - start)
 
     def _begin(self, inputs: _Inputs, moving: bool) -> _Progress:
         asked = inputs.camera

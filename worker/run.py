@@ -35,6 +35,7 @@ def run_worker(data: Path, device: str = "auto", parent_pid: int | None = None) 
     """
     directory = open_data_directory(data)
     worker_id, slot_lock = _claim_slot(directory)
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would otherwise spin beside the server's
     os.nice(10)  # the viewer comes first where both run on one machine
     engine = open_database(directory)
     migrate_queue(directory)

@@ -76,10 +76,10 @@ def test_websockets_of_strangers_and_other_origins_are_refused_before_they_open(
     assert not connects(service.client, session, {"Origin": "http://evil.example"})
     assert not connects(service.client, session, {"Host": "evil.example"})
     assert connects(service.client, session, {})
-    service.anonymous.post("/api/login", json={"token": service.token})
-    assert not connects(service.anonymous, session, {})
-    assert not connects(service.anonymous, session, {"Origin": "http://127.0.0.1:9999"})
-    assert connects(service.anonymous, session, {"Origin": OURS})
+    cookie = {"Cookie": service.anonymous.post("/api/login", json={"token": service.token}).headers["set-cookie"].split(";")[0]}
+    assert not connects(service.anonymous, session, cookie)
+    assert not connects(service.anonymous, session, {"Origin": "http://127.0.0.1:9999", **cookie})
+    assert connects(service.anonymous, session, {"Origin": OURS, **cookie})
 
 
 def test_answers_tell_browsers_to_be_careful(service: Service) -> None:

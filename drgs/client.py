@@ -1,0 +1,335 @@
+"""Drive a running server from Python: builds, assets, sessions, pictures (docs/protocol.md).
+
+    client = Client("http://127.0.0.1:8000/#token=...")       # the address that `drgs serve` prints
+    for job in client.watch(client.submit_build("captures/teapot", preset="fast")):
+        print(job.stage, f"{job.fraction:.0%}", job.psnr)
+    session = client.open_session(job.asset_id)
+    session.edit({"op": "environment", "file": "studio.exr", "rotation": 30})
+    Path("teapot.png").write_bytes(session.frame(width=800, height=600, spp=256))
+
+Speaks only HTTP and WebSocket; imports neither torch nor the renderer. Final states of a job: done, failed, cancelled; a job that
+the server does not know is an error, never done.
+"""
+
+import json
+import tempfile
+import time
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Literal, TypeVar
+from urllib.parse import urlsplit
+
+import httpx
+from pydantic import BaseModel, TypeAdapter
+from websockets.sync.client import ClientConnection, connect
+
+from drgs.scene.edits import Edit
+from server.messages import EditLog, FrameHeader, ServerHello, Settings, server_message, unpack_frame
+from server.rest_records import AssetInfo, AssetList, EnvironmentInfo, EnvironmentList, JobInfo, JobList, SessionInfo, SessionList
+
+Model = TypeVar("Model", bound=BaseModel)
+Preset = Literal["draft", "fast", "full"]
+
+FINAL_STATES = ("done", "failed", "cancelled")
+_edit = TypeAdapter(Edit)
+
+
+class ServerError(Exception):
+    """The server said no; the text is its sentence."""
+
+    def __init__(self, status: int, detail: str) -> None:
+        super().__init__(detail)
+        self.status = status
+
+
+class Client:
+    """Final. Use it as a context manager, or close it."""
+
+    def __init__(self, address: str = "http://127.0.0.1:8000", token: str | None = None, timeout_seconds: float = 60.0) -> None:
+        """
+        Args:
+            address: with or without `#token=...`.
+            token: instead of the address's.
+        """
+        parts = urlsplit(address)
+        token = token or parts.fragment.removeprefix("token=")
+        if not token:
+            raise ValueError("Client: no token; give the whole address that `drgs serve` printed, or token=")
+        self.address = f"{parts.scheme}://{parts.netloc}"
+        self._headers = {"Authorization": f"Bearer {token}"}
+        self._http = httpx.Client(base_url=self.address, headers=self._headers, timeout=timeout_seconds)
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._http.close()
+
+    # ---- jobs -------------------------------------------------------------------------------------------------------
+
+    def submit_build(
+        self, dataset: Path | str, preset: Preset = "fast", seed: int = 0, name: str | None = None, idempotency_key: str | None = None
+    ) -> JobInfo:
+        """Start a build.
+
+        Args:
+            dataset: `sample`, a folder or zip of this machine (uploaded), or `server:PATH`, a folder that the server may read.
+            idempotency_key: the same key gives the same job, however often this is called.
+        """
+        headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
+        if isinstance(dataset, str) and (dataset == "sample" or dataset.startswith("server:")):
+            body = {"dataset": dataset.removeprefix("server:"), "preset": preset, "seed": seed, "name": name}
+            return self._call("POST", "/api/jobs", JobInfo, json=body, headers=headers)
+        path = Path(dataset)
+        fields = {"preset": preset, "seed": str(seed), "name": name or path.stem}
+        with _as_zip(path) as file:
+            upload = {"file": (path.stem + ".zip", file, "application/zip")}
+            return self._call("POST", "/api/jobs", JobInfo, data=fields, files=upload, headers=headers)
+
+    def jobs(self, limit: int = 50, offset: int = 0) -> JobList:
+        return self._call("GET", "/api/jobs", JobList, params={"limit": limit, "offset": offset})
+
+    def job(self, job_id: str) -> JobInfo:
+        return self._call("GET", f"/api/jobs/{job_id}", JobInfo)
+
+    def cancel(self, job_id: str) -> JobInfo:
+        return self._call("POST", f"/api/jobs/{job_id}/cancel", JobInfo)
+
+    def retry(self, job_id: str) -> JobInfo:
+        return self._call("POST", f"/api/jobs/{job_id}/retry", JobInfo)
+
+    def resume(self, job_id: str) -> JobInfo:
+        return self._call("POST", f"/api/jobs/{job_id}/resume", JobInfo)
+
+    def preview(self, job_id: str) -> bytes:
+        """JPEG."""
+        return self._bytes(f"/api/jobs/{job_id}/preview.jpg")
+
+    def watch(self, job: JobInfo | str, interval_seconds: float = 0.5) -> Iterator[JobInfo]:
+        """The job each time something about it changed, the last time in its final state."""
+        job_id = job if isinstance(job, str) else job.id
+        last: JobInfo | None = None
+        while True:
+            found = self.job(job_id)
+            if found.state == "unknown":
+                raise ServerError(
+                    404, f"The queue does not know job {job_id}; it may have been lost before it was queued. Submit it again."
+                )
+            if found != last:
+                yield found
+            if found.state in FINAL_STATES:
+                return
+            last = found
+            time.sleep(interval_seconds)
+
+    # ---- assets and environments ------------------------------------------------------------------------------------
+
+    def assets(self, limit: int = 50, offset: int = 0) -> AssetList:
+        return self._call("GET", "/api/assets", AssetList, params={"limit": limit, "offset": offset})
+
+    def asset(self, asset_id: str) -> AssetInfo:
+        return self._call("GET", f"/api/assets/{asset_id}", AssetInfo)
+
+    def upload_asset(self, path: Path, name: str | None = None) -> AssetInfo:
+        """A zipped asset, or a mesh (GLB, PLY, OBJ)."""
+        return self._upload("/api/assets", path, name, AssetInfo)
+
+    def delete_asset(self, asset_id: str) -> None:
+        self._request("DELETE", f"/api/assets/{asset_id}")
+
+    def export(self, asset_id: str, format: Literal["ply", "ply3", "glb", "usd", "env", "zip"], out: Path) -> None:
+        """Write the asset to the file `out`, in another program's format."""
+        with self._http.stream("GET", f"/api/assets/{asset_id}/export", params={"format": format}, timeout=600) as response:
+            if response.is_error:
+                response.read()
+                raise _error(response)
+            with out.open("wb") as file:
+                for chunk in response.iter_bytes():
+                    file.write(chunk)
+
+    def environments(self) -> list[EnvironmentInfo]:
+        return self._call("GET", "/api/environments", EnvironmentList).environments
+
+    def upload_environment(self, path: Path, name: str | None = None) -> EnvironmentInfo:
+        """A lat-long EXR or Radiance HDR."""
+        return self._upload("/api/environments", path, name, EnvironmentInfo)
+
+    # ---- sessions ---------------------------------------------------------------------------------------------------
+
+    def open_session(self, asset_id: str) -> "RemoteSession":
+        return RemoteSession(self, self._call("POST", "/api/sessions", SessionInfo, json={"asset": asset_id}))
+
+    def session(self, session_id: str) -> "RemoteSession":
+        return RemoteSession(self, self._call("GET", f"/api/sessions/{session_id}", SessionInfo))
+
+    def sessions(self) -> list[SessionInfo]:
+        return self._call("GET", "/api/sessions", SessionList).sessions
+
+    # ---- how ---------------------------------------------------------------------------------------------------------
+
+    def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        response = self._http.request(method, path, **options)
+        if response.is_error:
+            raise _error(response)
+        return response
+
+    def _call(self, method: str, path: str, model: type[Model], **options: Any) -> Model:
+        return model.model_validate_json(self._request(method, path, **options).content)
+
+    def _bytes(self, path: str, **options: Any) -> bytes:
+        return self._request("GET", path, **options).content
+
+    def _upload(self, path: str, file: Path, name: str | None, model: type[Model]) -> Model:
+        with file.open("rb") as stream:
+            return self._call("POST", path, model, files={"file": (file.name, stream)}, data={"name": name} if name else {}, timeout=600)
+
+    def _connect(self, session_id: str) -> ClientConnection:
+        address = self.address.replace("http", "ws", 1) + f"/api/sessions/{session_id}/stream"
+        return connect(address, additional_headers=self._headers, compression=None, max_size=64 << 20)
+
+
+class RemoteSession:
+    """Final. One open asset: edits in order, pictures of any camera."""
+
+    def __init__(self, client: Client, info: SessionInfo) -> None:
+        self._client = client
+        self.id = info.id
+        self.asset_id = info.asset
+
+    def info(self) -> SessionInfo:
+        return self._client._call("GET", f"/api/sessions/{self.id}", SessionInfo)
+
+    def edit(self, edit: Edit | dict) -> EditLog:
+        """Append an edit (drgs.scene.edits, or the same as plain data)."""
+        values = _edit.dump_python(_edit.validate_python(edit), mode="json", exclude_none=True)
+        return self._client._call("POST", f"/api/sessions/{self.id}/edits", EditLog, json={"edit": values}, timeout=600)
+
+    def undo(self) -> EditLog:
+        return self._client._call("POST", f"/api/sessions/{self.id}/undo", EditLog, timeout=600)
+
+    def redo(self) -> EditLog:
+        return self._client._call("POST", f"/api/sessions/{self.id}/redo", EditLog, timeout=600)
+
+    def frame(
+        self,
+        width: int = 512,
+        height: int = 512,
+        spp: int = 128,
+        world_from_camera: list[list[float]] | None = None,
+        fov_y_degrees: float | None = None,
+        format: Literal["png", "jpg"] = "png",
+        **settings: Any,
+    ) -> bytes:
+        """One finished picture.
+
+        Args:
+            world_from_camera: 4x4 OpenGL camera-to-world; the start view when absent.
+            settings: exposure_stops, background, channel, bounces, denoise.
+        """
+        query: dict[str, Any] = {"width": width, "height": height, "spp": spp, **settings}
+        if world_from_camera is not None:
+            query["world_from_camera"] = ",".join(repr(float(value)) for row in world_from_camera for value in row)
+        if fov_y_degrees is not None:
+            query["fov_y_degrees"] = fov_y_degrees
+        return self._client._bytes(f"/api/sessions/{self.id}/frame.{format}", params=query, timeout=600)
+
+    def delete(self) -> None:
+        self._client._request("DELETE", f"/api/sessions/{self.id}")
+
+    @contextmanager
+    def stream(self, settings: Settings | None = None) -> Iterator["Stream"]:
+        """A live connection; frames come as the server has them."""
+        with self._client._connect(self.id) as socket:
+            stream = Stream(socket)
+            if settings is not None:
+                stream.send(type="settings", settings=settings.model_dump())
+            yield stream
+
+
+class Stream:
+    """Final. A viewer without a screen: say where to look, take frames as they come."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+        self._camera_number = 0
+        self.messages: list[BaseModel] = []
+        """Everything but frames that the server said, in order."""
+        self.send(type="hello", v=1, client="drgs.client")
+        while not self.messages or not isinstance(self.messages[-1], ServerHello):
+            self.receive(timeout_seconds=120)
+        self.hello: ServerHello = self.messages[-1]
+
+    def send(self, **message: Any) -> None:
+        self._socket.send(json.dumps(message))
+
+    def look(self, width: int, height: int, world_from_camera: Any = None, fov_y_degrees: float | None = None) -> None:
+        """Move the camera; the start view where nothing else is said."""
+        start = self.hello.start_view
+        self._camera_number += 1
+        self.send(
+            type="camera",
+            number=self._camera_number,
+            world_from_camera=world_from_camera or start.world_from_camera,
+            fov_y_degrees=fov_y_degrees or start.fov_y_degrees,
+            width=width,
+            height=height,
+        )
+
+    def receive(self, timeout_seconds: float | None = None) -> tuple[FrameHeader, bytes] | None:
+        """The next frame, acknowledged; or None after a text message, which is kept in `messages`.
+
+        Raises:
+            TimeoutError: nothing came.
+            ServerError: something the client did, or that the server could not do.
+        """
+        received = self._socket.recv(timeout=timeout_seconds)
+        if isinstance(received, str):
+            message = server_message.validate_json(received)
+            if message.type == "error":
+                raise ServerError(400, message.message)
+            self.messages.append(message)
+            return None
+        header, picture = unpack_frame(received)
+        self.send(type="ack", frame_id=header.frame_id)
+        return header, picture
+
+    def frames(self, timeout_seconds: float | None = 60) -> Iterator[tuple[FrameHeader, bytes]]:
+        """Frames until the converged one, and with it."""
+        while True:
+            frame = self.receive(timeout_seconds)
+            if frame is not None:
+                yield frame
+                if frame[0].flags & 2:
+                    return
+
+
+def _error(response: httpx.Response) -> ServerError:
+    try:
+        detail = response.json()["detail"]
+    except (ValueError, KeyError, TypeError):
+        detail = response.text[:200] or response.reason_phrase
+    return ServerError(response.status_code, str(detail))
+
+
+@contextmanager
+def _as_zip(path: Path) -> Iterator[IO[bytes]]:
+    """The file itself, or a temporary zip of the folder (stored: pictures do not get smaller)."""
+    if path.is_file():
+        with path.open("rb") as file:
+            yield file
+        return
+    if not path.is_dir():
+        raise ValueError(f"{path}: expected the folder or zip of a capture")
+    with tempfile.TemporaryFile() as file:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            for entry in sorted(path.rglob("*")):
+                if entry.is_file():
+                    archive.write(entry, entry.relative_to(path))
+        file.seek(0)
+        yield file
