@@ -36,7 +36,7 @@ export const light = computed(() => lightOf(edits.value));
 /** Mean of the mesh's captured materials; null until the mesh is here. */
 export const captured = signal<MaterialMean | null>(null);
 
-export const settings = signal<Required<Settings>>({ exposure_stops: 0, background: 'environment', spp_target: 256, bounces: 1, channel: 'final' });
+export const settings = signal<Required<Settings>>({ exposure_stops: 0, background: 'environment', spp_target: 256, bounces: 1, channel: 'final', denoise: true });
 
 export interface Notice {
   id: number;

@@ -27,8 +27,8 @@ const AIMED_FRAME_MS = 25;
 const QUICK_FRAME_MS = 17.5;
 const FRAMES_BEFORE_STEP = 4;
 const PIXEL_BUDGET = { low: 200_000, medium: 500_000, full: MAX_PIXELS };
-/** A fresh picture with fewer samples a pixel than this is too noisy to replace the local one. */
-const SHOW_FROM_SAMPLES = 16;
+/** A fresh picture with fewer samples a pixel than this is too noisy to replace the local one: denoised, and as it is. */
+const SHOW_FROM_SAMPLES = { denoised: 4, raw: 16 };
 
 export class Viewport {
   private readonly camera = new PerspectiveCamera(40, 1, 0.01, 100);
@@ -146,7 +146,7 @@ export class Viewport {
       header.stateRev >= log.value.revision &&
       pending.value.length === 0 &&
       (header.frameId > this.staleUpTo || (header.flags & FLAG_CONVERGED) !== 0);
-    const enough = header.spp >= Math.min(SHOW_FROM_SAMPLES, header.sppTarget) && !(header.flags & FLAG_MOVING);
+    const enough = header.spp >= Math.min(settings.value.denoise ? SHOW_FROM_SAMPLES.denoised : SHOW_FROM_SAMPLES.raw, header.sppTarget) && !(header.flags & FLAG_MOVING);
     if (this.tracedCanvas.width !== header.width || this.tracedCanvas.height !== header.height) {
       this.tracedCanvas.width = header.width;
       this.tracedCanvas.height = header.height;
@@ -180,7 +180,7 @@ export class Viewport {
   private followState(): void {
     let before: unknown[] = [];
     effect(() => {
-      const now = [edits.value, settings.value.exposure_stops, settings.value.background, settings.value.channel];
+      const now = [edits.value, settings.value.exposure_stops, settings.value.background, settings.value.channel, settings.value.denoise];
       if (now.some((value, i) => value !== before[i])) {
         if (now.slice(1).some((value, i) => value !== before[i + 1])) this.staleUpTo = this.newestFrame + 3;
         before = now;

@@ -135,7 +135,7 @@ const CHANNELS: { value: NonNullable<Settings['channel']>; text: string }[] = [
 ];
 
 function View() {
-  const { channel, spp_target, bounces } = settings.value;
+  const { channel, spp_target, bounces, denoise } = settings.value;
   return (
     <Section title="View">
       <Choice label="Channel" value={channel} options={CHANNELS} onChange={(value) => changeSettings({ channel: value })} />
@@ -156,6 +156,7 @@ function View() {
         onChange={(value) => changeSettings({ spp_target: Number(value) })}
       />
       <Choice label="Indirect bounces" value={String(bounces)} options={['0', '1', '2', '4'].map((value) => ({ value, text: value }))} onChange={(value) => changeSettings({ bounces: Number(value) })} />
+      <Switch label="Denoise" title="Filter what is left of the noise; fades as samples add up" value={denoise} onChange={(value) => changeSettings({ denoise: value })} />
       <Switch label="Instant local picture" title={titleFor('local', 'Draw the mesh in the browser while the traced picture is on its way')} value={localPicture.value} onChange={(value) => (localPicture.value = value)} />
     </Section>
   );
