@@ -53,7 +53,9 @@ class Pull:
         self.seen += (norm > 0).float()
 
 
-def densify(optimizer, parameters: dict[str, Tensor], pull: Pull, settings: DensifySettings, radius: float, generator: torch.Generator) -> Pull:
+def densify(
+    optimizer, parameters: dict[str, Tensor], pull: Pull, settings: DensifySettings, radius: float, generator: torch.Generator
+) -> Pull:
     """One round; returns the emptied statistics."""
     with torch.no_grad():
         opacity = torch.sigmoid(parameters["opacity_logits"])

@@ -151,7 +151,9 @@ def scaled_camera(camera: Camera, factor: float) -> Camera:
 
 
 @dataclass(frozen=True, eq=False)
-class _Target:
+class ViewTarget:
+    """A photo as the losses want it."""
+
     camera: Camera
     photo: Tensor
     """(height, width, 3) sRGB times mask."""
@@ -163,7 +165,8 @@ class _Target:
     """Box around the mask: outside it only coverage is compared."""
 
 
-def _targets(views: Views, factor: float, device: torch.device) -> list[_Target]:
+def view_targets(views: Views, factor: float, device: torch.device) -> list[ViewTarget]:
+    """Photos at `factor` times their size, premultiplied by their masks."""
     targets = []
     for camera, image, mask in zip(views.cameras, views.images_srgb, views.coverage, strict=True):
         photo, alpha = image.float() / 255, mask.float() / 255
@@ -176,11 +179,14 @@ def _targets(views: Views, factor: float, device: torch.device) -> list[_Target]
             premultiplied = photo * alpha[..., None]
         rows, columns = (alpha > 0).any(1).nonzero().flatten(), (alpha > 0).any(0).nonzero().flatten()
         margin = 8
-        box = [
-            slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else slice(0, 1) for x in (rows, columns)
-        ]
-        targets.append(_Target(small.to(device), *(x.contiguous().to(device) for x in (premultiplied, photo, alpha)), *box))
+        box = [slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else slice(0, 1) for x in (rows, columns)]
+        targets.append(ViewTarget(small.to(device), *(x.contiguous().to(device) for x in (premultiplied, photo, alpha)), *box))
     return targets
+
+
+def pick_box(target: ViewTarget) -> tuple[slice, slice]:
+    """Rows and columns of the target's box."""
+    return target.rows, target.columns
 
 
 def fit_gaussians(
@@ -200,7 +206,7 @@ def fit_gaussians(
     device = state.parameters["centers"].device
     total = settings.iterations
     half_until = int(settings.half_size_share * total)
-    targets = _targets(views, 0.5 if state.iteration < half_until else 1.0, device)
+    targets = view_targets(views, 0.5 if state.iteration < half_until else 1.0, device)
     parameters, optimizer = state.parameters, state.optimizer
     near = 0.01 * radius
     recent: list[float] = []
@@ -210,7 +216,7 @@ def fit_gaussians(
         if should_stop is not None and should_stop():
             break
         if state.iteration == half_until:
-            targets = _targets(views, 1.0, device)
+            targets = view_targets(views, 1.0, device)
         progress = state.iteration / total
         _set_rates(optimizer, settings.rates, radius, progress)
         if not order:
@@ -220,7 +226,7 @@ def fit_gaussians(
         degree = min(settings.sh_degree, max(0, int((progress - settings.sh_start) * 10) + 1) if progress >= settings.sh_start else 0)
         tables = filter_environment(environment_table(parameters))
         maps = render_stage_one(parameters, tables, target.camera, near, degree)
-        box = (target.rows, target.columns)
+        box = pick_box(target)
         image = display_image(maps.radiance_linear[box], maps.coverage[box], target.saturation[box])
         photo = target.photo[box]
         weight = settings.weight_dissimilarity

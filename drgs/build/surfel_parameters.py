@@ -33,7 +33,17 @@ class LearningRates:
     environment: float = 0.03
 
 
-SURFEL_GROUPS = ("centers", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest", "albedo_logits", "roughness_logits", "metallic_logits")
+SURFEL_GROUPS = (
+    "centers",
+    "log_scales",
+    "quats",
+    "opacity_logits",
+    "sh_dc",
+    "sh_rest",
+    "albedo_logits",
+    "roughness_logits",
+    "metallic_logits",
+)
 
 
 def logit(p: float) -> float:
