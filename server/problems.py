@@ -15,9 +15,10 @@ class ProblemError(Exception):
     """Ends a request with this status and sentence."""
 
     def __init__(self, status: int, detail: str) -> None:
-        super().__init__(detail)
+        # The library's own sentences come without a full stop, as texts of exceptions do.
+        self.detail = detail if detail.endswith((".", "?", "!")) else detail + "."
         self.status = status
-        self.detail = detail
+        super().__init__(self.detail)
 
 
 def problem_response(status: int, detail: str, headers: dict[str, str] | None = None) -> JSONResponse:

@@ -1,0 +1,54 @@
+"""The size of moving pictures follows the machine and cannot spiral down."""
+
+from itertools import pairwise
+
+from server.pace import Pace
+
+WIDTH, HEIGHT = 960, 720
+
+
+def measure(pace: Pace, seconds_at_full_size: float, fixed_seconds: float = 0.0) -> float:
+    """One moving picture on a machine with this cost; returns its scale."""
+    scale = pace.scale(WIDTH, HEIGHT)
+    pace.measured(int(WIDTH * scale), int(HEIGHT * scale), scale, fixed_seconds + seconds_at_full_size * scale**2)
+    return scale
+
+
+def test_a_fast_machine_always_sends_full_size() -> None:
+    pace = Pace()
+    assert {measure(pace, 0.01) for _ in range(20)} == {1.0}
+
+
+def test_a_slow_machine_goes_to_half_and_no_further() -> None:
+    pace = Pace()
+    scales = [measure(pace, 5.0) for _ in range(20)]
+    assert scales[0] == 1.0 and set(scales[1:]) == {0.5}
+
+
+def test_a_fixed_cost_a_picture_does_not_pull_the_size_down() -> None:
+    pace = Pace()
+    scales = [measure(pace, 0.06, fixed_seconds=0.02) for _ in range(50)]
+    # 80 ms at full size is within the target; a controller that trusted small pictures would end at half.
+    assert scales[-1] == 1.0
+
+
+def test_the_size_recovers_when_the_machine_does() -> None:
+    pace = Pace()
+    for _ in range(5):
+        measure(pace, 1.0)
+    assert measure(pace, 1.0) == 0.5
+    assert [measure(pace, 0.02) for _ in range(10)][-1] == 1.0
+
+
+def test_the_size_does_not_flicker_at_a_limit() -> None:
+    pace = Pace()
+    scales = [measure(pace, 1 / 12 + (0.001 if k % 2 else -0.001)) for k in range(60)]
+    assert sum(a != b for a, b in pairwise(scales[5:])) <= 1
+
+
+def test_small_pictures_are_not_reduced() -> None:
+    pace = Pace()
+    for _ in range(3):
+        pace.measured(300, 200, 1.0, 3.0)
+    assert pace.scale(300, 200) == 1.0
+    assert pace.scale(640, 480) == 0.5

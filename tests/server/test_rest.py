@@ -1,0 +1,156 @@
+"""REST: jobs and uploads as answers, without a worker; every refusal is a problem document with a sentence."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from conftest import Service
+
+from worker.asset_folder import count_asset_folder
+
+
+def zipped(entries: dict[str, bytes]) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, data in entries.items():
+            archive.writestr(name, data)
+    return stream.getvalue()
+
+
+def submit(service: Service, data: bytes, name: str = "teapot.zip", **fields: str):
+    return service.client.post("/api/jobs", files={"file": (name, data)}, data=fields)
+
+
+def is_problem(response, status: int) -> str:
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    document = response.json()
+    assert set(document) == {"type", "title", "status", "detail"} and document["status"] == status
+    assert document["detail"].endswith((".", "?")) and " " in document["detail"]
+    return document["detail"]
+
+
+def left_on_disk(service: Service) -> list[Path]:
+    return list(service.context.directory.uploads.iterdir())
+
+
+def test_an_uploaded_capture_becomes_a_queued_job(service: Service) -> None:
+    response = submit(service, zipped({"teapot/transforms.json": b"{}"}), preset="draft", seed="7")
+    assert response.status_code == 202
+    job = response.json()
+    assert (job["state"], job["name"], job["preset"], job["attempts"], job["asset_id"]) == ("queued", "teapot", "draft", 0, None)
+    assert (service.context.directory.uploads / job["id"] / "teapot" / "transforms.json").is_file()
+    listed = service.client.get("/api/jobs").json()
+    assert listed["total"] == 1 and listed["jobs"] == [job] and listed["workers_alive"] == 0
+    assert service.client.get(f"/api/jobs/{job['id']}").json() == job
+    is_problem(service.client.get(f"/api/jobs/{job['id']}/preview.jpg"), 404)
+    assert service.client.post(f"/api/jobs/{job['id']}/cancel").json()["state"] == "cancelled"
+    assert "cancelled" in is_problem(service.client.post(f"/api/jobs/{job['id']}/resume"), 409)
+    assert service.client.post(f"/api/jobs/{job['id']}/retry").json()["state"] == "queued"
+
+
+def test_the_same_idempotency_key_gives_the_same_job(service: Service) -> None:
+    body = zipped({"transforms.json": b"{}"})
+    first, second = (
+        service.client.post("/api/jobs", files={"file": ("a.zip", body)}, headers={"Idempotency-Key": "k1"}).json()["id"] for _ in range(2)
+    )
+    assert first == second and service.client.get("/api/jobs").json()["total"] == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "fields", "words"),
+    [
+        ("a.tar", b"x", {}, "ends in .zip"),
+        ("a.zip", b"not a zip", {}, "damaged"),
+        ("a.zip", zipped({"../../evil": b"1"}), {}, "does not name a place"),
+        ("a.zip", zipped({"a": b"1"}), {"preset": "ultra"}, "preset"),
+        ("a.zip", zipped({"a": b"1"}), {"seed": "-3"}, "seed"),
+    ],
+)
+def test_wrong_uploads_are_refused_and_leave_nothing(service: Service, name: str, data: bytes, fields: dict, words: str) -> None:
+    assert words in is_problem(submit(service, data, name, **fields), 422)
+    assert left_on_disk(service) == [] and service.client.get("/api/jobs").json()["total"] == 0
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"dataset": 3}', b'{"dataset": "sample", "shell": "rm"}', b"\xff"])
+def test_wrong_bodies_are_refused(service: Service, body: bytes) -> None:
+    is_problem(service.client.post("/api/jobs", content=body, headers={"content-type": "application/json"}), 422)
+
+
+def test_a_folder_below_an_allowed_root_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "captures" / "mug").mkdir(parents=True)
+    (tmp_path / "captures" / "way-out").symlink_to(tmp_path)
+    service = Service(tmp_path, capture_roots=(tmp_path / "captures",))
+    with service.client:
+        assert service.client.post("/api/jobs", json={"dataset": str(tmp_path / "captures/mug")}).json()["name"] == "mug"
+        is_problem(service.client.post("/api/jobs", json={"dataset": str(tmp_path / "captures/way-out")}), 403)
+        is_problem(service.client.post("/api/jobs", json={"dataset": str(tmp_path / "captures/none")}), 404)
+
+
+def test_an_asset_is_listed_read_and_deleted(service: Service) -> None:
+    asset = service.add_asset()
+    assert service.client.get("/api/assets").json()["assets"][0]["id"] == asset
+    assert service.client.get(f"/api/assets/{asset}").json()["has_thumbnail"] is False
+    response = service.client.get(f"/api/assets/{asset}/mesh.glb")
+    assert response.content == b"glTF" and response.headers["content-type"] == "model/gltf-binary"
+    assert service.client.get(f"/api/assets/{asset}/mesh.glb", headers={"Range": "bytes=1-2"}).content == b"lT"
+    is_problem(service.client.get(f"/api/assets/{asset}/thumb.jpg"), 404)
+    session = service.client.post("/api/sessions", json={"asset": asset}).json()["id"]
+    assert service.client.delete(f"/api/assets/{asset}").status_code == 204
+    is_problem(service.client.get(f"/api/assets/{asset}"), 404)
+    is_problem(service.client.get(f"/api/sessions/{session}"), 404)
+    assert not service.context.directory.asset(asset).exists()
+    is_problem(service.client.post("/api/sessions", json={"asset": asset}), 404)
+
+
+def exr(height: int, width: int) -> bytes:
+    stream = io.BytesIO()
+    channels = {key: np.full((height, width), 0.5, np.float32) for key in "RGB"}
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(stream)
+    return stream.getvalue()
+
+
+def test_an_environment_is_uploaded_listed_and_shown(service: Service) -> None:
+    for wanted in ("my-sky.exr", "my-sky-2.exr"):
+        response = service.client.post("/api/environments", files={"file": ("../../My sky.exr", exr(8, 16))}, data={"name": "my sky"})
+        assert response.status_code == 201, response.text
+        assert response.json() == {"name": wanted, "title": wanted[:-4].replace("-", " ").capitalize(), "width": 16, "height": 8}
+    assert [found["name"] for found in service.client.get("/api/environments").json()["environments"]] == ["my-sky-2.exr", "my-sky.exr"]
+    assert service.client.get("/api/environments/my-sky.exr/thumb.jpg").content.startswith(b"\xff\xd8")
+    assert service.client.get("/api/environments/my-sky.exr").content[:4] == b"\x76\x2f\x31\x01"
+
+
+def test_a_wrong_environment_is_refused_by_name(service: Service) -> None:
+    sentence = is_problem(service.client.post("/api/environments", files={"file": ("sky.exr", exr(8, 8))}), 422)
+    assert "twice as wide" in sentence and str(service.context.directory.root) not in sentence
+    is_problem(service.client.post("/api/environments", files={"file": ("sky.exr", b"\x80\x04pickle")}), 422)
+    assert left_on_disk(service) == [] and service.client.get("/api/environments").json() == {"environments": []}
+
+
+def test_a_wrong_asset_is_refused(service: Service) -> None:
+    sentence = is_problem(service.client.post("/api/assets", files={"file": ("a.obj", b"v 0 0 nan\nf 1 1 1\n")}), 422)
+    assert str(service.context.directory.root) not in sentence
+    is_problem(service.client.post("/api/assets", files={"file": ("a.zip", zipped({"asset.json": json.dumps({"a": 1}).encode()}))}), 422)
+    assert left_on_disk(service) == [] and service.client.get("/api/assets").json()["total"] == 0
+
+
+def test_a_folder_without_counts_is_no_asset(tmp_path: Path) -> None:
+    (tmp_path / "asset.json").write_text("[]")
+    with pytest.raises(ValueError, match="counts"):
+        count_asset_folder(tmp_path)
+
+
+@pytest.mark.parametrize("query", ["limit=0", "limit=100000", "offset=-1", "limit=x"])
+def test_pages_have_bounds(service: Service, query: str) -> None:
+    is_problem(service.client.get(f"/api/jobs?{query}"), 422)
+
+
+def test_unknown_calls_and_methods_are_problems(service: Service) -> None:
+    is_problem(service.client.get("/api/none"), 404)
+    is_problem(service.client.put("/api/jobs"), 405)
+    assert "/api/jobs" in service.client.get("/api/docs").text
+    assert "/api/sessions/{session_id}/edits" in service.client.get("/api/openapi.json").json()["paths"]
