@@ -37,7 +37,7 @@ def test_the_token_leaves_the_address_bar_and_a_chosen_mesh_opens(viewer: Viewer
     expect(viewer.page.get_by_text("No asset is open")).to_be_visible()
     assert "token" not in viewer.page.url
     viewer.page.get_by_label("Capture or mesh").set_input_files(ball_file)
-    expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=40_000)
+    expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=120_000)
     color = viewer.settled_color()
     assert color[0] > 1.5 * color[2], "the ball's red side faces the first camera"
     assert "asset=" in viewer.page.url
