@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -236,7 +236,7 @@ def _camera(message: CameraMessage, width: int, height: int):
 def _render_settings(settings: Settings):
     from drgs.render.accumulate import RenderSettings
 
-    background = settings.background
+    background: Any = settings.background
     if settings.channel != "final":
         background = "transparent"
     elif isinstance(background, tuple):

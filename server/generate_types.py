@@ -8,11 +8,15 @@ with defaults are optional), answers as they are serialised (every field is ther
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, Literal
 
+from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from drgs.scene.edits import Edit
 from server import messages, rest_records
+
+Mode = Literal["validation", "serialization"]
 
 OUTPUT = Path(__file__).resolve().parent.parent / "web" / "src" / "protocol.gen.ts"
 
@@ -31,8 +35,13 @@ _CONSTANTS = (
     "CAMERA_NUMBER_SHIFT",
 )
 
-_REQUESTS = (rest_records.BuildRequest, rest_records.SessionRequest, rest_records.EditRequest, rest_records.TokenRequest)
-_ANSWERS = (
+_REQUESTS: tuple[type[BaseModel], ...] = (
+    rest_records.BuildRequest,
+    rest_records.SessionRequest,
+    rest_records.EditRequest,
+    rest_records.TokenRequest,
+)
+_ANSWERS: tuple[type[BaseModel], ...] = (
     rest_records.JobInfo,
     rest_records.JobList,
     rest_records.AssetInfo,
@@ -136,7 +145,7 @@ def _interface(name: str, schema: dict) -> str:
 
 def typescript_text() -> str:
     """The whole of protocol.gen.ts."""
-    pairs = [(model, "validation") for model in (*_REQUESTS, *_union_models(messages.ClientMessage))]
+    pairs: list[tuple[type[BaseModel], Mode]] = [(model, "validation") for model in (*_REQUESTS, *_union_models(messages.ClientMessage))]
     pairs += [(model, "serialization") for model in (*_ANSWERS, *_union_models(messages.ServerMessage))]
     names, document = models_json_schema(pairs, ref_template="#/$defs/{model}")
     wanted = {key: node["$ref"].rsplit("/", 1)[1] for key, node in names.items()}
@@ -152,19 +161,20 @@ def typescript_text() -> str:
             text += _interface(_plain_name(name), _renamed(node)) + "\n"
         else:
             text += f"export type {_plain_name(name)} = {typescript_from_schema(_renamed(node))};\n\n"
-    for union, mode, models in (
+    unions: tuple[tuple[str, Mode, tuple[type[BaseModel], ...]], ...] = (
         ("ClientMessage", "validation", _union_models(messages.ClientMessage)),
         ("ServerMessage", "serialization", _union_models(messages.ServerMessage)),
-    ):
+    )
+    for union, mode, models in unions:
         text += f"export type {union} =\n  | " + "\n  | ".join(_plain_name(wanted[model, mode]) for model in models) + ";\n\n"
     edits = _union_models(Edit)
-    union = " | ".join(model.__name__ for model in edits)
-    text = text.replace(f"({union})[]", "Edit[]").replace(union, "Edit")
+    spelled = " | ".join(model.__name__ for model in edits)
+    text = text.replace(f"({spelled})[]", "Edit[]").replace(spelled, "Edit")
     text += "export type Edit =\n  | " + "\n  | ".join(model.__name__ for model in edits) + ";\n"
     return text
 
 
-def _union_models(annotated: object) -> tuple[type, ...]:
+def _union_models(annotated: object) -> tuple[type[BaseModel], ...]:
     """The models of Annotated[A | B | ..., Field(discriminator)]."""
     return annotated.__origin__.__args__  # type: ignore[attr-defined]
 
@@ -174,7 +184,7 @@ def _plain_name(name: str) -> str:
     return name.replace("-Input", "Input").replace("-Output", "")
 
 
-def _renamed(node: object) -> object:
+def _renamed(node: Any) -> Any:
     if isinstance(node, dict):
         return {key: _plain_ref(value) if key == "$ref" else _renamed(value) for key, value in node.items()}
     if isinstance(node, list):

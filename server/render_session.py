@@ -104,4 +104,4 @@ class AbstractRenderer(ABC):
 def view_of_bounds(bounds: Bounds) -> StartView:
     """The camera of `worker.start_view` as a message."""
     matrix = start_view(bounds.minimum, bounds.maximum).tolist()
-    return StartView(world_from_camera=tuple(tuple(row) for row in matrix), fov_y_degrees=FOV_Y_DEGREES)
+    return StartView.model_validate({"world_from_camera": matrix, "fov_y_degrees": FOV_Y_DEGREES})

@@ -79,7 +79,8 @@ async def start_job(request: Request, context: Context, idempotency_key: Idempot
         await run_in_threadpool(context.queue.submit, row)
     except IntegrityError:  # the same key, a moment earlier
         shutil.rmtree(context.directory.uploads / job_id, ignore_errors=True)
-        job_id = await run_in_threadpool(_job_of_key, context, idempotency_key) or job_id
+        known = await run_in_threadpool(_job_of_key, context, idempotency_key)
+        job_id = known or job_id
     return await run_in_threadpool(_read_job, context, job_id)
 
 

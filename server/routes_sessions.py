@@ -87,12 +87,14 @@ async def read_frame(session_id: str, suffix: Literal["jpg", "png"], context: Co
     assert session.loaded is not None
     start = session.loaded.start_view
     try:
-        camera = CameraMessage(
-            type="camera",
-            world_from_camera=_matrix(query.world_from_camera) if query.world_from_camera else start.world_from_camera,
-            fov_y_degrees=query.fov_y_degrees or start.fov_y_degrees,
-            width=query.width,
-            height=query.height,
+        camera = CameraMessage.model_validate(
+            {
+                "type": "camera",
+                "world_from_camera": _matrix(query.world_from_camera) if query.world_from_camera else start.world_from_camera,
+                "fov_y_degrees": query.fov_y_degrees or start.fov_y_degrees,
+                "width": query.width,
+                "height": query.height,
+            }
         )
     except ValidationError as error:
         raise ProblemError(422, f"{error.errors()[0]['msg']}.") from error

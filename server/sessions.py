@@ -10,6 +10,7 @@ import uuid
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from sqlalchemy import Engine, delete, select
 from sqlalchemy.orm import Session as DatabaseSession
@@ -25,6 +26,8 @@ from server.settings import Limits
 from server.viewer import Posed, Viewer
 from worker.data_directory import DataDirectory
 from worker.database import AssetRow, SessionEventRow, SessionRow, now
+
+Result = TypeVar("Result")
 
 COALESCE_SECONDS = 0.5
 """Edits with the same key, closer together than this, are one step of undo."""
@@ -171,11 +174,10 @@ class SessionRegistry:
         if session.posed is not None:
             return session.posed
         async with self._loading:
-            loaded = self._loaded.get(session.asset_id)
-            if loaded is None:
+            if session.asset_id not in self._loaded:
                 folder, environments = self._directory.asset(session.asset_id), self._directory.environments
-                loaded = await self._call(lambda: self._renderer.load(folder, environments))
-                self._loaded[session.asset_id] = loaded
+                self._loaded[session.asset_id] = await self._call(lambda: self._renderer.load(folder, environments))
+            loaded = self._loaded[session.asset_id]
             self._loaded.move_to_end(session.asset_id)
             self._unload_some()
         edits = session.log.done
@@ -191,7 +193,7 @@ class SessionRegistry:
                     if session.asset_id == asset_id:
                         session.loaded = session.posed = None
 
-    async def _call(self, function: Callable) -> object:
+    async def _call(self, function: Callable[[], Result]) -> Result:
         try:
             return await asyncio.wrap_future(self._thread.call(function))
         except ValueError as error:

@@ -6,7 +6,7 @@ keep checkpoints in `OUT.build/` so that a second call goes on, and raise BuildS
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 
@@ -68,7 +68,11 @@ def build_with_drgs(request: BuildRequest, progress: Callable[[BuildProgress], N
     from drgs.build import build_asset as build
 
     settings = build.BuildSettings(preset=request.preset, seed=request.seed, device=request.device, resume=True)
+
+    def report(made: build.Progress) -> None:
+        progress(BuildProgress(**{entry.name: getattr(made, entry.name) for entry in fields(BuildProgress)}))
+
     try:
-        build.build_asset(request.dataset, request.out, settings, progress=progress, should_stop=should_stop)
+        build.build_asset(request.dataset, request.out, settings, progress=report, should_stop=should_stop)
     except build.BuildStopped as stopped:
         raise BuildStopped from stopped

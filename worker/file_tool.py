@@ -11,7 +11,7 @@ import asyncio
 import resource
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from worker.start_view import FOV_Y_DEGREES, start_view
 
@@ -88,7 +88,7 @@ def make_environment(source: Path, out: Path) -> None:
     out.write_bytes(encode_environment(decode_environment(source.read_bytes(), source.name)))
 
 
-def export(asset_folder: Path, out: Path, format: str) -> None:
+def export(asset_folder: Path, out: Path, format: Any) -> None:
     from drgs.scene.asset import load_asset
 
     asset = load_asset(asset_folder)

@@ -101,7 +101,7 @@ class JobQueue:
             state = _STATES.get(row.status, "unknown") if row else "unknown"
             if row and state == "running" and row.executor_id in dead:
                 state = "stalled"
-            answer[job_id] = JobStatus(state, bool(row) and row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
+            answer[job_id] = JobStatus(state, row is not None and row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
         return answer
 
     def cancel(self, job_id: str) -> None:
@@ -193,4 +193,4 @@ def refuse_pickled_rows() -> None:
     def refuse(self: DefaultSerializer, serialized_data: str) -> object:
         raise ValueError("the jobs database holds a pickled value; drgs writes none, so somebody else did")
 
-    DefaultSerializer.deserialize = refuse  # type: ignore[method-assign]
+    DefaultSerializer.deserialize = refuse  # type: ignore[assignment,method-assign]

@@ -57,7 +57,6 @@ def run_worker(data: Path, device: str = "auto", parent_pid: int | None = None) 
             "executor_id": worker_id,
             "run_migrations": False,
             "serializer": DBOSPortableJSONSerializer(),
-            "run_admin_server": False,
             "log_level": "WARNING",
         }
     )

@@ -1,5 +1,7 @@
 """Where to look from at first: the camera of thumbnails and of new viewers."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 FOV_Y_DEGREES = 40.0
@@ -7,7 +9,7 @@ FILL = 0.92
 """Distance as a share of that at which the bounding box's sphere fits the picture; objects rarely fill their box."""
 
 
-def start_view(minimum: tuple[float, float, float], maximum: tuple[float, float, float]) -> np.ndarray:
+def start_view(minimum: Sequence[float], maximum: Sequence[float]) -> np.ndarray:
     """(4, 4) OpenGL camera-to-world, from the front right (+x -y) and a little above, with the whole box in sight [world units]."""
     center = np.add(minimum, maximum) / 2
     radius = max(float(np.linalg.norm(np.subtract(maximum, minimum))) / 2, 1e-6)
