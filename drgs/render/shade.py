@@ -9,6 +9,7 @@ Source: Veach 1995 (balance heuristic). Twin: drgs/reference/shade.py.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from drgs.maths.brdf import MIN_ROUGHNESS
 from drgs.render.brdf_warp import PI, alpha_of, specular_brdf
 from drgs.render.environment_table import EnvironmentLight, lookup_radiance, table_place
 from drgs.render.records import ShadingPoints
@@ -64,6 +66,12 @@ class PointLight:
     """Open share of the cosine-weighted sky, 0..1."""
 
 
+def _source_of_start_rays() -> str:
+    folder = Path(__file__).parent
+    vectors = (folder / "rasterize_gbuffer" / "tile_vector.h").read_text()
+    return f"constexpr float MIN_ROUGHNESS = {MIN_ROUGHNESS}f;\n" + vectors + (folder / "start_rays.h").read_text()
+
+
 @wp.kernel
 def start_rays(
     first: int,
@@ -108,6 +116,40 @@ def start_rays(
     cosine_weight[i] = w
     specular[i] = f
     radiance[i] = seen
+
+
+@wp.func_native(_source_of_start_rays())
+def start_sixteen_rays(
+    base: int, ray_count: int, first: int,
+    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3),
+    light: EnvironmentLight, samples: SampleSet, keep_dark: int,
+    origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), cosine_weight: wp.array(dtype=float),
+    specular: wp.array(dtype=wp.vec3), radiance: wp.array(dtype=wp.vec3),
+): ...  # fmt: skip
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def start_rays_simd(
+    ray_count: int,
+    first: int,
+    points: PointArrays,
+    starts: wp.array[wp.vec3],
+    surface_normals: wp.array[wp.vec3],
+    light: EnvironmentLight,
+    samples: SampleSet,
+    keep_dark: int,
+    # outputs
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    cosine_weight: wp.array[float],
+    specular: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+):
+    """start_rays for sixteen rays a launch index, on the CPU."""
+    start_sixteen_rays(
+        16 * wp.tid(), ray_count, first, points, starts, surface_normals, light, samples, keep_dark,
+        origin, direction, cosine_weight, specular, radiance,
+    )  # fmt: skip
 
 
 @wp.func
@@ -216,7 +258,7 @@ def shade(
         warp_array(result.variance, wp.vec3),
         warp_array(result.visibility),
     ]
-    for kernel in (start_rays, scatter_hits, query_any):
+    for kernel in (start_rays_simd if device.type == "cpu" else start_rays, sum_samples, scatter_hits, query_any):
         load_kernel(kernel, warp_dev)
 
     def batch(first: int, last: int) -> None:
@@ -224,13 +266,12 @@ def shade(
         origin, direction, specular, radiance = (torch.empty(rays, 3, device=device) for _ in range(4))
         cosine_weight = torch.empty(rays, device=device)
         vectors = [warp_array(t, wp.vec3) for t in (specular, radiance)]
-        wp.launch(
-            start_rays,
-            dim=rays,
-            inputs=[first * counts.total, arrays, *start_arrays, light, samples, int(bounces > 0)],
-            outputs=[warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), warp_array(cosine_weight), *vectors],
-            device=warp_dev,
-        )
+        inputs = [first * counts.total, arrays, *start_arrays, light, samples, int(bounces > 0)]
+        outputs = [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), warp_array(cosine_weight), *vectors]
+        if device.type == "cpu":
+            wp.launch(start_rays_simd, dim=-(-rays // 16), inputs=[rays, *inputs], outputs=outputs, device=warp_dev)
+        else:
+            wp.launch(start_rays, dim=rays, inputs=inputs, outputs=outputs, device=warp_dev)
         if bounces > 0:
             hits = tracer.closest_hits(origin, direction)
             blocked = hits.hit

@@ -4,16 +4,18 @@ import math
 
 import pytest
 import torch
+import warp as wp
 
 from drgs.maths.brdf import evaluate_brdf
 from drgs.reference import shade as reference
 from drgs.render.environment_table import build_environment_table, environment_light
 from drgs.render.records import ShadingPoints
-from drgs.render.sample_rays import SampleCounts
-from drgs.render.shade import PointLight, RayStarts, shade
+from drgs.render.sample_rays import SampleCounts, point_arrays, sample_set
+from drgs.render.shade import PointLight, RayStarts, shade, start_rays, start_rays_simd
 from drgs.render.trace_rays import build_tracer
 from drgs.scene.environment import Environment, direction_from_uv
 from drgs.scene.mesh import TriangleMesh
+from drgs.warp_torch import warp_array
 from tests.render.closed_form_scenes import constant_sky, on_device, points_seen_at, sphere_mesh, sunny_sky, two_spheres
 
 FAR_AWAY = sphere_mesh(subdivisions=1, radius=1e-3)
@@ -192,3 +194,41 @@ def test_light_does_not_depend_on_batching_or_threads(monkeypatch: pytest.Monkey
 def test_no_points_give_no_light() -> None:
     empty = points_seen_at([])
     assert len(shade_points(empty, constant_sky(), SampleCounts()).diffuse) == 0
+
+
+@pytest.mark.parametrize("by_material", [False, True])
+@pytest.mark.parametrize("sky", [constant_sky(), sunny_sky(sun=1e4), constant_sky(0.0)])
+def test_sixteen_rays_at_once_are_the_rays_one_by_one(by_material: bool, sky: Environment) -> None:
+    """The hand-vectorised CPU kernel against the plain one, last partial group, grazing and backward views included."""
+    parts = [
+        points_seen_at([0.0, 45.0, 89.5, 95.0], roughness=r, metallic=m, copies=13)
+        for r, m in ((0.0, 1.0), (0.2, 0.5), (0.9, 0.0), (0.1, 1.0))
+    ]
+    points = ShadingPoints(*(torch.cat([getattr(p, name) for p in parts]) for name in vars(parts[0])))
+    surface = torch.nn.functional.normalize(points.normal_world + 0.3 * torch.randn(points.normal_world.shape), dim=-1)
+    counts, first = SampleCounts(7, 3, 5), 45
+    rays = (len(points.pixel) - first // counts.total) * counts.total - 6
+    light = environment_light(sky, build_environment_table(sky), rotation_degrees=70.0, intensity=2.0)
+    inputs = [
+        first, point_arrays(points), warp_array(points.position_world, wp.vec3), warp_array(surface, wp.vec3), light,
+        sample_set(counts, 11, 3, by_material), 0,
+    ]  # fmt: skip
+    results = []
+    for kernel, dim, extra in ((start_rays, rays, []), (start_rays_simd, -(-rays // 16), [rays])):
+        out = (
+            [torch.full((rays, 3), -7.0) for _ in range(2)] + [torch.full((rays,), -7.0)] + [torch.full((rays, 3), -7.0) for _ in range(2)]
+        )
+        outputs = [warp_array(t, wp.vec3 if t.dim() == 2 else None) for t in out]
+        wp.launch(kernel, dim=dim, inputs=[*extra, *inputs], outputs=outputs, device="cpu")
+        results.append(out)
+    plain, vector = results
+    live = (plain[2] > 0) & (vector[2] > 0)
+    assert float(((plain[2] > 0) == (vector[2] > 0)).float().mean()) > 0.995
+    if float(sky.radiance.max()) == 0:
+        assert not bool(live.any())
+        return
+    assert torch.equal(plain[0][live], vector[0][live])
+    assert float((plain[1] - vector[1])[live].norm(dim=-1).quantile(0.99)) < 1e-4
+    for a, b in zip(plain[2:], vector[2:], strict=True):
+        error = (a - b)[live].abs() / (a[live].abs() + 1e-3 * a[live].abs().mean() + 1e-6)
+        assert float(error.quantile(0.97)) < 5e-3
