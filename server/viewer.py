@@ -171,7 +171,10 @@ class Viewer:
             return
         progress = self._progress
         start = self._clock()
-        begun = progress is None or progress.inputs.generation != inputs.generation or (progress.scale < 1 and not moving)
+        changed = progress is None or progress.inputs.generation != inputs.generation
+        # The first answer to an input is always the quick one, however late this thread got to it.
+        moving = moving or changed
+        begun = changed or (progress is not None and progress.scale < 1 and not moving)
         if begun:
             progress = self._progress = self._begin(inputs, moving)
         else:

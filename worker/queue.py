@@ -69,22 +69,22 @@ class JobQueue:
 
     def submit(self, row: JobRow, priority: int = 1) -> None:
         """Store the job and enqueue it; a job that was stored but not enqueued reads `unknown`, never done."""
-        job_id, dataset, preset, seed = row.id, row.dataset, row.preset, row.seed
+        arguments = (row.id, row.dataset, row.preset, row.seed)
         with Session(self._engine) as session, session.begin():
             session.add(row)
+        self._enqueue(arguments, priority)
+
+    def _enqueue(self, arguments: tuple[str, str, str, int], priority: int = 1) -> None:
         self._client.enqueue(
             {
                 "workflow_name": BUILD_WORKFLOW,
                 "queue_name": QUEUE_NAME,
-                "workflow_id": job_id,
+                "workflow_id": arguments[0],
                 "app_version": JOBS_VERSION,
                 "priority": priority,
                 "application_name": APPLICATION_NAME,
             },
-            job_id,
-            dataset,
-            preset,
-            seed,
+            *arguments,
         )
 
     def statuses(self, job_ids: Iterable[str]) -> dict[str, JobStatus]:
@@ -120,18 +120,22 @@ class JobQueue:
         self._client.cancel_workflow(job_id)
 
     def retry(self, job_id: str) -> None:
-        """Start a failed or cancelled job again; its build goes on from the checkpoint.
+        """Start a failed or cancelled job again; its build goes on from the checkpoint. One that never reached the queue is enqueued.
 
         Raises:
-            JobNotInState: it is neither.
+            JobNotInState: it is none of these.
         """
         state = self.statuses([job_id])[job_id].state
-        if state not in ("failed", "cancelled"):
+        if state not in ("failed", "cancelled", "unknown"):
             raise JobNotInState(f"This job is {state}; only a failed or cancelled job can be retried.")
         with Session(self._engine) as session, session.begin():
             row = session.get_one(JobRow, job_id)
             row.cancel_requested, row.error, row.finished_at, row.message = False, None, None, ""
-        self._client.rewind_workflow(job_id, queue_name=QUEUE_NAME)
+            arguments = (row.id, row.dataset, row.preset, row.seed)
+        if state == "unknown":
+            self._enqueue(arguments)
+        else:
+            self._client.rewind_workflow(job_id, queue_name=QUEUE_NAME)
 
     def resume(self, job_id: str) -> None:
         """Hand a job whose worker is dead to whichever worker is free.

@@ -19,7 +19,7 @@ from server.run import serve
 from worker.builders import BUILDER_VARIABLE
 
 REPOSITORY = Path(__file__).parents[2]
-PATIENCE_SECONDS = 20.0
+PATIENCE_SECONDS = 60.0
 PROGRAM = "import sys; from pathlib import Path; from server.run import serve; sys.exit(serve(Path(sys.argv[1]), port=0, ready=lambda a: print(a, flush=True)))"
 
 

@@ -20,7 +20,7 @@ from server import messages
 from server.messages import FLAG_ALPHA, FLAG_CONVERGED, FLAG_MOVING, FrameHeader, unpack_frame
 
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
-PATIENCE_SECONDS = 10.0
+PATIENCE_SECONDS = 60.0
 
 
 def camera(number: int = 0, x: float = 0.0, width: int = 64, height: int = 48) -> dict:
