@@ -31,6 +31,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--dump", type=Path)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--device", default="cpu", choices=["auto", "cpu", "cuda"])
+    parser.add_argument("--check", action="store_true", help="compare the image with the float64 twin (some minutes)")
     parser.add_argument("--depth", action="store_true", help="blend depth moments and the median as well")
     given = parser.parse_args(arguments)
     if given.repeats < MIN_REPEATS:
@@ -40,7 +41,10 @@ def main(arguments: list[str]) -> None:
     if given.dump:
         with torch.no_grad():
             np.save(given.dump, rasterize(*surfels, camera, settings).features.permute(1, 2, 0).contiguous().cpu().numpy())
-    print(json.dumps(measure(camera, surfels, settings, given.repeats), indent=None if given.json else 1))
+    result = measure(camera, surfels, settings, given.repeats)
+    if given.check:
+        result |= difference_from_twin(camera, surfels)
+    print(json.dumps(result, indent=None if given.json else 1))
 
 
 def load_workload(path: Path, device: torch.device) -> tuple[Camera, tuple[torch.Tensor, ...]]:
@@ -52,6 +56,38 @@ def load_workload(path: Path, device: torch.device) -> tuple[Camera, tuple[torch
     tangents = torch.stack([arrays["tangents_u"], arrays["tangents_v"]], -1) * arrays["scales"][:, None, :]
     surfels = (arrays["centers"], tangents, arrays["opacities"], arrays["features"])
     return camera, tuple(tensor.float().to(device).contiguous().requires_grad_() for tensor in surfels)
+
+
+def difference_from_twin(camera: Camera, surfels: tuple[torch.Tensor, ...], tile: int = 20) -> dict:
+    """Largest and mean absolute difference of the image from drgs/reference, tile by tile, each with the surfels whose sphere it may see."""
+    from drgs.reference.rasterize_gbuffer import rasterize as rasterize_reference
+
+    with torch.no_grad():
+        image = rasterize(*surfels, camera, RasterSettings(depth=False)).features.double().cpu()
+        centers, tangents, opacities, features = (tensor.detach().double().cpu() for tensor in surfels)
+        camera = camera.to("cpu")
+        inside = centers @ camera.camera_from_world[:3, :3].double().T + camera.camera_from_world[:3, 3].double()
+        pixel = inside @ camera.intrinsics.double().T
+        pixel = pixel[:, :2] / pixel[:, 2:]
+        reach = 3.4 * tangents.norm(dim=1).amax(1)  # beyond it alpha < 1/255 whatever the opacity
+        nearest = inside[:, 2] - reach
+        margin = 2 * reach * float(camera.intrinsics[0, 0]) / nearest.clamp(min=1e-3) + 4
+        margin = torch.where(nearest > 1e-3, margin, torch.full_like(margin, torch.inf))
+        worst, total = 0.0, 0.0
+        for top in range(0, camera.height, tile):
+            for left in range(0, camera.width, tile):
+                seen = (pixel[:, 0] > left - margin) & (pixel[:, 0] < left + tile + margin)
+                seen &= (pixel[:, 1] > top - margin) & (pixel[:, 1] < top + tile + margin)
+                shifted = camera.intrinsics.double().clone()
+                shifted[0, 2] -= left
+                shifted[1, 2] -= top
+                width, height = min(tile, camera.width - left), min(tile, camera.height - top)
+                window = Camera(camera.camera_from_world, shifted.float(), width, height)
+                chosen = (x[seen] for x in (centers, tangents, opacities, features))
+                truth = rasterize_reference(*chosen, window, RasterSettings(depth=False), depth_origin=0.0).features
+                difference = (image[:, top : top + height, left : left + width] - truth).abs()
+                worst, total = max(worst, float(difference.max())), total + float(difference.sum())
+    return {"twin_max_difference": worst, "twin_mean_difference": total / image.numel()}
 
 
 def measure(camera: Camera, surfels: tuple[torch.Tensor, ...], settings: RasterSettings, repeats: int) -> dict:

@@ -54,13 +54,13 @@ def outward_normals(gaussians: Gaussians, mesh: TriangleMesh) -> Tensor:
     return torch.where(outside, normals, -normals)
 
 
-def bake_outgoing_radiance(gaussians: Gaussians, diffuse_sh: Tensor, normals: Tensor, environment: Environment) -> Tensor:
-    """(surfel, 16, 3) harmonics of the whole outgoing radiance under the environment: diffuse part plus split-sum reflection.
+def bake_outgoing_radiance(gaussians: Gaussians, residual_sh: Tensor, normals: Tensor, environment: Environment) -> Tensor:
+    """(surfel, 16, 3) harmonics of the whole outgoing radiance under the environment: split sum plus residual.
 
     Least squares over directions of the hemisphere that the surfel faces, with a ridge that falls on the higher degrees.
 
     Args:
-        diffuse_sh: (surfel, 16, 3) of the diffuse radiance, without the factor 1 - metallic. normals: (surfel, 3) outward.
+        residual_sh: (surfel, 16, 3) of the residual radiance, no offset. normals: (surfel, 3) outward.
     """
     k = torch.arange(HARMONIC_DIRECTIONS, device=normals.device) + 0.5
     cosine = 1 - k / HARMONIC_DIRECTIONS * 0.95
@@ -68,13 +68,13 @@ def bake_outgoing_radiance(gaussians: Gaussians, diffuse_sh: Tensor, normals: Te
     t_u, t_v = tangents_from_normal(normals)
     tables = filter_environment(environment.radiance)
     f0 = f0_from_base(gaussians.albedo, gaussians.metallic)
+    diffuse_albedo = gaussians.albedo * (1 - gaussians.metallic)[:, None]
     count = len(normals)
     normal_matrix = torch.zeros(count, 16, 16, device=normals.device)
     right_side = torch.zeros(count, 16, 3, device=normals.device)
     for c, s, phi in zip(cosine.tolist(), sine.tolist(), azimuth.tolist(), strict=True):
         wo = c * normals + s * math.cos(phi) * t_u + s * math.sin(phi) * t_v
-        diffuse = (evaluate_sh(diffuse_sh, -wo) + 0.5).clamp(min=0) * (1 - gaussians.metallic)[:, None]
-        radiance = shade_split_sum(diffuse, f0, gaussians.roughness, normals, wo, tables)
+        radiance = shade_split_sum(diffuse_albedo, evaluate_sh(residual_sh, -wo), f0, gaussians.roughness, normals, wo, tables).clamp(min=0)
         basis = sh_basis(-wo)
         normal_matrix += basis[:, :, None] * basis[:, None, :]
         right_side += basis[:, :, None] * (radiance - 0.5)[:, None, :]

@@ -1,6 +1,6 @@
 """Stage 1: surfels, a rough material and the light, from posed photographs.
 
-Each step draws one view: surfels are blended into maps (normal, diffuse radiance, F0, roughness), the maps are shaded by split sum under
+Each step draws one view: surfels are blended into maps (normal, diffuse albedo, F0, roughness, residual), the maps are shaded by split sum under
 a learned HDR environment, all in linear light, and compared with the photo in display space. Reflections therefore pull at normals, so
 that mirror-like surfaces get a surface and not a fog of colours. Sources: Huang et al. 2024 (surfels, normal consistency), Yao et al.
 2025 (deferred reflection), Kerbl et al. 2023 (densification); docs/sources.md. Faults of the published recipes that are avoided here:
@@ -21,7 +21,7 @@ from drgs.build.densify import DensifySettings, Pull, densify, reset_opacity
 from drgs.build.initial_points import InitialPoints
 from drgs.build.losses import display_image, edge_aware_smoothness, mask_loss, normal_consistency, structural_dissimilarity
 from drgs.build.split_sum import filter_environment, shade_split_sum
-from drgs.build.surfel_parameters import LearningRates, initial_parameters, make_optimizer
+from drgs.build.surfel_parameters import INITIAL_LIGHT, LearningRates, initial_parameters, make_optimizer
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
@@ -46,11 +46,13 @@ class FitSettings:
     densify: DensifySettings = field(default_factory=DensifySettings)
     sh_degree: int = 3
     sh_start: float = 0.5
-    """Share of the iterations before the diffuse radiance may depend on the view (one degree each tenth after)."""
+    """Share of the iterations before the residual may depend on the view (one degree each tenth after)."""
     weight_dissimilarity: float = 0.2
     weight_mask: float = 0.1
     weight_normal: float = 0.05
     weight_normal_smooth: float = 0.02
+    weight_residual: float = 0.1
+    """Radiance that only the residual explains costs this share of the error that it removes."""
     seed: int = 0
 
 
@@ -81,7 +83,7 @@ def start_fit(points: InitialPoints, settings: FitSettings, device: torch.device
     """Surfels on the initial points under a uniform light."""
     parameters = initial_parameters(points, device, settings.seed)
     for rows in ENVIRONMENT_PYRAMID:
-        value = math.log(0.6) if rows == ENVIRONMENT_PYRAMID[0] else 0.0
+        value = math.log(INITIAL_LIGHT) if rows == ENVIRONMENT_PYRAMID[0] else 0.0
         parameters[f"environment_{rows}"] = torch.full((1, 3, rows, 2 * rows), value, device=device, requires_grad=True)
     optimizer = make_optimizer(parameters, settings.rates, points.bounds_radius)
     generator = torch.Generator().manual_seed(settings.seed)
@@ -110,6 +112,8 @@ class StageOneMaps:
     normal_world: Tensor
     depth: Tensor
     roughness: Tensor
+    residual: Tensor
+    """(covered pixel, 3) radiance that the material and the unshadowed light do not explain."""
 
 
 def render_stage_one(parameters: dict[str, Tensor], tables: Tensor, camera: Camera, near: float, sh_degree: int) -> StageOneMaps:
@@ -122,9 +126,9 @@ def render_stage_one(parameters: dict[str, Tensor], tables: Tensor, camera: Came
         facing = torch.where((rotation[:, :, 2] * to_surfel).sum(-1, keepdim=True) > 0, -1.0, 1.0)
     metallic = torch.sigmoid(parameters["metallic_logits"])
     sh = parameters["sh_dc"] if sh_degree == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"]], 1)
-    diffuse = (evaluate_sh(sh, to_surfel, sh_degree) + 0.5).clamp(min=0) * (1 - metallic)[:, None]
-    f0 = f0_from_base(torch.sigmoid(parameters["albedo_logits"]), metallic)
-    features = torch.cat([rotation[:, :, 2] * facing, diffuse, f0, torch.sigmoid(parameters["roughness_logits"])[:, None]], 1)
+    albedo = torch.sigmoid(parameters["albedo_logits"])
+    surface = [albedo * (1 - metallic)[:, None], f0_from_base(albedo, metallic), torch.sigmoid(parameters["roughness_logits"])[:, None]]
+    features = torch.cat([rotation[:, :, 2] * facing, *surface, evaluate_sh(sh, to_surfel, sh_degree)], 1)
     maps = rasterize(centers, tangents, torch.sigmoid(parameters["opacity_logits"]), features, camera, RasterSettings(near=near))
     # Maps are divided by coverage; a pixel hardly covered keeps a bounded gradient.
     inverse = 1 / maps.coverage.clamp(min=0.02)
@@ -134,13 +138,13 @@ def render_stage_one(parameters: dict[str, Tensor], tables: Tensor, camera: Came
     normal = torch.nn.functional.normalize(values[:, :3], dim=-1)
     _, directions = pixel_rays_world(camera)
     wo = -directions.reshape(-1, 3)[pixels]
-    radiance = shade_split_sum(values[:, 3:6], values[:, 6:9], values[:, 9], normal, wo, tables)
+    radiance = shade_split_sum(values[:, 3:6], values[:, 10:13], values[:, 6:9], values[:, 9], normal, wo, tables)
     size = (camera.height, camera.width)
 
     def image(packed: Tensor) -> Tensor:
         return packed.new_zeros(camera.height * camera.width, packed.shape[1]).index_copy(0, pixels, packed).view(*size, -1)
 
-    return StageOneMaps(image(radiance), maps.coverage, image(normal), depth, image(values[:, 9:10])[..., 0])
+    return StageOneMaps(image(radiance), maps.coverage, image(normal), depth, image(values[:, 9:10])[..., 0], values[:, 10:13])
 
 
 def scaled_camera(camera: Camera, factor: float) -> Camera:
@@ -238,6 +242,7 @@ def fit_gaussians(
         if progress > 0.02:
             normal_term = normal_consistency(maps.normal_world, maps.depth, maps.coverage, target.camera)
             loss = loss + settings.weight_normal * min(1.0, (progress - 0.02) * 10) * normal_term
+        loss = loss + settings.weight_residual * maps.residual.abs().sum() / image.numel()
         if settings.weight_normal_smooth > 0:
             loss = loss + settings.weight_normal_smooth * edge_aware_smoothness(maps.normal_world[box], photo, maps.coverage[box])
         loss.backward()
@@ -269,7 +274,7 @@ def _set_rates(optimizer: torch.optim.Adam, rates: LearningRates, radius: float,
 
 
 def gaussians_from_state(state: FitState) -> Gaussians:
-    """Surfels as an asset holds them; `sh` is the diffuse part only (bake_outgoing_radiance adds the reflection)."""
+    """Surfels as an asset holds them, but for `sh`, which is the residual alone (bake_outgoing_radiance makes it the whole)."""
     p = {name: value.detach() for name, value in state.parameters.items()}
     return Gaussians(
         centers=p["centers"],

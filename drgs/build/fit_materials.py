@@ -21,7 +21,7 @@ from drgs.build.bake_materials import bake_outgoing_radiance, outward_normals
 from drgs.build.fit_gaussians import FitReport, environment_table, pick_box, view_targets
 from drgs.build.incident_light import AbstractIncidentLight, build_incident_light
 from drgs.build.losses import display_image, edge_aware_smoothness, mask_loss, normal_consistency
-from drgs.build.split_sum import filter_environment, texel_directions, texel_solid_angles
+from drgs.build.split_sum import IRRADIANCE_ROWS, IRRADIANCE_START, filter_environment, texel_solid_angles
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.render.environment_table import build_environment_table
@@ -89,39 +89,22 @@ def _logit(x: Tensor) -> Tensor:
     return torch.logit(x.clamp(0.005, 0.995))
 
 
-def diffuse_albedo(radiance: Tensor, normals: Tensor, environment: Environment) -> Tensor:
-    """(surfel, 3) albedo that explains diffuse radiance (surfel, 3) under the unshadowed environment, clamped to 0.02..0.95."""
-    rows = 16
-    tables = filter_environment(environment.radiance)
-    lowest = tables[-2 * rows * rows :]  # any smooth version of the light will do for irradiance
-    directions = texel_directions(rows).reshape(-1, 3).to(normals.device)
-    area = texel_solid_angles(rows).repeat_interleave(2 * rows).to(normals.device)
-    irradiance = (normals @ directions.T).clamp(min=0) @ (lowest * area[:, None])
-    return (radiance * math.pi / irradiance.clamp(min=1e-4)).clamp(0.02, 0.95)
-
-
 def start_materials(
     gaussians: Gaussians, stage_one: dict[str, Tensor], mesh: TriangleMesh, settings: MaterialSettings, radius: float
 ) -> MaterialState:
-    """Materials from stage 1: metals keep their tint, dielectrics take the albedo that explains their diffuse radiance."""
+    """Materials, light and geometry from stage 1; the surfels' own radiance becomes the whole of what stage 1 draws."""
     environment = Environment(environment_table(stage_one).detach())
     normals = outward_normals(gaussians, mesh)
-    diffuse = (evaluate_sh(gaussians.sh, -normals) + 0.5).clamp(min=0)
-    metallic = gaussians.metallic[:, None]
-    albedo = metallic * gaussians.albedo + (1 - metallic) * diffuse_albedo(diffuse, normals, environment)
-    start = Gaussians(
-        gaussians.centers, gaussians.log_scales, gaussians.quats_wxyz, gaussians.opacity_logits,
-        bake_outgoing_radiance(gaussians, gaussians.sh, normals, environment), albedo, gaussians.roughness, gaussians.metallic,
-    )  # fmt: skip
+    radiance_sh = bake_outgoing_radiance(gaussians, gaussians.sh, normals, environment)
     parameters = {
-        "centers": start.centers,
-        "log_scales": start.log_scales,
-        "quats": start.quats_wxyz,
-        "opacity_logits": start.opacity_logits,
-        "sh": start.sh,
-        "albedo_logits": _logit(start.albedo),
-        "roughness_logits": _logit(start.roughness),
-        "metallic_logits": _logit(start.metallic),
+        "centers": gaussians.centers,
+        "log_scales": gaussians.log_scales,
+        "quats": gaussians.quats_wxyz,
+        "opacity_logits": gaussians.opacity_logits,
+        "sh": radiance_sh,
+        "albedo_logits": _logit(gaussians.albedo),
+        "roughness_logits": _logit(gaussians.roughness),
+        "metallic_logits": _logit(gaussians.metallic),
     } | {name: value for name, value in stage_one.items() if name.startswith("environment_")}
     parameters = {name: value.detach().clone().requires_grad_(True) for name, value in parameters.items()}
     groups = []
@@ -215,8 +198,8 @@ def trace_samples(points: ShadingPoints, rays: Rays, light: AbstractIncidentLigh
 
 def white_light_penalty(environment_radiance: Tensor) -> Tensor:
     """Scalar: mean over directions of the smooth light's distance from its own grey (Liu et al. 2023), relative to its brightness."""
-    smooth = filter_environment(environment_radiance)[-2 * 16 * 16 :]
-    area = texel_solid_angles(16).repeat_interleave(32).to(smooth.device)[:, None] / (4 * math.pi)
+    smooth = filter_environment(environment_radiance)[IRRADIANCE_START:]
+    area = texel_solid_angles(IRRADIANCE_ROWS).repeat_interleave(2 * IRRADIANCE_ROWS).to(smooth.device)[:, None] / (4 * math.pi)
     distance = ((smooth - smooth.mean(1, keepdim=True)).abs() * area).sum()
     return distance / (smooth * area).sum().detach().clamp(min=1e-6)
 

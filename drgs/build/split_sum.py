@@ -1,8 +1,9 @@
 """Deferred reflection-aware shading for stage 1: the split-sum approximation under a learned HDR environment.
 
-    L_o = (diffuse radiance) + S(omega_r, r) (F0 F1 + F2)
+    L_o = c_d I(n) + S(omega_r, r) (F0 F1 + F2) + residual
 
-S is the environment filtered by the GGX lobe of roughness r about the mirror direction, F1 and F2 the usual two integrals of the BRDF
+c_d = (1 - m) a is the diffuse albedo and I the irradiance over pi, both S and I unshadowed: the residual takes up shadows and
+inter-reflection. S is the environment filtered by the GGX lobe of roughness r about the mirror direction, F1 and F2 the usual two integrals of the BRDF
 over (n.v, r). On a lat-long table the filter commutes with turns about z: it is a circular convolution along u, so one small matrix a
 frequency, computed once. The lookup is a Warp kernel, differentiated by Warp. All radiance is linear. Stage 1 only: the renderer and stage 2 integrate the full equation instead.
 Source: Karis 2013, with the BRDF of drgs/maths/brdf.py (docs/sources.md: karis2013); its use for Gaussians: yao2025.
@@ -23,12 +24,16 @@ ENVIRONMENT_SIZE = (128, 256)
 """Rows and columns of the learned table."""
 LEVELS = ((0.05, 128), (0.2, 128), (0.35, 64), (0.5, 32), (0.7, 16), (1.0, 16))
 """(roughness, rows) of each filtered table; between them the lookup is linear in roughness. The first is the environment itself."""
+IRRADIANCE_ROWS = 16
+"""Of the last table: the cosine-weighted mean of the environment about a normal."""
 _OFFSETS = tuple(sum(2 * rows * rows for _, rows in LEVELS[:k]) for k in range(len(LEVELS)))
-_TEXELS = sum(2 * rows * rows for _, rows in LEVELS)
+IRRADIANCE_START = sum(2 * rows * rows for _, rows in LEVELS)
 _ROUGHNESS = wp.constant(wp.types.vector(length=len(LEVELS), dtype=float)(*(r for r, _ in LEVELS)))
 _ROWS = wp.constant(wp.types.vector(length=len(LEVELS), dtype=wp.int32)(*(rows for _, rows in LEVELS)))
 _OFFSET = wp.constant(wp.types.vector(length=len(LEVELS), dtype=wp.int32)(*_OFFSETS))
 _LEVEL_COUNT = wp.constant(len(LEVELS))
+_IRRADIANCE_ROWS = wp.constant(IRRADIANCE_ROWS)
+_IRRADIANCE_START = wp.constant(IRRADIANCE_START)
 _TABLE_SIZE = 32
 GRADIENT_SLICES = 4
 """Points are cut into this many slices, each with its own gradient of the tables: the sum has the same bits for any thread count."""
@@ -48,19 +53,20 @@ def texel_solid_angles(rows: int) -> Tensor:
 
 
 @cache
-def _filter_spectra(roughness: float, rows: int) -> Tensor:
-    """(frequency, rows out, rows in) real: the lobe's weights, Fourier-transformed along u (they are even in u)."""
+def _filter_spectra(roughness: float | None, rows: int) -> Tensor:
+    """(frequency, rows out, rows in) real: the lobe's weights, Fourier-transformed along u (they are even in u); None: the cosine lobe."""
     directions = texel_directions(rows).double()
     target = directions[:, 0]  # one column of output texels stands for all
     cosine = torch.einsum("ic,jkc->ijk", target, directions).clamp(-1, 1)
-    alpha = torch.tensor(roughness**2, dtype=torch.float64)
-    weight = ggx_d(((1 + cosine) / 2).sqrt(), alpha) * cosine.clamp(min=0) * texel_solid_angles(rows).double()[None, :, None]
+    weight = cosine.clamp(min=0) * texel_solid_angles(rows).double()[None, :, None]
+    if roughness is not None:
+        weight = weight * ggx_d(((1 + cosine) / 2).sqrt(), torch.tensor(roughness**2, dtype=torch.float64))
     weight = weight / weight.sum((1, 2), keepdim=True)
     return torch.fft.rfft(weight, dim=-1).real.permute(2, 0, 1).float().contiguous()
 
 
 def filter_environment(radiance: Tensor) -> Tensor:
-    """(texel, 3): the tables of LEVELS one after the other, of a table (128, 256, 3) of linear radiance; differentiable."""
+    """(texel, 3): the tables of LEVELS and the irradiance over pi, one after the other, of a table (128, 256, 3) of linear radiance; differentiable."""
     pyramid = {ENVIRONMENT_SIZE[0]: radiance.permute(2, 0, 1)}
     for rows in (64, 32, 16):
         # Area weights matter only near the poles, where neighbouring rows differ in size.
@@ -68,7 +74,7 @@ def filter_environment(radiance: Tensor) -> Tensor:
         fine = pyramid[2 * rows] * area
         pyramid[rows] = torch.nn.functional.avg_pool2d(fine, 2) / torch.nn.functional.avg_pool2d(area[None], (2, 1))
     tables = [radiance.reshape(-1, 3)]
-    for roughness, rows in LEVELS[1:]:
+    for roughness, rows in (*LEVELS[1:], (None, IRRADIANCE_ROWS)):
         spectrum = torch.fft.rfft(pyramid[rows], dim=-1)  # (3, rows, frequency)
         operator = _filter_spectra(roughness, rows).to(radiance.device)
         both = torch.cat([spectrum.real, spectrum.imag]).permute(2, 1, 0)  # (frequency, rows in, 6)
@@ -96,8 +102,14 @@ def brdf_table(size: int = 32, samples: int = 1024) -> Tensor:
 
 
 @wp.func
-def _table_value(tables: wp.array(dtype=wp.vec3), level: int, u: float, v: float) -> wp.vec3:
-    rows = _ROWS[level]
+def _uv(direction: wp.vec3) -> wp.vec2:
+    # atan2 and acos have no derivative at the poles; a nudge of 1e-6 is a millionth of a turn.
+    u = 0.5 - wp.atan2(direction[1], direction[0] + 1.0e-8) / (2.0 * wp.pi)
+    return wp.vec2(u, wp.acos(wp.clamp(direction[2], -0.999999, 0.999999)) / wp.pi)
+
+
+@wp.func
+def _table_value(tables: wp.array(dtype=wp.vec3), start: int, rows: int, u: float, v: float) -> wp.vec3:
     columns = 2 * rows
     x = u * float(columns) - 0.5
     y = wp.clamp(v * float(rows) - 0.5, 0.0, float(rows) - 1.0)
@@ -107,7 +119,7 @@ def _table_value(tables: wp.array(dtype=wp.vec3), level: int, u: float, v: float
     fy = y - y_floor
     column0 = (int(x_floor) + columns) % columns
     column1 = (column0 + 1) % columns
-    row = _OFFSET[level] + int(y_floor) * columns
+    row = start + int(y_floor) * columns
     top = tables[row + column0] * (1.0 - fx) + tables[row + column1] * fx
     bottom = tables[row + columns + column0] * (1.0 - fx) + tables[row + columns + column1] * fx
     return top * (1.0 - fy) + bottom * fy
@@ -138,7 +150,8 @@ def _level_below(r: float) -> int:
 @wp.kernel
 def split_sum_kernel(
     first: int,
-    diffuse: wp.array(dtype=wp.vec3),
+    diffuse_albedo: wp.array(dtype=wp.vec3),
+    residual: wp.array(dtype=wp.vec3),
     f0: wp.array(dtype=wp.vec3),
     roughness: wp.array(dtype=float),
     normal: wp.array(dtype=wp.vec3),
@@ -151,21 +164,24 @@ def split_sum_kernel(
     i = first + wp.tid()
     n_dot_v = wp.dot(normal[i], wo[i])
     mirror = 2.0 * n_dot_v * normal[i] - wo[i]
-    # atan2 and acos have no derivative at the poles; a nudge of 1e-6 is a millionth of a turn.
-    u = 0.5 - wp.atan2(mirror[1], mirror[0] + 1.0e-8) / (2.0 * wp.pi)
-    v = wp.acos(wp.clamp(mirror[2], -0.999999, 0.999999)) / wp.pi
+    uv = _uv(mirror)
     r = wp.clamp(roughness[i], _ROUGHNESS[0], _ROUGHNESS[_LEVEL_COUNT - 1])
     level = _level_below(r)
     fraction = (r - _ROUGHNESS[level]) / (_ROUGHNESS[level + 1] - _ROUGHNESS[level])
-    reflected = _table_value(tables, level, u, v) * (1.0 - fraction) + _table_value(tables, level + 1, u, v) * fraction
+    near = _table_value(tables, _OFFSET[level], _ROWS[level], uv[0], uv[1])
+    far = _table_value(tables, _OFFSET[level + 1], _ROWS[level + 1], uv[0], uv[1])
+    reflected = near * (1.0 - fraction) + far * fraction
     factors = _factors(factor_table, n_dot_v, roughness[i])
-    radiance[i] = diffuse[i] + wp.cw_mul(reflected, f0[i] * factors[0] + wp.vec3(factors[1], factors[1], factors[1]))
+    about = _uv(normal[i])
+    irradiance = _table_value(tables, _IRRADIANCE_START, _IRRADIANCE_ROWS, about[0], about[1])
+    specular = wp.cw_mul(reflected, f0[i] * factors[0] + wp.vec3(factors[1], factors[1], factors[1]))
+    radiance[i] = wp.cw_mul(diffuse_albedo[i], irradiance) + specular + residual[i]
 
 
 class _SplitSum(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, diffuse, f0, roughness, normal, wo, tables, factor_table):
-        inputs = [x.detach().contiguous() for x in (diffuse, f0, roughness, normal, wo, tables, factor_table)]
+    def forward(ctx, diffuse_albedo, residual, f0, roughness, normal, wo, tables, factor_table):
+        inputs = [x.detach().contiguous() for x in (diffuse_albedo, residual, f0, roughness, normal, wo, tables, factor_table)]
         ctx.save_for_backward(*inputs)
         radiance = torch.empty_like(inputs[0])
         _launch_slices(inputs, radiance, None, None)
@@ -174,13 +190,13 @@ class _SplitSum(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         inputs = ctx.saved_tensors
-        point_gradients = [torch.zeros_like(x) for x in inputs[:4]]
-        table_gradients = torch.zeros(GRADIENT_SLICES, *inputs[5].shape, device=gradient.device)
+        point_gradients = [torch.zeros_like(x) for x in inputs[:5]]
+        table_gradients = torch.zeros(GRADIENT_SLICES, *inputs[6].shape, device=gradient.device)
         _launch_slices(inputs, gradient.contiguous(), point_gradients, table_gradients)
         return *point_gradients, None, table_gradients.sum(0), None
 
 
-_DTYPES = (wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3, wp.vec2)
+_DTYPES = (wp.vec3, wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3, wp.vec2)
 
 
 def _launch_slices(inputs, radiance: Tensor, point_gradients: list[Tensor] | None, table_gradients: Tensor | None) -> None:
@@ -211,12 +227,14 @@ def _launch_slices(inputs, radiance: Tensor, point_gradients: list[Tensor] | Non
             done.result()
 
 
-def shade_split_sum(diffuse: Tensor, f0: Tensor, roughness: Tensor, normal: Tensor, wo: Tensor, tables: Tensor) -> Tensor:
-    """(point, 3) linear radiance towards wo; differentiable in all but wo.
+def shade_split_sum(
+    diffuse_albedo: Tensor, residual: Tensor, f0: Tensor, roughness: Tensor, normal: Tensor, wo: Tensor, tables: Tensor
+) -> Tensor:
+    """(point, 3) linear radiance towards wo; differentiable in all but wo. May be negative where the residual is.
 
     Args:
-        diffuse: (point, 3) diffuse outgoing radiance. f0: (point, 3). roughness: (point,). normal, wo: (point, 3) unit, world.
-        tables: of filter_environment.
+        diffuse_albedo: (point, 3) (1 - m) a. residual: (point, 3) radiance. f0: (point, 3). roughness: (point,).
+        normal, wo: (point, 3) unit, world. tables: of filter_environment.
     """
-    factor_table = brdf_table(_TABLE_SIZE).permute(1, 2, 0).reshape(-1, 2).to(diffuse.device)
-    return _SplitSum.apply(diffuse, f0, roughness, normal, wo, tables, factor_table)
+    factor_table = brdf_table(_TABLE_SIZE).permute(1, 2, 0).reshape(-1, 2).to(f0.device)
+    return _SplitSum.apply(diffuse_albedo, residual, f0, roughness, normal, wo, tables, factor_table)

@@ -10,9 +10,10 @@ from torch import Tensor
 from drgs.build.initial_points import InitialPoints
 from drgs.maths.color import linear_from_srgb
 from drgs.maths.frames import quat_wxyz_from_rotation, rotation_from_quat_wxyz, tangents_from_normal
-from drgs.maths.spherical_harmonics import K00
 
 ADAM_EPSILON = 1e-15
+INITIAL_LIGHT = 0.6
+"""Radiance of the uniform environment that the fit starts under."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class LearningRates:
     quats: float = 0.005
     quats_end: float = 0.001
     opacity_logits: float = 0.04
-    sh_dc: float = 0.01
+    sh_dc: float = 0.005
     sh_rest: float = 0.0005
     albedo_logits: float = 0.02
     roughness_logits: float = 0.02
@@ -67,9 +68,9 @@ def initial_parameters(points: InitialPoints, device: torch.device, seed: int) -
         "log_scales": spacing.log()[:, None].repeat(1, 2),
         "quats": quats,
         "opacity_logits": torch.full((count,), logit(0.6 if points.normals_world is not None else 0.1)),
-        "sh_dc": ((0.6 * radiance - 0.5) / K00)[:, None, :],
+        "sh_dc": torch.zeros(count, 1, 3),
         "sh_rest": torch.zeros(count, 15, 3),
-        "albedo_logits": torch.full((count, 3), logit(0.6)),
+        "albedo_logits": torch.logit((radiance / INITIAL_LIGHT).clamp(0.1, 0.8)),
         "roughness_logits": torch.full((count,), logit(0.35)),
         "metallic_logits": torch.full((count,), logit(0.25)),
     }

@@ -60,6 +60,9 @@ def rasterize(
     pixels = torch.stack([xs.expand(camera.height, -1), ys[:, None].expand(-1, camera.width)], -1).reshape(-1, 2)
 
     def blend(pixel: Tensor) -> tuple[Tensor, ...]:
+        if len(opacity) == 0:
+            nothing = pixel.new_zeros(len(pixel))
+            return pixel.new_zeros(len(pixel), features.shape[1]), nothing, nothing, nothing, nothing
         h = side[:, None] * (pixel[:, None, :1] * ax + pixel[:, None, 1:] * ay + a1)  # (P, M, 3)
         hx, hy, hz = h.unbind(-1)
         radius2 = hx * hx + hy * hy
@@ -82,7 +85,7 @@ def rasterize(
         z = tw[:, 2] + (tw[:, 0] * hx + tw[:, 1] * hy) / reach
         relative = z - depth_origin
         ordinal = torch.arange(len(opacity)).expand_as(w)
-        last = torch.where(live & (before.detach() > 0.5), ordinal, torch.full_like(ordinal, -1)).amax(1) if len(opacity) else None
+        last = torch.where(live & (before.detach() > 0.5), ordinal, torch.full_like(ordinal, -1)).amax(1)
         median = torch.where(last >= 0, z.gather(1, last.clamp(min=0)[:, None])[:, 0], torch.zeros_like(z[:, 0]))
         return w @ feature, w.sum(1), (w * relative).sum(1), (w * relative * relative).sum(1), median
 

@@ -51,13 +51,13 @@ def project_surfels(
     height: int,
     # outputs
     parameters: wp.array2d(dtype=float),
-    depths: wp.array(dtype=float),
+    depths: wp.array(dtype=wp.float64),
     tile_rects: wp.array2d(dtype=wp.int32),
     tile_counts: wp.array(dtype=wp.int32),
 ):
     i = first + wp.tid()
     tile_counts[i] = 0
-    depths[i] = 0.0
+    depths[i] = wp.float64(0.0)
     opacity = opacities[i]
     if not (opacity >= MIN_ALPHA):
         return
@@ -158,7 +158,10 @@ def project_surfels(
     parameters[i, 21] = float(y0)
     parameters[i, 22] = float(y1)
     parameters[i, 23] = scale
-    depths[i] = tw[2]
+    # In float64: two opaque surfels whose float32 depths tie must not change places.
+    c = centers[i]
+    along = wp.float64(camera_from_world[2, 0]) * wp.float64(c[0]) + wp.float64(camera_from_world[2, 1]) * wp.float64(c[1])
+    depths[i] = along + wp.float64(camera_from_world[2, 2]) * wp.float64(c[2]) + wp.float64(camera_from_world[2, 3])
     tile_rects[i, 0] = x0 / 16
     tile_rects[i, 1] = x1 / 16
     tile_rects[i, 2] = y0 / 16

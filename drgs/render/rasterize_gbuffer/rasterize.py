@@ -69,7 +69,7 @@ class _Rasterize(torch.autograd.Function):
         camera_from_world, pixel_from_camera = _camera_arguments(camera)
 
         parameters = torch.empty(count, PARAMETERS, device=device)
-        depths = torch.empty(count, device=device)
+        depths = torch.empty(count, dtype=torch.float64, device=device)
         tile_rects = torch.empty(count, 4, dtype=torch.int32, device=device)
         tile_counts = torch.empty(count, dtype=torch.int32, device=device)
         launch(

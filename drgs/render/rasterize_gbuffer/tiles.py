@@ -33,12 +33,16 @@ int* const index = scratch.data + n;
 unsigned* const key_other = (unsigned*)scratch.data + 2 * n;
 int* const index_other = scratch.data + 3 * n;
 int seen = 0;
+double nearest = 1e300, farthest = -1e300;
 for (int s = 0; s < n; ++s) {
     if (counts.data[s] == 0) continue;
-    const unsigned bits = ((const unsigned*)depths.data)[s];
-    key[seen] = bits & 0x80000000u ? ~bits : bits | 0x80000000u;  // order of floats as order of integers
     index[seen++] = s;
+    nearest = depths.data[s] < nearest ? depths.data[s] : nearest;
+    farthest = depths.data[s] > farthest ? depths.data[s] : farthest;
 }
+// 32 bits over the range of depths met: finer than float32 wherever the scene is.
+const double steps = farthest > nearest ? 4294967295.0 / (farthest - nearest) : 0.0;
+for (int k = 0; k < seen; ++k) key[k] = (unsigned)((depths.data[index[k]] - nearest) * steps);
 unsigned* from_key = key; unsigned* to_key = key_other;
 int* from = index; int* to = index_other;
 for (int shift = 0; shift < 33; shift += 11) {
@@ -73,7 +77,7 @@ for (int k = 0; k < seen; ++k) {
 }
 """)
 def _fill_lists(
-    depths: wp.array(dtype=float),
+    depths: wp.array(dtype=wp.float64),
     rects: wp.array2d(dtype=wp.int32),
     counts: wp.array(dtype=wp.int32),
     offsets: wp.array(dtype=wp.int32),
@@ -89,7 +93,7 @@ def _fill_lists(
 
 @wp.kernel(enable_backward=False)
 def fill_lists(
-    depths: wp.array(dtype=float),
+    depths: wp.array(dtype=wp.float64),
     rects: wp.array2d(dtype=wp.int32),
     counts: wp.array(dtype=wp.int32),
     offsets: wp.array(dtype=wp.int32),
