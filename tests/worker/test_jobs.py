@@ -85,7 +85,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
         if worker.poll() is None:
             worker.terminate()
     for worker in bench.workers:
-        worker.wait(10)
+        worker.wait(PATIENCE_SECONDS)
     bench.queue.close()
     bench.engine.dispose()
 
@@ -123,7 +123,7 @@ def test_a_job_goes_on_after_its_worker_was_asked_to_end(bench: Bench) -> None:
     first = bench.start_worker()
     bench.wait(lambda: bench.row(job).iteration >= 3)
     first.send_signal(signal.SIGTERM)
-    assert first.wait(10) == 0
+    assert first.wait(PATIENCE_SECONDS) == 0
     assert bench.state(job) == "stalled" and bench.row(job).error is None
     bench.start_worker()
     bench.wait_for(job, "done")
