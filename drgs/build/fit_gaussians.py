@@ -19,7 +19,15 @@ from torch import Tensor
 
 from drgs.build.densify import DensifySettings, Pull, densify, reset_opacity
 from drgs.build.initial_points import InitialPoints
-from drgs.build.losses import display_image, edge_aware_smoothness, mask_loss, normal_consistency, structural_dissimilarity
+from drgs.build.losses import (
+    display_image,
+    edge_aware_smoothness,
+    mask_loss,
+    normal_consistency,
+    rough_light,
+    structural_dissimilarity,
+    white_light,
+)
 from drgs.build.split_sum import filter_environment, shade_split_sum
 from drgs.build.surfel_parameters import INITIAL_LIGHT, LearningRates, initial_parameters, make_optimizer
 from drgs.maths.brdf import f0_from_base
@@ -53,6 +61,8 @@ class FitSettings:
     weight_normal_smooth: float = 0.02
     weight_residual: float = 0.1
     """Radiance that only the residual explains costs this share of the error that it removes."""
+    weight_white_light: float = 0.02
+    weight_rough_light: float = 0.002
     seed: int = 0
 
 
@@ -228,7 +238,8 @@ def fit_gaussians(
         target = targets[order.pop()]
 
         degree = min(settings.sh_degree, max(0, int((progress - settings.sh_start) * 10) + 1) if progress >= settings.sh_start else 0)
-        tables = filter_environment(environment_table(parameters))
+        environment = environment_table(parameters)
+        tables = filter_environment(environment)
         maps = render_stage_one(parameters, tables, target.camera, near, degree)
         box = pick_box(target)
         image = display_image(maps.radiance_linear[box], maps.coverage[box], target.saturation[box])
@@ -242,6 +253,7 @@ def fit_gaussians(
         if progress > 0.02:
             normal_term = normal_consistency(maps.normal_world, maps.depth, maps.coverage, target.camera)
             loss = loss + settings.weight_normal * min(1.0, (progress - 0.02) * 10) * normal_term
+        loss = loss + settings.weight_white_light * white_light(environment) + settings.weight_rough_light * rough_light(environment)
         loss = loss + settings.weight_residual * maps.residual.abs().sum() / image.numel()
         if settings.weight_normal_smooth > 0:
             loss = loss + settings.weight_normal_smooth * edge_aware_smoothness(maps.normal_world[box], photo, maps.coverage[box])

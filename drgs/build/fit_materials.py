@@ -3,7 +3,7 @@
 Each step draws one view, picks some of its pixels, samples rays there from cosine, GGX and environment distributions under the balance
 heuristic, traces visibility and indirect light, and compares with the photo:
 
-    L = weight_splat L_c (surfels' own radiance) + L1(PBR, photo) + weight_light (incident light is white) + regularisers      (Eq. 6)
+    L = weight_splat L_c (surfels' own radiance) + L1(PBR, photo) + weight_white_light (incident light is white) + regularisers      (Eq. 6)
 
 Gradients reach materials, environment and, at a small rate, geometry. Source: the paper's stage 2 with the parameters of Gu et al. 2025
 and GOGS where it is silent (docs/sources.md: gu2025irgs, gogs2025); exact densities and one definition of F0 throughout.
@@ -20,8 +20,7 @@ from torch import Tensor
 from drgs.build.bake_materials import bake_outgoing_radiance, outward_normals
 from drgs.build.fit_gaussians import FitReport, environment_table, pick_box, view_targets
 from drgs.build.incident_light import AbstractIncidentLight, build_incident_light
-from drgs.build.losses import display_image, edge_aware_smoothness, mask_loss, normal_consistency
-from drgs.build.split_sum import IRRADIANCE_ROWS, IRRADIANCE_START, filter_environment, texel_solid_angles
+from drgs.build.losses import display_image, edge_aware_smoothness, mask_loss, normal_consistency, rough_light, white_light
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.render.environment_table import build_environment_table
@@ -67,9 +66,12 @@ class MaterialSettings:
     weight_splat: float = 0.3
     weight_mask: float = 0.1
     weight_normal: float = 0.05
-    weight_light: float = 0.01
-    weight_albedo_smooth: float = 0.005
-    weight_roughness_smooth: float = 0.005
+    weight_white_light: float = 0.02
+    weight_rough_light: float = 0.002
+    weight_smooth: float = 0.2
+    """Of the edge-aware smoothness of albedo, roughness and metallic: materials change where the photo does."""
+    weight_metallic_prior: float = 0.01
+    """Of m (1 - m) in the second half: most matter is metal or is not."""
     refresh_every: int = 100
     """Iterations between updates of the radiance that rays meet."""
     seed: int = 0
@@ -196,14 +198,6 @@ def trace_samples(points: ShadingPoints, rays: Rays, light: AbstractIncidentLigh
     return openness, met
 
 
-def white_light_penalty(environment_radiance: Tensor) -> Tensor:
-    """Scalar: mean over directions of the smooth light's distance from its own grey (Liu et al. 2023), relative to its brightness."""
-    smooth = filter_environment(environment_radiance)[IRRADIANCE_START:]
-    area = texel_solid_angles(IRRADIANCE_ROWS).repeat_interleave(2 * IRRADIANCE_ROWS).to(smooth.device)[:, None] / (4 * math.pi)
-    distance = ((smooth - smooth.mean(1, keepdim=True)).abs() * area).sum()
-    return distance / (smooth * area).sum().detach().clamp(min=1e-6)
-
-
 def fit_materials(
     views: Views,
     mesh: TriangleMesh,
@@ -258,10 +252,12 @@ def fit_materials(
         if views.has_masks:
             loss = loss + settings.weight_mask * mask_loss(maps.coverage, target.mask)
         loss = loss + settings.weight_normal * normal_consistency(maps.normal_world, maps.depth, maps.coverage, target.camera)
-        loss = loss + settings.weight_light * white_light_penalty(environment)
+        loss = loss + settings.weight_white_light * white_light(environment) + settings.weight_rough_light * rough_light(environment)
         smooth = torch.cat([maps.albedo[box], maps.roughness[box][..., None], maps.metallic[box][..., None]], -1)
-        weights = smooth.new_tensor([settings.weight_albedo_smooth] * 3 + [settings.weight_roughness_smooth] * 2) * 5
-        loss = loss + edge_aware_smoothness(smooth * weights, photo, maps.coverage[box])
+        loss = loss + settings.weight_smooth * edge_aware_smoothness(smooth, photo, maps.coverage[box])
+        if 2 * state.iteration > settings.iterations:
+            metallic = torch.sigmoid(parameters["metallic_logits"])
+            loss = loss + settings.weight_metallic_prior * (metallic * (1 - metallic)).mean()
         loss.backward()
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)

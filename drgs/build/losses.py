@@ -83,3 +83,26 @@ def edge_aware_smoothness(maps: Tensor, photo: Tensor, coverage: Tensor) -> Tens
         weight = torch.exp(-8 * edge) * solid[tuple(ahead)] * solid[tuple(here)]
         total = total + ((maps[tuple(ahead)] - maps[tuple(here)]).abs().mean(-1) * weight).sum() / solid.sum().clamp(min=1)
     return total
+
+
+def white_light(environment_radiance: Tensor) -> Tensor:
+    """Scalar: mean over directions of the light's distance from its own grey, relative to its brightness.
+
+    Light is whiter than paint: without this, colour wanders between the two (Liu et al. 2023; docs/sources.md: liu2023nero).
+    """
+    area = texel_areas(environment_radiance)
+    distance = (environment_radiance - environment_radiance.mean(-1, keepdim=True)).abs()
+    return (distance * area).sum() / (environment_radiance * area).sum().detach().clamp(min=1e-6)
+
+
+def rough_light(environment_radiance: Tensor) -> Tensor:
+    """Scalar total variation of the logarithm of the light, in both directions of its table: unseen texels follow their neighbours."""
+    log = torch.log(environment_radiance.clamp(min=1e-4))
+    return (log - torch.roll(log, 1, 1)).abs().mean() + (log[1:] - log[:-1]).abs().mean()
+
+
+def texel_areas(environment_radiance: Tensor) -> Tensor:
+    """(height, 1, 1) share of the sphere of a texel of each row."""
+    height, width, _ = environment_radiance.shape
+    edges = torch.cos(torch.linspace(0, torch.pi, height + 1, device=environment_radiance.device))
+    return ((edges[:-1] - edges[1:]) / (2 * width))[:, None, None]

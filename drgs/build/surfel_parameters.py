@@ -30,7 +30,7 @@ class LearningRates:
     sh_rest: float = 0.0005
     albedo_logits: float = 0.02
     roughness_logits: float = 0.02
-    metallic_logits: float = 0.02
+    metallic_logits: float = 0.04
     environment: float = 0.03
 
 
