@@ -19,6 +19,7 @@ import uuid
 import webbrowser
 from pathlib import Path
 
+import httpx
 from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -42,6 +43,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=ROOT / "data")
     parser.add_argument("--port", type=int, default=8000, help="another one is taken when it is in use")
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda _number, _frame: sys.exit(143))  # so that the service is stopped then, too
     given.data.mkdir(parents=True, exist_ok=True)
     log = given.data / "serve.log"
     service = start_service(given.data, free_port(given.port), log)
@@ -62,6 +64,9 @@ def main() -> int:
         return 130
     except (ServerError, RuntimeError) as error:
         print(f"demo: {error}", file=sys.stderr)
+        return 1
+    except httpx.HTTPError as error:
+        print(f"demo: the service no longer answers ({error}); its words are in {os.path.relpath(log)}", file=sys.stderr)
         return 1
     finally:
         if keep:
