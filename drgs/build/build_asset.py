@@ -108,9 +108,9 @@ PRESETS = {
     "full": Preset(
         25_000,
         1024,
-        FitSettings(iterations=6000, half_size_share=0.25, densify=DensifySettings(budget=80_000, every=150, growth=0.08)),
+        FitSettings(iterations=4000, half_size_share=0.25, densify=DensifySettings(budget=60_000, growth=0.08)),
         FULL_MESH,
-        MaterialSettings(iterations=1500, points_a_step=1024, samples=SampleCounts(128, 64, 64)),
+        MaterialSettings(iterations=800, samples=SampleCounts(96, 48, 48)),
     ),
 }
 STAGE_SHARES = {"read": 0.02, "fit": 0.62, "mesh": 0.04, "materials": 0.3, "pack": 0.02}

@@ -33,7 +33,7 @@ from drgs.build.surfel_parameters import INITIAL_LIGHT, LearningRates, initial_p
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
-from drgs.render.rasterize_gbuffer import RasterSettings, rasterize
+from drgs.render.rasterize_gbuffer import RasterSettings, face_camera, facing_normals, rasterize
 from drgs.scene.camera import Camera, pixel_rays_world
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
@@ -133,21 +133,20 @@ def render_stage_one(parameters: dict[str, Tensor], tables: Tensor, camera: Came
     centers = parameters["centers"]
     with torch.no_grad():
         to_surfel = torch.nn.functional.normalize(centers - camera.center_world, dim=-1)
-        facing = torch.where((rotation[:, :, 2] * to_surfel).sum(-1, keepdim=True) > 0, -1.0, 1.0)
     metallic = torch.sigmoid(parameters["metallic_logits"])
     sh = parameters["sh_dc"] if sh_degree == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"]], 1)
     albedo = torch.sigmoid(parameters["albedo_logits"])
     surface = [albedo * (1 - metallic)[:, None], f0_from_base(albedo, metallic), torch.sigmoid(parameters["roughness_logits"])[:, None]]
-    features = torch.cat([rotation[:, :, 2] * facing, *surface, evaluate_sh(sh, to_surfel, sh_degree)], 1)
+    features = torch.cat([facing_normals(rotation[:, :, 2], centers, camera), *surface, evaluate_sh(sh, to_surfel, sh_degree)], 1)
     maps = rasterize(centers, tangents, torch.sigmoid(parameters["opacity_logits"]), features, camera, RasterSettings(near=near))
     # Maps are divided by coverage; a pixel hardly covered keeps a bounded gradient.
     inverse = 1 / maps.coverage.clamp(min=0.02)
     depth = maps.depth_sum * inverse + maps.depth_origin
     pixels = (maps.coverage.detach().flatten() > 0.02).nonzero().squeeze(1)
     values = (maps.features.flatten(1)[:, pixels] * inverse.flatten()[pixels]).T
-    normal = torch.nn.functional.normalize(values[:, :3], dim=-1)
     _, directions = pixel_rays_world(camera)
     wo = -directions.reshape(-1, 3)[pixels]
+    normal = face_camera(values[:, :3], wo)
     radiance = shade_split_sum(values[:, 3:6], values[:, 10:13], values[:, 6:9], values[:, 9], normal, wo, tables)
     size = (camera.height, camera.width)
 

@@ -26,7 +26,7 @@ from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.render.environment_table import build_environment_table
 from drgs.render.integrate_samples import integrate_samples
 from drgs.render.lift_points import lift_points
-from drgs.render.rasterize_gbuffer import RasterSettings, rasterize
+from drgs.render.rasterize_gbuffer import RasterSettings, face_camera, facing_normals, rasterize
 from drgs.render.records import Rays, ShadingPoints
 from drgs.render.sample_rays import SampleCounts, sample_rays
 from drgs.render.trace_rays import build_tracer
@@ -97,11 +97,15 @@ def start_materials(
     """Materials, light and geometry from stage 1; the surfels' own radiance becomes the whole of what stage 1 draws."""
     environment = Environment(environment_table(stage_one).detach())
     normals = outward_normals(gaussians, mesh)
+    turned = (rotation_from_quat_wxyz(gaussians.quats_wxyz)[:, :, 2] * normals).sum(-1) < 0
+    w, x, y, z = gaussians.quats_wxyz.unbind(-1)
+    over = torch.stack([-x, w, z, -y], -1)  # half a turn about t_u: the same disc, its normal outward
+    quats = torch.where(turned[:, None], over, gaussians.quats_wxyz)
     radiance_sh = bake_outgoing_radiance(gaussians, gaussians.sh, normals, environment)
     parameters = {
         "centers": gaussians.centers,
         "log_scales": gaussians.log_scales,
-        "quats": gaussians.quats_wxyz,
+        "quats": quats,
         "opacity_logits": gaussians.opacity_logits,
         "sh": radiance_sh,
         "albedo_logits": _logit(gaussians.albedo),
@@ -145,11 +149,10 @@ def render_stage_two(parameters: dict[str, Tensor], camera: Camera, near: float)
     centers = parameters["centers"]
     with torch.no_grad():
         to_surfel = torch.nn.functional.normalize(centers - camera.center_world, dim=-1)
-        facing = torch.where((rotation[:, :, 2] * to_surfel).sum(-1, keepdim=True) > 0, -1.0, 1.0)
     radiance = (evaluate_sh(parameters["sh"], to_surfel) + 0.5).clamp(min=0)
     features = torch.cat(
         [
-            rotation[:, :, 2] * facing,
+            facing_normals(rotation[:, :, 2], centers, camera),
             torch.sigmoid(parameters["albedo_logits"]),
             torch.sigmoid(parameters["roughness_logits"])[:, None],
             torch.sigmoid(parameters["metallic_logits"])[:, None],
@@ -165,7 +168,7 @@ def render_stage_two(parameters: dict[str, Tensor], camera: Camera, near: float)
         splat_radiance=normalised[..., 8:11],
         coverage=maps.coverage,
         depth=maps.depth_sum * inverse + maps.depth_origin,
-        normal_world=torch.nn.functional.normalize(normalised[..., :3], dim=-1),
+        normal_world=face_camera(normalised[..., :3], -pixel_rays_world(camera)[1]),
         albedo=normalised[..., 3:6],
         roughness=normalised[..., 6],
         metallic=normalised[..., 7],

@@ -20,7 +20,7 @@ INITIAL_LIGHT = 0.6
 class LearningRates:
     """Adam's step per group; world lengths are in units of the object's radius. Rates ending in _end are reached exponentially."""
 
-    centers: float = 1.2e-3
+    centers: float = 4e-3
     centers_end: float = 2e-5
     log_scales: float = 0.01
     quats: float = 0.005

@@ -12,11 +12,29 @@ MIN_COVERAGE = 1.0 / 255.0
 """Pixels below carry no surface; the division by coverage is guarded here."""
 
 
-def surfel_normals(surfels_tangents: Tensor, centers: Tensor, camera: Camera) -> Tensor:
-    """(surfel, 3) unit normals of tangent columns (surfel, 3, 2), turned towards the camera."""
-    normals = torch.nn.functional.normalize(torch.linalg.cross(surfels_tangents[:, :, 0], surfels_tangents[:, :, 1]), dim=-1, eps=1e-20)
-    away = (normals * (centers - camera.center_world)).sum(-1, keepdim=True) > 0
-    return torch.where(away, -normals, normals)
+SEEN_FROM_BEHIND = 0.3
+"""Cosine between a surfel's normal and the viewing ray above which the surfel is taken to show its back."""
+LEAST_FACING = 0.02
+"""Blended normals face the camera at least by this cosine."""
+
+
+def facing_normals(normals: Tensor, centers: Tensor, camera: Camera) -> Tensor:
+    """(surfel, 3) normals to blend: turned round where the camera clearly sees the back.
+
+    Surfels of a closed surface point outward, and near an outline some tip away from the camera by a few degrees. Turned round one by one
+    they would spoil the blended normal there; left alone they average to the outline's own. `face_camera` then bends what is left.
+    """
+    with torch.no_grad():
+        to_surfel = torch.nn.functional.normalize(centers - camera.center_world, dim=-1)
+        sign = torch.where((normals * to_surfel).sum(-1, keepdim=True) > SEEN_FROM_BEHIND, -1.0, 1.0)
+    return normals * sign
+
+
+def face_camera(normals: Tensor, wo: Tensor) -> Tensor:
+    """(..., 3) unit normals of blended (..., 3), bent towards wo as little as makes their cosine LEAST_FACING; differentiable."""
+    unit = torch.nn.functional.normalize(normals, dim=-1)
+    lacking = (LEAST_FACING - (unit * wo).sum(-1, keepdim=True)).clamp(min=0)
+    return torch.nn.functional.normalize(unit + lacking * wo, dim=-1)
 
 
 def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSettings | None = None) -> GBuffer:
@@ -25,7 +43,8 @@ def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSet
     Depth is the expected one; the shaded point lies on the pixel's ray at that depth. Where nothing is met: depth inf, the rest 0.
     """
     materials = surfels.materials
-    normals = surfel_normals(surfels.tangents, surfels.centers, camera)
+    crosses = torch.linalg.cross(surfels.tangents[:, :, 0], surfels.tangents[:, :, 1])
+    normals = facing_normals(torch.nn.functional.normalize(crosses, dim=-1, eps=1e-20), surfels.centers, camera)
     features = torch.cat([normals, materials.albedo, materials.roughness[:, None], materials.metallic[:, None]], -1)
     maps = rasterize(surfels.centers, surfels.tangents, surfels.opacities, features, camera, settings)
     covered = maps.coverage >= MIN_COVERAGE
@@ -39,7 +58,7 @@ def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSet
         coverage=maps.coverage,
         depth=depth,
         position_world=position,
-        normal_world=torch.nn.functional.normalize(normalised[..., :3], dim=-1),
+        normal_world=face_camera(normalised[..., :3], -directions),
         wo_world=-directions,
         albedo=normalised[..., 3:6].clamp(0, 1),
         roughness=normalised[..., 6].clamp(0, 1),
