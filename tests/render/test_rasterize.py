@@ -22,19 +22,19 @@ def random_surfels(count, seed=0, spread=0.6, scale=0.15, channels=5):
 
 def assert_maps_close(maps, expected, tolerance=2e-5, outliers=0.0):
     for name in ("features", "coverage", "depth_sum", "depth_square_sum"):
-        difference = (getattr(maps, name).double() - getattr(expected, name)).abs()
+        difference = (getattr(maps, name).double().cpu() - getattr(expected, name)).abs()
         assert (difference > tolerance).double().mean() <= outliers, f"{name}: {difference.max():.2e}"
 
 
 @pytest.mark.parametrize("per_pixel", [False, True])
 @pytest.mark.parametrize("size", [(48, 32), (37, 51)])
-def test_maps_equal_the_twin(per_pixel, size):
+def test_maps_equal_the_twin(per_pixel, size, device):
     surfels = random_surfels(60)
     camera = look_at_camera(*size, focal=70.0)
     expected = rasterize_reference(*(x.double() for x in surfels), camera)
-    maps = rasterize(*surfels, camera, per_pixel=per_pixel)
+    maps = rasterize(*(x.to(device) for x in surfels), camera.to(device), per_pixel=per_pixel)
     assert_maps_close(maps, expected)
-    flips = (maps.median_depth.double() - expected.median_depth).abs() > 1e-4
+    flips = (maps.median_depth.double().cpu() - expected.median_depth).abs() > 1e-4
     assert flips.double().mean() < 0.005  # T = 0.5 exactly at a rounding error
 
 
@@ -52,7 +52,7 @@ CASES = {
 
 @pytest.mark.parametrize("per_pixel", [False, True])
 @pytest.mark.parametrize("case", CASES)
-def test_gradients_equal_the_twin(case, per_pixel):
+def test_gradients_equal_the_twin(case, per_pixel, device):
     options = dict(CASES[case])
     edge_on, opacity, count = options.pop("edge_on", False), options.pop("opacity", None), options.pop("count", 30)
     centers, tangents, opacities, features = random_surfels(count, seed=3, **options)
@@ -68,15 +68,15 @@ def test_gradients_equal_the_twin(case, per_pixel):
 
     def loss(maps):
         parts = [maps.features, maps.coverage[None], maps.depth_sum[None], maps.depth_square_sum[None]]
-        return sum((w.to(p.dtype) * p).sum() for w, p in zip(weights, parts, strict=True))
+        return sum((w.to(p) * p).sum() for w, p in zip(weights, parts, strict=True))
 
-    def gradients(function, dtype, **extra):
-        inputs = [x.detach().to(dtype).requires_grad_(True) for x in (centers, tangents, opacities, features)]
-        maps = function(*inputs, camera, **extra)
-        return maps, torch.autograd.grad(loss(maps), inputs)
+    def gradients(function, dtype, where, **extra):
+        inputs = [x.detach().to(where, dtype).requires_grad_(True) for x in (centers, tangents, opacities, features)]
+        maps = function(*inputs, camera.to(where), **extra)
+        return maps, [g.cpu() for g in torch.autograd.grad(loss(maps), inputs)]
 
-    expected_maps, expected = gradients(rasterize_reference, torch.float64)
-    maps, actual = gradients(rasterize, torch.float32, per_pixel=per_pixel)
+    expected_maps, expected = gradients(rasterize_reference, torch.float64, "cpu")
+    maps, actual = gradients(rasterize, torch.float32, device, per_pixel=per_pixel)
     # A pixel on the rim (alpha = 1/255, T = 1e-4, equal depths) may fall on the other side in float32.
     assert_maps_close(maps, expected_maps, tolerance=1e-3 if edge_on else 1e-4, outliers=0.003)
     for name, a, e in zip(("centers", "tangents", "opacities", "features"), actual, expected, strict=True):
