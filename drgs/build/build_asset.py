@@ -108,9 +108,9 @@ PRESETS = {
     "full": Preset(
         25_000,
         1024,
-        FitSettings(iterations=4000, half_size_share=0.25, densify=DensifySettings(budget=60_000, growth=0.08)),
+        FitSettings(iterations=2500, half_size_share=0.25, densify=DensifySettings(budget=40_000)),
         FULL_MESH,
-        MaterialSettings(iterations=800, samples=SampleCounts(96, 48, 48)),
+        MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
     ),
 }
 STAGE_SHARES = {"read": 0.02, "fit": 0.62, "mesh": 0.04, "materials": 0.3, "pack": 0.02}
