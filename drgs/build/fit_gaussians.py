@@ -197,6 +197,12 @@ def view_targets(views: Views, factor: float, device: torch.device) -> list[View
     return targets
 
 
+def drawn_view(iteration: int, count: int, seed: int) -> int:
+    """Which of `count` views a step looks at: all once a round, in an order that only seed and round decide, so a resumed fit keeps it."""
+    rounds, place = divmod(iteration, count)
+    return int(torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + rounds))[place])
+
+
 def pick_box(target: ViewTarget) -> tuple[slice, slice]:
     """Rows and columns of the target's box."""
     return target.rows, target.columns
@@ -224,7 +230,6 @@ def fit_gaussians(
     near = 0.01 * radius
     recent: list[float] = []
     started = time.monotonic()
-    order: list[int] = []
     while state.iteration < total:
         if should_stop is not None and should_stop():
             break
@@ -232,9 +237,7 @@ def fit_gaussians(
             targets = view_targets(views, 1.0, device)
         progress = state.iteration / total
         _set_rates(optimizer, settings.rates, radius, progress)
-        if not order:
-            order = torch.randperm(len(targets), generator=state.generator).tolist()
-        target = targets[order.pop()]
+        target = targets[drawn_view(state.iteration, len(targets), settings.seed)]
 
         degree = min(settings.sh_degree, max(0, int((progress - settings.sh_start) * 10) + 1) if progress >= settings.sh_start else 0)
         environment = environment_table(parameters)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from drgs.build.bake_materials import bake_outgoing_radiance, outward_normals
-from drgs.build.fit_gaussians import FitReport, environment_table, pick_box, view_targets
+from drgs.build.fit_gaussians import FitReport, drawn_view, environment_table, pick_box, view_targets
 from drgs.build.incident_light import AbstractIncidentLight, build_incident_light
 from drgs.build.losses import display_image, edge_aware_smoothness, mask_loss, normal_consistency, rough_light, white_light
 from drgs.maths.frames import rotation_from_quat_wxyz
@@ -217,7 +217,6 @@ def fit_materials(
     tracer = build_tracer(mesh)
     light = build_incident_light(settings.indirect, mesh, gaussians_from_materials(state))
     recent: list[float] = []
-    order: list[int] = []
     started = time.monotonic()
     while state.iteration < settings.iterations:
         if should_stop is not None and should_stop():
@@ -226,9 +225,7 @@ def fit_materials(
             light = build_incident_light(settings.indirect, mesh, gaussians_from_materials(state))
         for group in optimizer.param_groups:  # cosine fall to a tenth: the estimate is noisy
             group["lr"] = group["full_rate"] * (0.55 + 0.45 * math.cos(math.pi * state.iteration / settings.iterations))
-        if not order:
-            order = torch.randperm(len(targets), generator=state.generator).tolist()
-        target = targets[order.pop()]
+        target = targets[drawn_view(state.iteration, len(targets), settings.seed)]
         maps = render_stage_two(parameters, target.camera, 0.01 * radius)
         environment = environment_table(parameters)
 
