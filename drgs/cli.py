@@ -192,11 +192,20 @@ def export(
 @app.command()
 def simulate(
     asset: AssetPath,
-    out: Annotated[Path, typer.Argument(metavar="OUT")],
-    scene: Annotated[Path, typer.Option(help="Simulation scene (JSON).")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Clip to write: a folder of frames.")],
+    scene: Annotated[Path | None, typer.Option(help="Simulation scene (JSON); without it a jelly under its own weight.")] = None,
+    device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
+    as_json: Json = False,
 ) -> None:
-    """Drop, squash and shake an asset (not in this version)."""
-    raise ValueError("simulate: this version has no simulation; deform an asset with drgs render --edits and a 'deform' edit")
+    """Drop, squash and shake an asset; play the clip with a 'pose' edit."""
+    from drgs.cli_progress import frame_progress
+    from drgs.deform.simulate import simulate as run_simulation
+    from drgs.deform.simulation_scene import SimulationScene, parse_simulation_scene
+
+    setting = SimulationScene() if scene is None else parse_simulation_scene(scene.read_bytes())
+    with frame_progress("Simulating", None) as advance:
+        _, report = run_simulation(_open_asset(asset, device), setting, out, lambda done, total: advance(f"{done} of {total}"))
+    _print_document({"out": str(out)} | vars(report), as_json)
 
 
 @app.command("eval")

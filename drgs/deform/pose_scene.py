@@ -18,8 +18,11 @@ import torch
 from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.clip import ClipFrame, frame_at, open_clip
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.maps import check_map, evaluate_map
+from drgs.deform.simulate import Simulation
+from drgs.deform.simulation_scene import parse_simulation_scene
 from drgs.exchange.npz import read_npz_array
 from drgs.scene.asset import Asset
 from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, SimulateEdit
@@ -32,6 +35,9 @@ from drgs.scene.select_vertices import select_surfels, select_vertices
 
 REMEMBERED = 4
 """Results kept of each kind for each asset."""
+
+ShapeEdit = DeformEdit | PoseEdit | SimulateEdit
+"""Edits that move things."""
 
 Result = TypeVar("Result")
 _lock = threading.Lock()
@@ -55,16 +61,12 @@ def pose_scene(
     Raises:
         ValueError: one sentence: an edit that does not fit this asset, or a missing or damaged file.
     """
-    for edit in edits:
-        if isinstance(edit, PoseEdit | SimulateEdit):
-            what = "clips to play" if isinstance(edit, PoseEdit) else "simulation"
-            raise ValueError(f"the edit '{edit.op}' is not available in this asset yet: it has no {what}")
     files = _Files(base_directory, confine)
     material = [edit for edit in edits if isinstance(edit, MaterialEdit)]
-    deform = [edit for edit in edits if isinstance(edit, DeformEdit)]
+    deform = [edit for edit in edits if isinstance(edit, ShapeEdit)]
 
     vertex_materials, surfel_materials = _remembered(asset, ("material", *map(_text, material)), lambda: _apply_materials(asset, material))
-    shape_key = ("shape", *((_text(edit), files.stamp(edit.vertices)) for edit in deform))
+    shape_key = ("shape", *((_text(edit), files.stamp(_file(edit))) for edit in deform))
     shape = _remembered(asset, shape_key, lambda: _apply_deformations(asset, deform, files))
 
     mesh, surfels = asset.mesh, None
@@ -163,12 +165,16 @@ def _edited(materials: Materials, edit: MaterialEdit, weights: Tensor) -> Materi
     )
 
 
-def _apply_deformations(asset: Asset, edits: list[DeformEdit], files: _Files) -> _Shape:
+def _apply_deformations(asset: Asset, edits: list[ShapeEdit], files: _Files) -> _Shape:
     mesh, gaussians = asset.mesh, asset.gaussians
     vertices, normals = mesh.vertices, mesh.normals
     centers, tangents = (None, None) if gaussians is None else (gaussians.centers, _rest(asset).tangents)
     for edit in edits:
-        if edit.map is not None:
+        if isinstance(edit, PoseEdit | SimulateEdit):
+            # Like a file of vertices, it says where everything is, whatever came before.
+            frame = _moment(asset, edit, files)
+            vertices, normals, centers, tangents = frame.vertices, frame.normals, frame.centers, frame.tangents
+        elif edit.map is not None:
             check_map(edit.map, vertices)
             vertices, gradient = evaluate_map(edit.map, vertices)
             normals = carry_normals(normals, gradient)
@@ -189,8 +195,35 @@ def _apply_deformations(asset: Asset, edits: list[DeformEdit], files: _Files) ->
                     mesh.vertices, vertices, mesh.faces, gradient, asset.binding, gaussians.centers, rest_tangents
                 )
         if not all(torch.isfinite(values).all() for values in (vertices, normals, centers, tangents) if values is not None):
-            raise ValueError(f"the deform edit {_text(edit)[:120]} moves parts of this object to infinity")
+            raise ValueError(f"the {edit.op} edit {_text(edit)[:120]} moves parts of this object to infinity")
     return _Shape(vertices, normals, centers, tangents)
+
+
+def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files) -> ClipFrame:
+    """What a clip or a simulation shows at the edit's time; at rest, the asset's own tensors."""
+    if isinstance(edit, SimulateEdit):
+        scene = parse_simulation_scene(edit.scene)
+        if edit.time == 0:
+            centers, tangents = (None, None) if asset.gaussians is None else (asset.gaussians.centers, _rest(asset).tangents)
+            return ClipFrame(asset.mesh.vertices, asset.mesh.normals, centers, tangents)
+        frame = _remembered(asset, ("simulation", scene.model_dump_json()), lambda: Simulation(asset, scene)).at(edit.time)
+    else:
+        clip = open_clip(files.path(f"{edit.clip}/clip.json").parent)
+        surfels = 0 if asset.gaussians is None else len(asset.gaussians.centers)
+        if (clip.vertices, clip.surfels) != (len(asset.mesh.vertices), surfels):
+            raise ValueError(
+                f"the clip {edit.clip} was made for another object: it has {clip.vertices} vertices and {clip.surfels} surfels, "
+                f"this one {len(asset.mesh.vertices)} and {surfels}"
+            )
+        frame = frame_at(clip, edit.time, asset.mesh.vertices.device)
+    return frame
+
+
+def _file(edit: ShapeEdit) -> str | None:
+    """The file that an edit reads, whose change must be noticed."""
+    if isinstance(edit, PoseEdit):
+        return f"{edit.clip}/clip.json"
+    return edit.vertices if isinstance(edit, DeformEdit) else None
 
 
 def _environment(asset: Asset, name: str, files: _Files, environments: Callable[[str], Environment] | None) -> Environment:
@@ -204,7 +237,7 @@ def _environment(asset: Asset, name: str, files: _Files, environments: Callable[
     return _remembered(asset, ("environment", files.stamp(name)), load)
 
 
-def _text(edit: DeformEdit | MaterialEdit) -> str:
+def _text(edit: Edit) -> str:
     return edit.model_dump_json()
 
 

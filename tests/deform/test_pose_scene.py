@@ -254,8 +254,9 @@ def test_edits_that_fold_the_object_or_need_what_is_not_there_are_refused():
     cases = [
         ({"op": "deform", "map": {"type": "bend", "curvature": 2.0}}, "folds the object through itself"),
         ({"op": "deform", "map": {"type": "stretch", "factor": 1e300}}, "to infinity"),
-        ({"op": "pose", "clip": "walk", "time": 0.4}, "'pose' is not available in this asset yet"),
-        ({"op": "simulate", "scene": {}, "time": 0.4}, "'simulate' is not available in this asset yet"),
+        ({"op": "pose", "clip": "walk", "time": 0.4}, "walk/clip.json: does not exist"),
+        ({"op": "simulate", "scene": {"gravity": -1}, "time": 0.4}, "simulation scene: gravity"),
+        ({"op": "simulate", "scene": {}, "time": 0.4}, "cannot fill a mesh that is flat"),
         ({"op": "environment", "file": "nowhere.exr"}, "does not exist"),
     ]
     for edit, sentence in cases:

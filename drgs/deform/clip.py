@@ -1,0 +1,151 @@
+"""Baked motion: a folder of frames with what a posed scene needs of an asset's shape, to be played, scrubbed and relit.
+
+clip.json names the format, the frames' rate and count, and the asset's counts; frame_00000.safetensors and so on hold float32 arrays
+vertices, normals, and for an asset with Gaussians centers and tangents. Writing is atomic; a clip of another asset is refused.
+"""
+
+import json
+import math
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+FORMAT, VERSION = "drgs clip", 1
+MOST_FRAMES = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class ClipFrame:
+    """Where an asset's parts are at one time."""
+
+    vertices: Tensor
+    """(vertex, 3) world."""
+    normals: Tensor
+    """(vertex, 3), unit."""
+    centers: Tensor | None
+    """(surfel, 3)."""
+    tangents: Tensor | None
+    """(surfel, 3, 2)."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clip on disk; frames are read when they are asked for."""
+
+    folder: Path
+    fps: float
+    frame_count: int
+    vertices: int
+    surfels: int
+    """0 for an asset without Gaussians."""
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last."""
+        return (self.frame_count - 1) / self.fps
+
+
+def blend_frames(first: ClipFrame, second: ClipFrame, share: float) -> ClipFrame:
+    """Between two frames: `share` of the second. Where both hold the same tensor, it stays the same."""
+
+    def mix(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+        return a if a is b or a is None or b is None else torch.lerp(a, b, share)
+
+    vertices, normals = mix(first.vertices, second.vertices), mix(first.normals, second.normals)
+    assert vertices is not None and normals is not None
+    if normals is not first.normals:
+        normals = torch.nn.functional.normalize(normals, dim=-1, eps=1e-20)
+    return ClipFrame(vertices, normals, mix(first.centers, second.centers), mix(first.tangents, second.tangents))
+
+
+def save_clip(folder: Path, frames: list[ClipFrame], fps: float, details: dict) -> None:
+    """Write frames to a new folder, or in place of another clip.
+
+    Raises:
+        ValueError: the path is taken by something that is no clip.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (folder / "clip.json").is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder}: exists, and is no clip")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        for index, frame in enumerate(frames):
+            arrays = {name: value.detach().cpu().contiguous() for name, value in vars(frame).items() if value is not None}
+            # Two tensors of one frame never share memory, which the format would refuse.
+            safetensors.torch.save_file(arrays, partial / _name(index))
+        first = frames[0]
+        counts = {"vertices": len(first.vertices), "surfels": 0 if first.centers is None else len(first.centers)}
+        manifest = {"format": FORMAT, "version": VERSION, "fps": fps, "frames": len(frames), "counts": counts} | details
+        (partial / "clip.json").write_text(json.dumps(manifest, indent=1))
+        os.chmod(partial, 0o755)
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(partial, folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def open_clip(folder: Path) -> Clip:
+    """Read a clip's manifest.
+
+    Raises:
+        ValueError: one sentence: no clip, or a damaged or newer one.
+    """
+    try:
+        manifest = json.loads((Path(folder) / "clip.json").read_text())
+        if manifest["format"] != FORMAT:
+            raise ValueError(f"its format is {manifest['format']!r}")
+        if manifest["version"] > VERSION:
+            raise ValueError(f"it has version {manifest['version']}; this program reads up to {VERSION}")
+        fps, frames = float(manifest["fps"]), int(manifest["frames"])
+        if not (0 < fps < math.inf and 1 <= frames <= MOST_FRAMES):
+            raise ValueError(f"it has {frames} frames at {fps} a second")
+        return Clip(Path(folder), fps, frames, int(manifest["counts"]["vertices"]), int(manifest["counts"]["surfels"]))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{folder}: is not a readable clip ({error})") from error
+
+
+def read_frame(clip: Clip, index: int, device: torch.device | str = "cpu") -> ClipFrame:
+    """One frame.
+
+    Raises:
+        ValueError: missing, damaged, of other sizes, or with values that are not finite.
+    """
+    path = clip.folder / _name(min(max(index, 0), clip.frame_count - 1))
+    shapes: dict[str, tuple[int, ...]] = {"vertices": (clip.vertices, 3), "normals": (clip.vertices, 3)}
+    if clip.surfels:
+        shapes |= {"centers": (clip.surfels, 3), "tangents": (clip.surfels, 3, 2)}
+    try:
+        arrays = safetensors.torch.load_file(path)
+    except (OSError, safetensors.SafetensorError) as error:
+        raise ValueError(f"{path}: is not a readable frame ({error})") from error
+    for name, shape in shapes.items():
+        values = arrays.get(name)
+        if values is None or tuple(values.shape) != shape or values.dtype != torch.float32:
+            found = None if values is None else (tuple(values.shape), str(values.dtype))
+            raise ValueError(f"{path}: {name} is {found}; expected {shape} of float32")
+        if not torch.isfinite(values).all():
+            raise ValueError(f"{path}: {name} holds values that are not finite")
+    return ClipFrame(*(arrays[name].to(device) if name in shapes else None for name in ("vertices", "normals", "centers", "tangents")))
+
+
+def frame_at(clip: Clip, seconds: float, device: torch.device | str = "cpu") -> ClipFrame:
+    """What a clip shows at a time; its last frame after its end."""
+    position = min(max(seconds, 0.0) * clip.fps, clip.frame_count - 1)
+    first = math.floor(position + 1e-6)
+    share = position - first
+    frame = read_frame(clip, first, device)
+    return frame if share <= 1e-6 else blend_frames(frame, read_frame(clip, first + 1, device), share)
+
+
+def _name(index: int) -> str:
+    return f"frame_{index:05d}.safetensors"

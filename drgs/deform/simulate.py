@@ -1,0 +1,277 @@
+"""Matter moves an asset: particles from its mesh, the material point method, and where that takes vertices and surfels, frame by frame.
+
+In: an asset and a SimulationScene. Out: ClipFrames, which pose_scene shows and `save_clip` writes; frame 0 is the object at rest, the very
+tensors of the asset. The simulation runs in coordinates about the object's centre, so that distance from the world's origin costs no
+digits.
+"""
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from drgs.deform.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.clip import ClipFrame, blend_frames, save_clip
+from drgs.deform.fill_particles import FillSettings, Particles, fill_particles
+from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate
+from drgs.deform.mpm import (
+    Box,
+    Condition,
+    GridSettings,
+    Material,
+    Model,
+    MpmSettings,
+    Plane,
+    Sphere,
+    State,
+    advance,
+    make_model,
+    rest_state,
+)
+from drgs.deform.simulation_scene import SimulationScene, make_condition, make_material, make_shape
+from drgs.scene.asset import Asset
+from drgs.scene.gaussians import surfel_tangents
+
+LARGEST_STRETCH = 10.0
+"""Of a surfel; and 1/10 the least. Matter may stretch further, its picture would only smear."""
+STILL = 1e-4
+"""Cells a frame: below it, matter is at rest."""
+STILL_FRAMES = 3
+"""Frames at rest after which nothing is computed until something acts again."""
+ROOM_SIZES = 3.0
+"""How far the room reaches beyond the object on every side, in sizes of the object."""
+
+
+@dataclass(frozen=True)
+class SimulationReport:
+    """How a simulation went; what `drgs simulate --json` prints, and clip.json keeps."""
+
+    particles: int
+    dx: float
+    """World units."""
+    substeps: int
+    retries: int
+    frozen: int
+    frames: int
+    sleeping_frames: int
+    """Frames in which nothing was computed because everything was at rest."""
+    reached_wall: bool
+    warnings: tuple[str, ...]
+
+
+class Simulation:
+    """Frames of one asset in one scene, computed as far as somebody has asked, and kept. Final; safe to use from several threads."""
+
+    def __init__(self, asset: Asset, scene: SimulationScene) -> None:
+        """Fill the mesh and bind vertices and surfels; nothing moves yet.
+
+        Raises:
+            ValueError: one sentence: the mesh encloses nothing, or the scene does not fit the object.
+        """
+        self.scene = scene
+        self.frame_count = math.floor(scene.duration * scene.fps + 1e-6) + 1
+        self._asset = asset
+        self._lock = threading.Lock()
+        mesh = asset.mesh
+        self._center = ((mesh.vertices.amin(0).double() + mesh.vertices.amax(0).double()) / 2).cpu()
+        local = (mesh.vertices.double() - self._center.to(mesh.vertices.device)).float()
+        surface = "particles" if scene.variant == "paper" else "tracers"
+        filled = fill_particles(local, mesh.faces, FillSettings(scene.particles, surface=surface, seed=scene.seed))
+        self.warnings = _warnings(filled)
+        self.model = _make_model(asset, scene, filled, self._center)
+        self._settings = MpmSettings(
+            courant=scene.courant,
+            transfer="pic" if scene.variant == "paper" else "apic",
+            velocity_damping=scene.damping,
+        )
+        points = local
+        if asset.gaussians is not None:
+            centers = (asset.gaussians.centers.double() - self._center.to(local.device)).float()
+            points = torch.cat([local, centers])
+        gmls = GmlsSettings(isolated=3 * self.model.grid.dx, variant="paper_centred" if scene.variant == "paper" else "taylor")
+        self._weights: Weights = build_weights(self.model.rest, points, gmls, (local, mesh.faces))
+        self._state = _first_state(self.model, scene)
+        self._totals = {"substeps": 0, "retries": 0, "frozen": 0, "sleeping": 0, "wall": False}
+        self._still = 0
+        tangents = None if asset.gaussians is None else surfel_tangents(asset.gaussians)
+        self._rest_tangents = tangents
+        centers = None if asset.gaussians is None else asset.gaussians.centers
+        self._frames = [ClipFrame(mesh.vertices, mesh.normals, centers, tangents)]
+
+    @property
+    def report(self) -> SimulationReport:
+        totals = self._totals
+        return SimulationReport(
+            len(self.model.rest), self.model.grid.dx, totals["substeps"], totals["retries"], totals["frozen"], len(self._frames),
+            totals["sleeping"], totals["wall"], self.warnings,
+        )  # fmt: skip
+
+    @property
+    def state(self) -> State:
+        """Matter at the last frame computed, about the object's centre."""
+        return self._state
+
+    def frame(self, index: int) -> ClipFrame:
+        """Frame `index`, or the last of the scene if it has fewer; computed now if need be."""
+        index = min(index, self.frame_count - 1)
+        with self._lock:
+            while len(self._frames) <= index:
+                self._frames.append(self._next_frame())
+            return self._frames[index]
+
+    def at(self, seconds: float) -> ClipFrame:
+        """What is seen at a time: between two frames, their mean by time."""
+        position = min(max(seconds, 0.0) * self.scene.fps, self.frame_count - 1)
+        first = math.floor(position + 1e-6)
+        share = position - first
+        if share <= 1e-6:
+            return self.frame(first)
+        return blend_frames(self.frame(first), self.frame(first + 1), share)
+
+    def _next_frame(self) -> ClipFrame:
+        before, seconds = self._state, 1 / self.scene.fps
+        if self._still >= STILL_FRAMES and not _acts_later(self.model.conditions, before.time):
+            self._totals["sleeping"] += 1
+            self._state = replace(before, time=before.time + seconds)
+            return self._frames[-1]
+        self._state, report = advance(self.model, before, seconds, self._settings)
+        self._totals["substeps"] += report.substeps
+        self._totals["retries"] += report.retries
+        self._totals["frozen"] = report.frozen
+        self._totals["wall"] |= report.at_wall
+        moved = float((self._state.positions - before.positions).norm(dim=-1).max()) / self.model.grid.dx
+        self._still = self._still + 1 if moved < STILL else 0
+        if report.skipped:
+            return self._frames[-1]
+        return self._carry(self._state)
+
+    def _carry(self, state: State) -> ClipFrame:
+        mesh, vertices = self._asset.mesh, len(self._asset.mesh.vertices)
+        positions, gradients = interpolate(self._weights, state.positions, state.total)
+        positions = (positions.double() + self._center.to(positions.device)).float()
+        gradients = limit_stretch(gradients)
+        normals = carry_normals(mesh.normals, gradients[:vertices])
+        if self._rest_tangents is None:
+            return ClipFrame(positions, normals, None, None)
+        tangents = carry_tangents(self._rest_tangents, gradients[vertices:])
+        return ClipFrame(positions[:vertices].contiguous(), normals, positions[vertices:].contiguous(), tangents)
+
+
+def simulate(
+    asset: Asset, scene: SimulationScene, out: Path | None = None, progress: Callable[[int, int], None] | None = None
+) -> tuple[list[ClipFrame], SimulationReport]:
+    """Simulate a whole scene, and write it as a clip if `out` says where.
+
+    Args:
+        progress: told of each finished frame and of how many there will be.
+
+    Raises:
+        ValueError: one sentence: the mesh encloses nothing, the scene does not fit, or `out` is taken.
+    """
+    simulation = Simulation(asset, scene)
+
+    def frames() -> Iterator[ClipFrame]:
+        for index in range(simulation.frame_count):
+            yield simulation.frame(index)
+            if progress is not None:
+                progress(index + 1, simulation.frame_count)
+
+    if out is None:
+        return list(frames()), simulation.report
+    kept = list(frames())
+    details = {"scene": scene.model_dump(mode="json"), "report": vars(simulation.report) | {"warnings": list(simulation.report.warnings)}}
+    save_clip(out, kept, scene.fps, details)
+    return kept, simulation.report
+
+
+def limit_stretch(gradients: Tensor) -> Tensor:
+    """(n, 3, 3) with singular values within the bounds of a surfel's; matrices that have such values are returned as they were."""
+    # sigma_1 <= |F|, and sigma_3 >= J / sigma_1^2.
+    size = gradients.flatten(1).norm(dim=1)
+    suspect = (size > LARGEST_STRETCH) | (torch.linalg.det(gradients) < size.square() / LARGEST_STRETCH)
+    if not bool(suspect.any()):
+        return gradients
+    u, s, vt = torch.linalg.svd(gradients[suspect].double())
+    limited = gradients.clone()
+    limited[suspect] = (u @ torch.diag_embed(s.clamp(1 / LARGEST_STRETCH, LARGEST_STRETCH)) @ vt).to(gradients.dtype)
+    return limited
+
+
+def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center: Tensor) -> Model:
+    """Everything in world units, about the centre."""
+    interior = filled.positions[: filled.interior]
+    low, high = filled.positions.amin(0).double().cpu(), filled.positions.amax(0).double().cpu()
+    size = float((high - low).max())
+    axis = "xyz".index(scene.up)
+    dx = 2 * filled.spacing
+    materials: list[Material] = [make_material(scene.matter, size, asset.meters_per_unit)]
+    material_of = torch.zeros(len(filled.positions), dtype=torch.int64, device=interior.device)
+    for region in scene.regions:
+        held = _inside(_moved(make_shape(region.shape), -center), filled.positions)
+        if not bool(held.any()):
+            raise ValueError(f"the region {region.shape.model_dump(exclude_none=True)} holds no part of the object")
+        material_of[held] = len(materials)
+        materials.append(make_material(region.matter, size, asset.meters_per_unit))
+    gravity = [0.0, 0.0, 0.0]
+    gravity[axis] = -scene.gravity / asset.meters_per_unit
+    if scene.room is not None:
+        room_low = torch.tensor(scene.room.minimum, dtype=torch.float64) - center
+        room_high = torch.tensor(scene.room.maximum, dtype=torch.float64) - center
+    else:
+        room_low, room_high = low - ROOM_SIZES * size, high + ROOM_SIZES * size
+    conditions = [replace(c, shape=_moved(c.shape, -center)) for c in map(make_condition, scene.acts)]
+    if scene.floor is not None:
+        height = float(low[axis]) if scene.floor.height is None else scene.floor.height - float(center[axis])
+        point, normal = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        point[axis], normal[axis] = height, 1.0
+        conditions.append(Condition(Plane(tuple(point), tuple(normal)), scene.floor.effect, scene.floor.friction))
+        room_low[axis] = min(float(room_low[axis]), height - 4 * dx)
+    grid = GridSettings(tuple(room_low.tolist()), tuple(room_high.tolist()), dx)
+    return make_model(filled.positions, filled.volumes, tuple(materials), material_of, grid, tuple(gravity), tuple(conditions))
+
+
+def _first_state(model: Model, scene: SimulationScene) -> State:
+    weight = model.masses[:, None] / model.masses.sum()
+    arm = model.rest - (weight * model.rest).sum(0)
+    spin = model.rest.new_tensor(scene.spin).expand_as(model.rest)
+    state = rest_state(model, (torch.linalg.cross(spin, arm) + model.rest.new_tensor(scene.velocity)).contiguous())
+    x, y, z = scene.spin
+    turning = model.rest.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return replace(state, affine=turning.expand_as(state.affine).contiguous())
+
+
+def _moved(shape: Plane | Sphere | Box, shift: Tensor) -> Plane | Sphere | Box:
+    def place(point: tuple[float, float, float]) -> tuple[float, float, float]:
+        return tuple(p + s for p, s in zip(point, shift.tolist(), strict=True))  # type: ignore[return-value]
+
+    if isinstance(shape, Plane):
+        return Plane(place(shape.point), shape.normal)
+    if isinstance(shape, Sphere):
+        return Sphere(place(shape.center), shape.radius)
+    return Box(place(shape.minimum), place(shape.maximum))
+
+
+def _inside(shape: Plane | Sphere | Box, points: Tensor) -> Tensor:
+    if isinstance(shape, Plane):
+        return (points - points.new_tensor(shape.point)) @ points.new_tensor(shape.normal) <= 0
+    if isinstance(shape, Sphere):
+        return (points - points.new_tensor(shape.center)).norm(dim=-1) <= shape.radius
+    return ((points >= points.new_tensor(shape.minimum)) & (points <= points.new_tensor(shape.maximum))).all(-1)
+
+
+def _acts_later(conditions: tuple[Condition, ...], time: float) -> bool:
+    """Whether something moves, pushes, begins or ends from now on."""
+    return any(time < c.start or (math.isfinite(c.end) and time < c.end) or (any(c.velocity) and time < c.end) for c in conditions)
+
+
+def _warnings(filled: Particles) -> tuple[str, ...]:
+    if filled.thin_fraction > 0.1:
+        return (
+            f"{filled.thin_fraction:.0%} of the surface belongs to parts thinner than three grid cells, which bend too easily: "
+            "use more particles",
+        )
+    return ()

@@ -1,0 +1,176 @@
+"""An asset in a simulation: it moves as matter does, plays from a clip, and is at rest again when the edit is undone."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+import trimesh
+
+from drgs.deform.clip import frame_at, open_clip, save_clip
+from drgs.deform.pose_scene import pose_scene
+from drgs.deform.simulate import Simulation, limit_stretch, simulate
+from drgs.deform.simulation_scene import make_material, parse_simulation_scene
+from drgs.scene.asset import Asset
+from drgs.scene.edits import parse_edits
+from drgs.scene.environment import Environment
+from drgs.scene.gaussians import Gaussians
+from drgs.scene.mesh import TriangleMesh
+
+CENTER = (2.0, -1.0, 5.0)
+SMALL = {"particles": 400, "duration": 0.5, "fps": 20}
+
+
+def ball_asset(surfels=True) -> Asset:
+    """A ball of radius 0.5 far from the origin, a surfel on every face."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    vertices = torch.tensor(ball.vertices + CENTER, dtype=torch.float32)
+    faces = torch.tensor(ball.faces, dtype=torch.int32)
+    normals = torch.tensor(ball.vertices / 0.5, dtype=torch.float32)
+    count = len(faces)
+    mesh = TriangleMesh(
+        vertices, faces, normals, torch.full_like(vertices, 0.5), torch.full((len(vertices),), 0.5), torch.zeros(len(vertices))
+    )
+    gaussians = Gaussians(
+        vertices[faces.long()].mean(1), torch.full((count, 2), -3.0), torch.randn(count, 4), torch.zeros(count), torch.zeros(count, 16, 3),
+        torch.full((count, 3), 0.5), torch.full((count,), 0.5), torch.zeros(count),
+    )  # fmt: skip
+    return Asset(gaussians if surfels else None, mesh, None, Environment(torch.ones(4, 8, 3)))
+
+
+def scene(**settings):
+    return parse_simulation_scene(SMALL | settings)
+
+
+def test_an_object_in_free_fall_moves_rigidly_and_as_far_as_gravity_says():
+    asset = ball_asset()
+    simulation = Simulation(asset, scene(floor=None, spin=[0, 0, 1.0]))
+    frame = simulation.at(0.2)
+    fallen = frame.vertices.mean(0) - asset.mesh.vertices.mean(0)
+    # The scheme updates velocities first: it falls by g t (t + dt) / 2, and so coarse a grid has long steps.
+    assert torch.allclose(fallen, torch.tensor([0, 0, -0.5 * 9.81 * 0.04]), atol=8e-3)
+    size = (frame.vertices - frame.vertices.mean(0)).norm(dim=-1)
+    assert float((size - 0.5).abs().max()) < 5e-3  # a slow spin hardly stretches jelly
+    turned = torch.atan2(*(frame.vertices - frame.vertices.mean(0)).T[[1, 0]]) - torch.atan2(
+        *(asset.mesh.vertices - torch.tensor(CENTER)).T[[1, 0]]
+    )
+    assert float(turned[(size > 0.4)].remainder(2 * torch.pi).median()) == pytest.approx(0.2, abs=0.02)
+    normals = torch.nn.functional.normalize(frame.vertices - frame.vertices.mean(0), dim=-1)
+    assert float((normals * frame.normals).sum(-1).min()) > 0.99
+    assert torch.allclose(frame.centers, frame.vertices[asset.mesh.faces.long()].mean(1), atol=2e-2)
+
+
+def test_jelly_on_the_floor_sags_under_its_weight_and_rubber_less():
+    sag = {}
+    for preset in ("jelly", "rubber"):
+        frame = Simulation(ball_asset(surfels=False), scene(matter={"preset": preset}, damping=3.0)).at(0.5)
+        sag[preset] = 5.5 - float(frame.vertices[:, 2].max())
+        assert frame.centers is None and float(frame.vertices[:, 2].min()) > 4.5 - 0.11  # half a cell
+    assert 0.0 < sag["rubber"] < sag["jelly"] < 0.4
+
+
+def test_simulate_edits_pose_the_scene_are_computed_once_and_undo_bit_for_bit():
+    asset = ball_asset()
+    edit = {"op": "simulate", "scene": SMALL | {"floor": None}, "time": 0.1}
+    before, moved = pose_scene(asset, []), pose_scene(asset, parse_edits([edit]))
+    assert float((moved.mesh.vertices - asset.mesh.vertices)[:, 2].mean()) == pytest.approx(-0.049, abs=5e-3)
+    assert moved.mesh.albedo is asset.mesh.albedo and moved.surfels.materials.albedo is asset.gaussians.albedo
+    again = pose_scene(asset, parse_edits([edit, {"op": "environment", "rotation": 20.0}]))
+    assert again.mesh.vertices is moved.mesh.vertices and again.surfels.tangents is moved.surfels.tangents
+    undone, at_zero = pose_scene(asset, []), pose_scene(asset, parse_edits([edit | {"time": 0.0}]))
+    assert undone.mesh is asset.mesh and undone.surfels.tangents is before.surfels.tangents
+    assert at_zero.mesh.vertices is asset.mesh.vertices and at_zero.surfels.tangents is before.surfels.tangents
+    # Another time of the same scene continues, it does not begin again; and an earlier one is still known.
+    later = pose_scene(asset, parse_edits([edit | {"time": 0.15}]))
+    assert float(later.mesh.vertices[:, 2].mean()) < float(moved.mesh.vertices[:, 2].mean())
+    assert torch.equal(pose_scene(asset, parse_edits([edit])).mesh.vertices, moved.mesh.vertices)
+
+
+def test_a_clip_on_disk_plays_what_was_simulated(tmp_path):
+    asset = ball_asset()
+    frames, report = simulate(asset, scene(floor=None), tmp_path / "fall")
+    assert (
+        report.frames == len(frames) == 11
+        and json.loads((tmp_path / "fall" / "clip.json").read_text())["report"]["particles"] == report.particles
+    )
+    clip = open_clip(tmp_path / "fall")
+    assert torch.equal(frame_at(clip, 0.25).vertices, frames[5].vertices) and torch.equal(frame_at(clip, 9.0).centers, frames[10].centers)
+    between = frame_at(clip, 0.225).vertices
+    assert torch.allclose(between, (frames[4].vertices + frames[5].vertices) / 2, atol=1e-6)
+    posed = pose_scene(asset, parse_edits([{"op": "pose", "clip": "fall", "time": 0.25}]), base_directory=tmp_path)
+    assert torch.equal(posed.mesh.vertices, frames[5].vertices) and torch.equal(posed.surfels.tangents, frames[5].tangents)
+    with pytest.raises(ValueError, match="made for another object"):
+        pose_scene(replace(asset, gaussians=None), parse_edits([{"op": "pose", "clip": "fall", "time": 0.25}]), base_directory=tmp_path)
+    with pytest.raises(ValueError, match="outside the folder"):
+        pose_scene(asset, parse_edits([{"op": "pose", "clip": "../fall", "time": 0}]), base_directory=tmp_path / "other", confine=True)
+
+
+def test_damaged_and_foreign_clips_are_refused(tmp_path):
+    asset = ball_asset()
+    rest = Simulation(asset, scene()).frame(0)
+    save_clip(tmp_path / "clip", [rest, rest], 24.0, {})
+    frame = tmp_path / "clip" / "frame_00001.safetensors"
+    frame.write_bytes(frame.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="not a readable frame"):
+        frame_at(open_clip(tmp_path / "clip"), 1.0)
+    manifest = json.loads((tmp_path / "clip" / "clip.json").read_text())
+    (tmp_path / "clip" / "clip.json").write_text(json.dumps(manifest | {"version": 9}))
+    with pytest.raises(ValueError, match="version 9"):
+        open_clip(tmp_path / "clip")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "letter.txt").write_text("dear")
+    with pytest.raises(ValueError, match="is no clip"):
+        save_clip(tmp_path / "other", [rest], 24.0, {})
+    assert (tmp_path / "other" / "letter.txt").exists()
+
+
+def test_an_object_that_nothing_moves_keeps_its_tensors():
+    asset = ball_asset()
+    frames, report = simulate(asset, scene(gravity=0.0))
+    assert report.substeps == 0 and all(frame.vertices is asset.mesh.vertices for frame in frames)
+
+
+def test_regions_hold_another_matter_and_acts_hold_parts_in_place():
+    hold = {"shape": {"box": {"minimum": [1, -2, 5.2], "maximum": [3, 0, 6]}}, "effect": "sticky"}
+    hanging = Simulation(ball_asset(), scene(floor=None, acts=[hold], matter={"preset": "rubber"})).at(0.3)
+    assert float(hanging.vertices[:, 2].max()) > 5.45  # else it would have fallen 0.44
+    region = {"shape": {"sphere": {"center": [2, -1, 5.4], "radius": 0.3}}, "matter": {"preset": "rubber"}}
+    model = Simulation(ball_asset(), scene(regions=[region])).model
+    assert 0 < int((model.laws == 1).sum()) < len(model.laws)
+    with pytest.raises(ValueError, match="holds no part"):
+        Simulation(ball_asset(), scene(regions=[region | {"shape": {"sphere": {"center": [9, 9, 9], "radius": 1}}}]))
+
+
+def test_presets_look_alike_at_every_scale():
+    for preset in ("jelly", "rubber", "clay", "sand", "snow", "honey"):
+        matter = parse_simulation_scene({"matter": {"preset": preset}}).matter
+        small, large = make_material(matter, 0.1, 1.0), make_material(matter, 10.0, 1.0)
+        in_millimetres = make_material(matter, 100.0, 1e-3)  # the small one again
+        crossing = [
+            m.wave_speed / (9.81 / unit * size) ** 0.5 for m, size, unit in ((small, 0.1, 1), (large, 10, 1), (in_millimetres, 100, 1e-3))
+        ]
+        assert crossing[0] == pytest.approx(crossing[1]) == pytest.approx(crossing[2])
+    soft = make_material(parse_simulation_scene({"matter": {"preset": "jelly", "young_modulus": 5e3}}).matter, 1.0, 0.5)
+    assert soft.young_modulus == pytest.approx(2.5e3)  # Pa, in kg / (half metre s^2)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"matter": {"preset": "lead"}}, "matter.preset"),
+        ({"matter": {}}, "preset or a law"),
+        ({"duration": 1e9}, "duration"),
+        ({"acts": [{"shape": {}}]}, "exactly one of plane, sphere, box"),
+        ({"colour": "red"}, "colour"),
+    ],
+)
+def test_wrong_scenes_are_refused_by_the_name_of_the_field(wrong, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        parse_simulation_scene(wrong)
+
+
+def test_stretches_are_limited_for_the_picture_only_where_they_exceed_it():
+    tame = torch.eye(3).expand(4, 3, 3) * 1.5
+    assert limit_stretch(tame) is tame
+    wild = torch.diag_embed(torch.tensor([[100.0, 1.0, 0.001]]))
+    assert torch.allclose(limit_stretch(wild), torch.diag_embed(torch.tensor([[10.0, 1.0, 0.1]])))
