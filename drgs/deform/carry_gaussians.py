@@ -4,6 +4,8 @@ Where F is inverted or nearly singular (a folded mesh), its signed singular valu
 an area and a side. Source: docs/sources.md (huang2024 for B); the cofactor rule is Nanson's formula.
 """
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
@@ -45,9 +47,26 @@ def guard_gradient(gradient: Tensor) -> Tensor:
     return guarded
 
 
-def carry_tangents(tangents: Tensor, gradient: Tensor) -> Tensor:
-    """(n, 3, 2) moved tangents B' = F B of tangents (n, 3, 2); F (n, 3, 3) is guarded here."""
-    return guard_gradient(gradient) @ tangents
+def carry_tangents(
+    tangents: Tensor,
+    gradient: Tensor,
+    variant: Literal["exact", "paper"] = "exact",
+    order: Literal["ascending", "descending"] = "ascending",
+) -> Tensor:
+    """(n, 3, 2) moved tangents B' = F B of tangents (n, 3, 2); F (n, 3, 3) is guarded here.
+
+    Args:
+        variant: paper: Eq. 7 of drgs2026. F = R S; the tangents turn with R and are scaled by two eigenvalues of S, whatever axes
+            those belong to. For comparison: it is right for rotations and uniform scales only.
+        order: of the eigenvalues, which the paper leaves open.
+    """
+    gradient = guard_gradient(gradient)
+    if variant == "exact":
+        return gradient @ tangents
+    u, s, vt = torch.linalg.svd(gradient.double())
+    lengths = s.flip(-1) if order == "ascending" else s  # lambda_1, lambda_2, lambda_3; torch sorts descending
+    scale = torch.stack([lengths[:, 1], lengths[:, 0]], -1)
+    return ((u @ vt) @ tangents.double() * scale[:, None]).to(tangents.dtype)
 
 
 def carry_normals(normals: Tensor, gradient: Tensor) -> Tensor:

@@ -5,10 +5,12 @@ rest, F of a surfel by its barycentrics; then B' = F B, and the centre keeps its
 p' = sum w v' + F (p - sum w v). That reproduces the rest pose, rigid motions and similarities.
 """
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
-from drgs.deform.carry_gaussians import carry_tangents
+from drgs.deform.carry_gaussians import carry_tangents, guard_gradient
 from drgs.scene.binding import Binding
 
 DEGENERATE = 1e-12
@@ -32,14 +34,39 @@ def vertex_gradients(vertices: Tensor, moved: Tensor, faces: Tensor) -> Tensor:
 
 
 def drive_surfels(
-    vertices: Tensor, moved: Tensor, faces: Tensor, gradients: Tensor, binding: Binding, centers: Tensor, tangents: Tensor
+    vertices: Tensor,
+    moved: Tensor,
+    faces: Tensor,
+    gradients: Tensor,
+    binding: Binding,
+    centers: Tensor,
+    tangents: Tensor,
+    variant: Literal["corrected", "paper"] = "corrected",
 ) -> tuple[Tensor, Tensor]:
-    """Moved centres (surfel, 3) and tangents (surfel, 3, 2), from the mesh at rest, moved, and `vertex_gradients`."""
+    """Moved centres (surfel, 3) and tangents (surfel, 3, 2), from the mesh at rest, moved, and `vertex_gradients`.
+
+    Args:
+        variant: paper: Eq. 8 of drgs2026 as printed. Centres move by the mean of the corners' displacements, so the offset along the
+            normal does not turn; rotations and stretches of the corners are averaged as matrices, then Eq. 7. For comparison.
+    """
     corners = faces.long()[binding.face.long()]
     weights = binding.barycentric[..., None]
+    if variant == "paper":
+        rotation, stretch = _polar(gradients)
+        blended = (rotation[corners] * weights[..., None]).sum(1)
+        lengths = torch.linalg.eigvalsh((stretch[corners] * weights[..., None]).sum(1).double()).abs().to(tangents.dtype)  # ascending
+        scale = torch.stack([lengths[:, 1], lengths[:, 0]], -1)
+        return centers + ((moved - vertices)[corners] * weights).sum(1), blended @ tangents * scale[:, None]
     gradient = (gradients[corners] * weights[..., None]).sum(1)
     foot, foot_moved = (vertices[corners] * weights).sum(1), (moved[corners] * weights).sum(1)
     return foot_moved + (gradient @ (centers - foot)[..., None]).squeeze(-1), carry_tangents(tangents, gradient)
+
+
+def _polar(gradients: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation and symmetric stretch (n, 3, 3) of F = R S, guarded."""
+    f = guard_gradient(gradients).double()
+    u, s, vt = torch.linalg.svd(f)
+    return (u @ vt).to(gradients.dtype), (vt.mT @ torch.diag_embed(s) @ vt).to(gradients.dtype)
 
 
 def _face_frames(vertices: Tensor, faces: Tensor) -> Tensor:

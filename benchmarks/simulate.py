@@ -1,0 +1,166 @@
+"""Time the material point method: a cube of 1 m falls onto a floor; one frame is 1/24 s.
+
+    python -m benchmarks simulate [--particles 20000] [--law fixed_corotated] [--young 1e5] [--frames 6] [--json] [--sweep | --stability]
+
+--sweep runs the same fall with time steps from half the default to twice it, and prints how much of the energy is left and how far the
+particles end from where the smallest step leads. --stability runs extremes of stiffness, incompressibility, speed and number, and says
+what became of each: docs/stability.md.
+"""
+
+import argparse
+import json
+import statistics
+import time
+
+import torch
+
+from drgs.deform.mpm import (
+    LAWS,
+    Condition,
+    GridSettings,
+    Material,
+    Model,
+    MpmSettings,
+    Plane,
+    advance,
+    make_model,
+    measure_balance,
+    rest_state,
+)
+from drgs.warp_torch import device_from_name, thread_count
+
+FRAME = 1 / 24
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks simulate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--particles", type=int, default=20_000)
+    parser.add_argument("--law", choices=LAWS, default="fixed_corotated")
+    parser.add_argument("--young", type=float, default=1e5, help="E [Pa]; the bulk modulus of a fluid")
+    parser.add_argument("--frames", type=int, default=6)
+    parser.add_argument("--device", default="cpu", choices=["auto", "cpu", "cuda"])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--dx", type=float, help="Cell size [m]; by default eight particles a cell.")
+    parser.add_argument("--sweep", action="store_true")
+    parser.add_argument("--stability", action="store_true")
+    given = parser.parse_args(arguments)
+    if given.particles < 1 or given.frames < 1:
+        raise ValueError(f"--particles and --frames are {given.particles} and {given.frames}; expected at least 1 of each")
+    model = falling_cube(
+        given.particles, Material(given.law, young_modulus=given.young, bulk_modulus=given.young, yield_stress=1e3), given.device
+    )
+    result = sweep(model) if given.sweep else measure(model, given.frames)
+    print(json.dumps(result, indent=None if given.json else 1))
+
+
+def falling_cube(particles: int, material: Material, device: str = "cpu", drop: float = 0.05, dx: float | None = None) -> Model:
+    """A cube of 1 m, eight particles a cell, `drop` metres above the floor."""
+    side = max(1, round(particles ** (1 / 3)))
+    steps = (torch.arange(side) + 0.5) / side
+    points = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3) + torch.tensor([0, 0, drop])
+    dx = dx or min(2 / side, 0.25)
+    grid = GridSettings((-1, -1, -5 * dx), (2, 2, 3), dx)
+    volumes = torch.full((len(points),), 1 / len(points))
+    floor = Condition(Plane((0, 0, 0), (0, 0, 1)), friction=0.3)
+    chosen = device_from_name(device)
+    return make_model(points.to(chosen), volumes.to(chosen), (material,), torch.zeros(len(points)), grid, (0, 0, -9.81), (floor,))
+
+
+def measure(model: Model, frames: int) -> dict:
+    """Median wall time a frame, after one that compiles."""
+    state = rest_state(model)
+    advance(model, state, FRAME / 10)
+    times, substeps = [], 0
+    for _ in range(frames):
+        start = time.perf_counter()
+        state, report = advance(model, state, FRAME)
+        state.positions.sum().item()  # waits for a GPU
+        times.append(1e3 * (time.perf_counter() - start))
+        substeps += report.substeps
+    median = statistics.median(times)
+    return {
+        "particles": len(model.rest),
+        "ms_per_frame": round(median, 3),
+        "substeps_per_frame": round(substeps / frames, 1),
+        "ns_per_particle_step": round(1e6 * sum(times) / substeps / len(model.rest), 1),
+        "fastest_ms_per_frame": round(min(times), 3),
+        "threads": thread_count(),
+        "device": str(model.rest.device),
+    }
+
+
+def sweep(model: Model, seconds: float = 0.25) -> dict:
+    """Time steps at parts of the limit C = 1: where the particles end, against C = 0.1, and the energy left."""
+    start = rest_state(model)
+    energy = measure_balance(model, start).energy
+    rows, truth = [], None
+    for courant in (0.1, 0.2, 0.4, 0.6, 0.8, 0.9):
+        clock = time.perf_counter()
+        state, report = advance(model, start, seconds, MpmSettings(courant=courant))
+        clock = time.perf_counter() - clock
+        truth = state.positions if truth is None else truth
+        rows.append(
+            {
+                "courant": courant,
+                "substeps": report.substeps,
+                "retries": report.retries,
+                "seconds": round(clock, 3),
+                "position_rms": float((state.positions - truth).square().sum(-1).mean().sqrt()),
+                "energy_left": measure_balance(model, state).energy / energy,
+            }
+        )
+    return {"particles": len(model.rest), "sweep": rows}
+
+
+def stability() -> list[dict]:
+    """One row for each extreme: what was done, and what became of it."""
+    rows = []
+
+    def attempt(
+        what: str, model: Model, settings: MpmSettings | None = None, seconds: float = 0.1, velocity: tuple = (0.0, 0.0, -3.0)
+    ) -> None:
+        start = rest_state(model, velocity)
+        before = measure_balance(model, start)
+        row = {"case": what, "particles": len(model.rest)}
+        clock = time.perf_counter()
+        try:
+            state, report = advance(model, start, seconds, settings or MpmSettings(max_substeps=20_000))
+        except ValueError as error:
+            rows.append(row | {"result": f"refused: {error}"})
+            return
+        finite = all(bool(torch.isfinite(value).all()) for value in (state.positions, state.velocities, state.total))
+        row |= {
+            "substeps": report.substeps,
+            "retries": report.retries,
+            "frozen": report.frozen,
+            "finite": finite,
+            "at_wall": report.at_wall,
+        }
+        row |= {
+            "energy_left": round(measure_balance(model, state).energy / before.energy, 4),
+            "seconds": round(time.perf_counter() - clock, 2),
+        }
+        rows.append(row | {"result": f"fastest {float(state.velocities.norm(dim=-1).max()):.2f} m/s"})
+
+    for exponent in range(2, 10):
+        attempt(f"E = 1e{exponent} Pa", falling_cube(512, Material(young_modulus=10.0**exponent)), seconds=0.1 if exponent < 8 else 0.02)
+    for ratio in (0.0, 0.45, 0.49):
+        for law in ("fixed_corotated", "neo_hookean"):
+            attempt(f"nu = {ratio}, {law}", falling_cube(512, Material(law, young_modulus=1e5, poisson_ratio=ratio)))
+    for law in LAWS:
+        attempt(f"{law}, 10 m/s", falling_cube(512, Material(law, yield_stress=1e3)), velocity=(0.0, 0.0, -10.0))
+    for courant in (0.2, 0.4, 0.8, 0.9):
+        attempt(f"C = {courant}", falling_cube(4096, Material()), MpmSettings(courant=courant, max_substeps=20_000))
+    for count in (1, 8, 1000, 100_000):
+        attempt(f"{count} particles", falling_cube(count, Material(young_modulus=1e4)), seconds=0.05)
+    attempt("out of the room at 100 m/s", falling_cube(512, Material()), velocity=(100.0, 60.0, 80.0))
+    attempt("2000 substeps allowed, E = 1e9 Pa", falling_cube(4096, Material(young_modulus=1e9)), MpmSettings(), seconds=FRAME * 4)
+    return rows
+
+
+if __name__ == "__main__":
+    import sys
+
+    main(sys.argv[1:])

@@ -1,0 +1,26 @@
+import json
+
+import pytest
+
+from benchmarks import carry, simulate
+
+
+def test_the_simulation_benchmark_prints_one_document_with_its_time(capsys):
+    simulate.main(["--particles", "216", "--young", "1e3", "--frames", "1", "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert result["particles"] == 216 and result["ms_per_frame"] > 0
+
+
+def test_the_carrying_benchmark_prints_one_document_with_its_time(capsys):
+    carry.main(["--surfels", "500", "--particles", "216", "--repeats", "1", "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert result["surfels"] == 500 and result["ms"] > 0
+
+
+def test_the_error_tables_show_the_paper_behind_ours(capsys):
+    carry.main(["--errors", "--json"])
+    tables = json.loads(capsys.readouterr().out)
+    far = tables["interpolation"][2]
+    assert far["taylor"] < far["paper_centred"] < far["paper"]
+    shear = next(row for row in tables["surfels"] if row["gradient"] == "shear x += 1.0 z")
+    assert shear["normal_degrees"] == pytest.approx(26.6, abs=0.1) and shear["covariance_ascending"] == pytest.approx(0.63, abs=0.01)

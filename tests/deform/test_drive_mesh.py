@@ -1,0 +1,84 @@
+"""The corrected rule of mesh-driven surfels beside the one printed in the paper."""
+
+import math
+
+import pytest
+import torch
+import trimesh
+
+from drgs.deform.carry_gaussians import carry_tangents
+from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
+from drgs.maths.frames import rotation_from_quat_wxyz
+from drgs.scene.binding import Binding
+
+
+def ball():
+    """Vertices, faces, a binding of one surfel 0.1 outside every face, centres, tangents."""
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    vertices, faces = torch.tensor(mesh.vertices, dtype=torch.float32), torch.tensor(mesh.faces, dtype=torch.int32)
+    normals = torch.tensor(mesh.face_normals, dtype=torch.float32)
+    count = len(faces)
+    binding = Binding(torch.arange(count, dtype=torch.int32), torch.full((count, 3), 1 / 3), torch.full((count,), 0.1))
+    first = torch.nn.functional.normalize(torch.linalg.cross(normals, torch.tensor([0.3, 0.5, 0.8]).expand_as(normals)), dim=-1)
+    tangents = torch.stack([0.1 * first, 0.05 * torch.linalg.cross(normals, first)], -1)
+    return vertices, faces, binding, vertices[faces.long()].mean(1) + 0.1 * normals, tangents
+
+
+def driven(moved, variant):
+    vertices, faces, binding, centers, tangents = ball()
+    gradients = vertex_gradients(vertices, moved, faces)
+    return drive_surfels(vertices, moved, faces, gradients, binding, centers, tangents, variant)
+
+
+@pytest.mark.parametrize("angle", [0.2, 1.0, 1.57, 3.14])
+def test_the_printed_rule_does_not_turn_the_offset_from_the_mesh_and_ours_does(angle):
+    turn = rotation_from_quat_wxyz(torch.tensor([math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]))
+    vertices, _, _, centers, tangents = ball()
+    position, moved_tangents = driven(vertices @ turn.T, "corrected")
+    assert torch.allclose(position, centers @ turn.T, atol=2e-6) and torch.allclose(moved_tangents, turn @ tangents, atol=1e-6)
+    printed, _ = driven(vertices @ turn.T, "paper")
+    error = (printed - centers @ turn.T).norm(dim=-1)
+    bound = 2 * 0.1 * math.sin(angle / 2)
+    assert 0.9 * bound < float(error.max()) <= bound * 1.001
+
+
+def test_the_printed_rule_shrinks_surfels_where_rotations_differ():
+    vertices = ball()[0]
+    turn = 2.5 * vertices[:, 2]
+    twisted = torch.stack(
+        [
+            vertices[:, 0] * turn.cos() - vertices[:, 1] * turn.sin(),
+            vertices[:, 0] * turn.sin() + vertices[:, 1] * turn.cos(),
+            vertices[:, 2],
+        ],
+        -1,
+    )
+    ours, printed = driven(twisted, "corrected")[1], driven(twisted, "paper")[1]
+    assert torch.isfinite(printed).all() and not torch.allclose(ours, printed, atol=1e-2)
+
+
+def test_the_identity_pose_gives_back_the_rest_in_both_variants():
+    vertices, _, _, centers, tangents = ball()
+    for variant in ("corrected", "paper"):
+        position, moved = driven(vertices.clone(), variant)
+        assert torch.allclose(position, centers, atol=1e-6) and torch.allclose(moved, tangents, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "ascending", "degrees"),
+    [
+        (torch.diag(torch.tensor([1.5, 1.5, 1.5])), 0.0, 0.0),
+        (torch.diag(torch.tensor([2.0, 1.0, 1.0])), 0.75, 0.0),
+        (torch.tensor([[1.0, 0, 0.5], [0, 1, 0], [0, 0, 1]]), 0.35, 14.0),
+        (torch.tensor([[1.0, 0, 1.0], [0, 1, 0], [0, 0, 1]]), 0.63, 26.6),
+        (torch.tensor([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]), 0.43, 0.0),
+    ],
+)
+def test_equation_7_errs_by_what_is_known_where_the_exact_rule_does_not(gradient, ascending, degrees):
+    tangents = torch.tensor([[[1.0, 0.0], [0.0, 0.5], [0.0, 0.0]]])
+    exact, paper = carry_tangents(tangents, gradient[None]), carry_tangents(tangents, gradient[None], variant="paper")
+    covariance = gradient @ tangents @ tangents.mT @ gradient.T
+    assert torch.allclose(exact @ exact.mT, covariance, atol=1e-6)
+    assert float((paper @ paper.mT - covariance).norm() / covariance.norm()) == pytest.approx(ascending, abs=0.02)
+    normals = [torch.nn.functional.normalize(torch.linalg.cross(b[..., 0], b[..., 1]), dim=-1) for b in (exact, paper)]
+    assert math.degrees(math.acos(min(1.0, float((normals[0] * normals[1]).sum())))) == pytest.approx(degrees, abs=0.1)
