@@ -45,5 +45,5 @@ def test_a_median_of_few_repeats_is_refused(workload: Path):
 
 
 def test_an_unknown_benchmark_is_refused_with_those_there_are():
-    with pytest.raises(ValueError, match="build, .*rasterize"):
+    with pytest.raises(ValueError, match=r"build, .*rasterize"):
         main(["nonsense"])
