@@ -112,7 +112,9 @@ def start_materials(
         "roughness_logits": _logit(gaussians.roughness),
         "metallic_logits": _logit(gaussians.metallic),
     } | {name: value for name, value in stage_one.items() if name.startswith("environment_")}
-    parameters = {name: value.detach().clone().requires_grad_(True) for name, value in parameters.items()}
+    # Row-major like a checkpoint's: sums round by memory layout, and a resumed fit must end with the same bits.
+    copies = {name: value.detach().clone(memory_format=torch.contiguous_format) for name, value in parameters.items()}
+    parameters = {name: value.requires_grad_(True) for name, value in copies.items()}
     groups = []
     for name, value in parameters.items():
         rate = getattr(settings.rates, "environment" if name.startswith("environment") else name) * (radius if name == "centers" else 1.0)
