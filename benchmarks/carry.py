@@ -61,8 +61,10 @@ def measure(surfels: int, particles: int, repeats: int, device: str) -> dict:
     clock = time.perf_counter()
     weights = build_weights(rest, points)
     built = time.perf_counter() - clock
-    gather, whole = [], []
-    for _ in range(repeats + 1):
+    gather, whole, busy = [], [], 0.0
+    for repeat in range(repeats + 1):
+        if repeat == 1:
+            busy = time.process_time()
         start = time.perf_counter()
         position, gradient = interpolate(weights, moved, gradients)
         position.sum().item()
@@ -70,11 +72,13 @@ def measure(surfels: int, particles: int, repeats: int, device: str) -> dict:
         carry_tangents(tangents, gradient).sum().item()
         gather.append(1e3 * (middle - start))
         whole.append(1e3 * (time.perf_counter() - start))
+    busy = time.process_time() - busy
     return {
         "surfels": surfels,
         "ms": round(statistics.median(whole[1:]), 3),
         "interpolation_ms": round(statistics.median(gather[1:]), 3),
         "fastest_ms": round(min(whole[1:]), 3),
+        "cpu_ms": round(1e3 * busy / repeats, 3),
         "build_seconds": round(built, 3),
         "particles": len(rest),
         "threads": thread_count(),
