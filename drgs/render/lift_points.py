@@ -31,6 +31,7 @@ def lift_points(points: ShadingPoints, tracer: AbstractTracer) -> RayStarts:
     face_normals = torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
 
     start, surface_normal = position + tracer.lift * normal, normal.clone()
+    face = torch.full((len(position),), -1, dtype=torch.int32, device=position.device)
     left = torch.arange(len(position), device=position.device)
     for axis, share, facing in ((wo, NEAR, FACING), (normal, NEAR, FACING), (wo, FAR, -1.0)):
         reach, away = share * tracer.extent, axis[left]
@@ -42,5 +43,6 @@ def lift_points(points: ShadingPoints, tracer: AbstractTracer) -> RayStarts:
         met = position[chosen] + (reach - hits.distance[near])[:, None] * away[near]
         start[chosen] = met + tracer.lift * outward[near]
         surface_normal[chosen] = outward[near]
+        face[chosen] = hits.face[near]
         left = left[~near]
-    return RayStarts(start, surface_normal)
+    return RayStarts(start, surface_normal, face)

@@ -1,16 +1,20 @@
 """What a frame leaves out, and why: facts about the scene in, a RenderPlan out.
 
-Every rule here is exact in expectation: it moves samples between strategies or drops work whose result is known. With
-`skip` off nothing is left out, and a test compares both. The plan is reported in the frame's metadata.
+Most rules are exact in expectation: they move samples between strategies or drop work whose result is known; `bound` says where one is
+not. With `skip` off nothing is left out, and tests compare both. The plan is reported in the frame's metadata.
+What one frame takes over from another is invalidate.py's.
 """
 
 from dataclasses import dataclass
 
 from drgs.render.sample_rays import SampleCounts
 from drgs.scene.environment import Environment
+from drgs.scene.posed_scene import PosedScene
 
 EVEN_SKY = 1e-3
 """A sky whose texels differ by no more than this share is sampled as well by the cosine."""
+ROUGH = 0.7
+"""From this roughness on the lobe of a dielectric is so broad that cosine samples find it."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,19 @@ class Skip:
 
 
 @dataclass(frozen=True)
+class SceneFacts:
+    """What plan_frame looks at besides the light; over all surfaces, seen or not."""
+
+    largest_diffuse: float
+    """Of (1 - metallic) times the albedo's largest channel."""
+    largest_metallic: float
+    smallest_roughness: float
+    empty_tiles: int = 0
+    """Tiles of the image without a surface, of `tiles`."""
+    tiles: int = 0
+
+
+@dataclass(frozen=True)
 class RenderPlan:
     """How a frame's samples are spent. Written by plan_frame, read by refine_frame."""
 
@@ -34,12 +51,34 @@ class RenderPlan:
     skips: tuple[Skip, ...]
 
 
-def plan_frame(environment: Environment, intensity: float, counts: SampleCounts, bounces: int, skip: bool) -> RenderPlan:
+def scene_facts(scene: PosedScene, empty_tiles: int = 0, tiles: int = 0) -> SceneFacts:
+    """Facts about the materials of mesh and Gaussians."""
+    carriers = [scene.mesh] if scene.surfels is None else [scene.mesh, scene.surfels.materials]
+    return SceneFacts(
+        max(float(((1 - m.metallic) * m.albedo.amax(-1)).max()) for m in carriers),
+        max(float(m.metallic.max()) for m in carriers),
+        min(float(m.roughness.min()) for m in carriers),
+        empty_tiles,
+        tiles,
+    )
+
+
+def plan_frame(
+    environment: Environment,
+    intensity: float,
+    counts: SampleCounts,
+    bounces: int,
+    skip: bool,
+    facts: SceneFacts | None = None,
+    skip_error: float = 0.0,
+) -> RenderPlan:
     """The plan for a scene's light and a frame's settings.
 
     Args:
         counts: samples a pass of each strategy as asked for.
         skip: False leaves nothing out.
+        facts: None: nothing is known of the surfaces.
+        skip_error: share of the sky that rays may be spared without proof (RenderSettings).
     """
     if not skip:
         return RenderPlan(counts, False, bounces, ())
@@ -48,13 +87,32 @@ def plan_frame(environment: Environment, intensity: float, counts: SampleCounts,
     if brightest * intensity <= 0:
         skips.append(Skip("light rays", "the sky is black", "exact"))
         return RenderPlan(SampleCounts(0, 0, 0), False, 0, tuple(skips))
+    if facts is not None and facts.empty_tiles:
+        why = f"nothing can be seen in {facts.empty_tiles} of {facts.tiles} tiles of the picture"
+        skips.append(Skip("rays through empty tiles", why, "exact"))
     if counts.environment > 0 and brightest - darkest <= EVEN_SKY * brightest:
         skips.append(Skip("environment samples", "the sky is even: they go to the other strategies", "exact in the mean"))
         ggx = counts.ggx + counts.environment // 2
         counts = SampleCounts(counts.total - ggx, ggx, 0)
+    if facts is not None and facts.largest_diffuse <= 0 and counts.cosine > 0 and counts.total > counts.cosine:
+        skips.append(Skip("cosine samples", "no surface has a diffuse part: they go to the other strategies", "exact in the mean"))
+        ggx = counts.ggx + (counts.cosine if counts.environment == 0 else counts.cosine // 2)
+        counts = SampleCounts(0, ggx, counts.total - ggx)
+    if facts is not None and facts.largest_metallic <= 0 and facts.smallest_roughness >= ROUGH and counts.ggx > 0 and counts.cosine > 0:
+        skips.append(Skip("GGX samples", "every surface is rough and no metal: cosine samples find its lobe", "exact in the mean"))
+        counts = SampleCounts(counts.cosine + counts.ggx, 0, counts.environment)
     by_material = counts.cosine > 0 and counts.ggx > 0
     if by_material:
         skips.append(
             Skip("samples of strategies that a point's material hardly needs", "they go to its other strategies", "exact in the mean")
         )
+    skips.append(
+        Skip("tracing of rays that leave above all the mesh has there", "horizons of faces, found as rays pay for them", "exact")
+        if skip_error <= 0
+        else Skip(
+            "tracing of rays that leave above nearly all the mesh has there",
+            "horizons of faces, found as rays pay for them",
+            f"at most {100 * skip_error:g} % of the cosine-weighted sky at a point taken for open",
+        )
+    )
     return RenderPlan(counts, by_material, bounces, tuple(skips))

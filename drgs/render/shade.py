@@ -14,12 +14,14 @@ from typing import Any
 
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.maths.brdf import MIN_ROUGHNESS
 from drgs.render.brdf_warp import PI, alpha_of, specular_brdf
 from drgs.render.environment_table import EnvironmentLight, lookup_radiance, table_place
+from drgs.render.horizon import BLOCKED
+from drgs.render.ray_memory import RayMemory, note_directions, room_for_rays, trace_batch, usable_rays
 from drgs.render.records import ShadingPoints
 from drgs.render.sample_rays import (
     PointArrays,
@@ -31,7 +33,7 @@ from drgs.render.sample_rays import (
     sampled_direction,
     split_at,
 )
-from drgs.render.trace_indirect import mesh_arrays, scatter_hits, trace_indirect
+from drgs.render.trace_indirect import far_along, mesh_arrays, scatter_hits, trace_indirect
 from drgs.render.trace_rays import over_slices
 from drgs.render.tracer import AbstractTracer
 from drgs.render.tracer_warp import query_any
@@ -52,6 +54,8 @@ class RayStarts:
     """On the outer side of the mesh, the tracer's lift away from it."""
     surface_normal_world: Float[Tensor, "point 3"]
     """Unit normal of the triangle itself: light from below it is blocked by the surface, whatever the shading normal says."""
+    face: Int[Tensor, "point"] | None = None
+    """That triangle; -1 where a point stands on none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,7 @@ def start_rays(
     points: PointArrays,
     starts: wp.array[wp.vec3],
     surface_normals: wp.array[wp.vec3],
+    horizon: wp.array[float],
     light: EnvironmentLight,
     samples: SampleSet,
     keep_dark: int,
@@ -107,7 +112,10 @@ def start_rays(
             place = table_place(light, candidate)
             seen = lookup_radiance(light, place)
             if keep_dark != 0 or wp.max(seen) > 0.0:
-                start = starts[point]
+                limit = wp.float32(2.0)
+                if horizon.shape[0] > 0:
+                    limit = horizon[point]
+                start = wp.where(wp.dot(surface_normals[point], candidate) <= limit, starts[point], far_along(candidate))
                 wi = candidate
                 w = balance_weight(split, light, wi, wo, n, alpha, place) * wp.dot(n, wi)
                 f = w * specular_brdf(wi, wo, n, alpha, points.albedo[point], points.metallic[point])
@@ -121,7 +129,7 @@ def start_rays(
 @wp.func_native(_source_of_start_rays())
 def start_sixteen_rays(
     base: int, ray_count: int, first: int,
-    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3),
+    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3), horizon: wp.array(dtype=float),
     light: EnvironmentLight, samples: SampleSet, keep_dark: int,
     origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), cosine_weight: wp.array(dtype=float),
     specular: wp.array(dtype=wp.vec3), radiance: wp.array(dtype=wp.vec3),
@@ -135,6 +143,7 @@ def start_rays_simd(
     points: PointArrays,
     starts: wp.array[wp.vec3],
     surface_normals: wp.array[wp.vec3],
+    horizon: wp.array[float],
     light: EnvironmentLight,
     samples: SampleSet,
     keep_dark: int,
@@ -147,7 +156,7 @@ def start_rays_simd(
 ):
     """start_rays for sixteen rays a launch index, on the CPU."""
     start_sixteen_rays(
-        16 * wp.tid(), ray_count, first, points, starts, surface_normals, light, samples, keep_dark,
+        16 * wp.tid(), ray_count, first, points, starts, surface_normals, horizon, light, samples, keep_dark,
         origin, direction, cosine_weight, specular, radiance,
     )  # fmt: skip
 
@@ -229,6 +238,8 @@ def shade(
     seed: int,
     samples_round: int = 0,
     by_material: bool = False,
+    memory: RayMemory | None = None,
+    horizon: Tensor | None = None,
 ) -> PointLight:
     """Outgoing light of all points, one estimate of `counts.total` rays each.
 
@@ -237,28 +248,37 @@ def shade(
         bounces: surfaces that light may meet between the environment and the points.
         by_material: each point shares its samples out by its material (sample_rays.split_at).
         samples_round: how many estimates of the same counts and seed came before; continues their sequences.
+        memory: of an estimate of the same counts from the same starts: rays that are known are not traced, and it then knows these.
+        horizon: (face,) sines (horizon.Horizons); rays above them are not traced.
     """
     device = points.normal_world.device
     point_count = len(points.pixel)
+    ray_count = point_count * counts.total
     result = PointLight(
         torch.zeros(point_count, 3, device=device),
         torch.zeros(point_count, 3, device=device),
         torch.zeros(point_count, 3, device=device),
         torch.zeros(point_count, device=device),
     )
-    if point_count == 0 or counts.total == 0:
+    if ray_count == 0:
         return result
+    known = usable_rays(memory, ray_count, bounces > 0)
+    kept = None if memory is None else room_for_rays(ray_count, bounces > 0, device)
     warp_dev = warp_device(result.diffuse)
     arrays, samples = point_arrays(points), sample_set(counts, seed, samples_round, by_material)
-    start_arrays = [warp_array(starts.origin_world, wp.vec3), warp_array(starts.surface_normal_world, wp.vec3)]
-    mesh = mesh_arrays(tracer.mesh, tracer.lift)
+    start_arrays = [
+        warp_array(starts.origin_world, wp.vec3),
+        warp_array(starts.surface_normal_world, wp.vec3),
+        warp_array(_point_horizons(starts, horizon)),
+    ]
+    mesh = mesh_arrays(tracer.mesh, tracer.lift, horizon)
     sums = [
         warp_array(result.diffuse, wp.vec3),
         warp_array(result.specular, wp.vec3),
         warp_array(result.variance, wp.vec3),
         warp_array(result.visibility),
     ]
-    for kernel in (start_rays_simd if device.type == "cpu" else start_rays, sum_samples, scatter_hits, query_any):
+    for kernel in (start_rays_simd if device.type == "cpu" else start_rays, note_directions, sum_samples, scatter_hits, query_any):
         load_kernel(kernel, warp_dev)
 
     def batch(first: int, last: int) -> None:
@@ -272,13 +292,10 @@ def shade(
             wp.launch(start_rays_simd, dim=-(-rays // 16), inputs=[rays, *inputs], outputs=outputs, device=warp_dev)
         else:
             wp.launch(start_rays, dim=rays, inputs=inputs, outputs=outputs, device=warp_dev)
+        hits = trace_batch(origin, direction, first * counts.total, tracer, bounces > 0, known, kept)
+        indirect = radiance
         if bounces > 0:
-            hits = tracer.closest_hits(origin, direction)
-            blocked = hits.hit
             indirect = trace_indirect(hits, direction, first, arrays, light, mesh, samples, tracer, bounces)
-        else:
-            blocked = tracer.occluded(origin, direction)
-            indirect = radiance
         wp.launch(
             sum_samples,
             dim=last - first,
@@ -288,7 +305,7 @@ def shade(
                 samples,
                 warp_array(cosine_weight),
                 *vectors,
-                warp_array(blocked),
+                warp_array(hits.hit),
                 warp_array(indirect, wp.vec3),
                 bounces,
             ],
@@ -301,4 +318,14 @@ def shade(
     else:
         batch_points = max(1, RAYS_A_BATCH_GPU // counts.total)
     over_slices(point_count, device, batch, batch_points)
+    if memory is not None:
+        memory.rays = kept
     return result
+
+
+def _point_horizons(starts: RayStarts, of_faces: Tensor | None) -> Tensor:
+    """(point,) horizons; empty where none is known."""
+    if of_faces is None or starts.face is None:
+        return starts.origin_world.new_empty(0)
+    face = starts.face.long()
+    return torch.where(face >= 0, of_faces[face.clamp(min=0)], BLOCKED)

@@ -3,7 +3,7 @@
 // Lanes never look at each other, so a ray's result does not depend on its group.
 //
 // in   base (first ray of the group in the batch), ray_count (of the batch), first (the batch's first ray among all),
-//      points, starts, surface_normals, light, samples, keep_dark
+//      points, starts, surface_normals, horizon (of each point), light, samples, keep_dark
 // out  origin, direction, cosine_weight, specular, radiance of rays base .. base + 15
 typedef unsigned u16 __attribute__((ext_vector_type(16)));
 const float PI = 3.14159265358979f;
@@ -67,7 +67,7 @@ const float* const normals = (const float*)points.normal.data;
 const float* const outgoing = (const float*)points.wo.data;
 const float* const albedos = (const float*)points.albedo.data;
 const float* const triangles = (const float*)surface_normals.data;
-alignas(64) float gathered[14][16];
+alignas(64) float gathered[15][16];
 alignas(64) unsigned pixel_lane[16], index_lane[16], strategy_lane[16];
 int point_lane[16];
 for (int lane = 0; lane < 16; ++lane) {
@@ -107,6 +107,7 @@ for (int lane = 0; lane < 16; ++lane) {
     gathered[11][lane] = (float)n_cosine;
     gathered[12][lane] = (float)n_ggx;
     gathered[13][lane] = (float)n_environment;
+    gathered[14][lane] = horizon.shape[0] > 0 ? horizon.data[point] : 2.0f;
 }
 const v16 nx = load16(gathered[0]), ny = load16(gathered[1]), nz = load16(gathered[2]);
 const v16 ox = load16(gathered[3]), oy = load16(gathered[4]), oz = load16(gathered[5]);
@@ -286,6 +287,8 @@ store16(result[4], dv * (1.0f - c5));
 store16(result[5], dv * c5);
 for (int k = 0; k < 3; ++k) store16(result[6 + k], select(live, seen[k], v16(0.0f)));
 *(i16*)live_lane = live;
+alignas(64) int traced_lane[16];
+*(i16*)traced_lane = above <= load16(gathered[14]);
 const float* const from = (const float*)starts.data;
 float* const origin_out = (float*)origin.data;
 float* const direction_out = (float*)direction.data;
@@ -296,7 +299,9 @@ for (int lane = 0; lane < lanes; ++lane) {
     const float metal = gathered[10][lane];
     cosine_weight.data[ray] = result[3][lane];
     for (int k = 0; k < 3; ++k) {
-        origin_out[3 * ray + k] = live_lane[lane] != 0 ? from[3 * point + k] : 1.0e15f;  // void rays leave from far outside
+        // Rays that are void or meet nothing for certain leave from far outside, away from the mesh.
+        const float outside = result[k][lane] < 0.0f ? -1.0e15f : 1.0e15f;
+        origin_out[3 * ray + k] = live_lane[lane] != 0 && traced_lane[lane] != 0 ? from[3 * point + k] : outside;
         direction_out[3 * ray + k] = result[k][lane];
         const float f0 = 0.04f * (1.0f - metal) + albedos[3 * point + k] * metal;
         specular_out[3 * ray + k] = result[4][lane] * f0 + result[5][lane];

@@ -37,10 +37,16 @@ class MeshArrays:
     metallic: wp.array[float]
     lift: float
     """Of ray origins off the surface."""
+    horizon: wp.array[float]
+    """Of each face; empty where none is known."""
 
 
-def mesh_arrays(mesh: TriangleMesh, lift: float) -> Any:
-    """The struct that kernels read; shares memory with the tensors."""
+def mesh_arrays(mesh: TriangleMesh, lift: float, horizon: Tensor | None = None) -> Any:
+    """The struct that kernels read; shares memory with the tensors.
+
+    Args:
+        horizon: (face,) sines; rays above them are not traced.
+    """
     arrays = MeshArrays()
     arrays.vertices = warp_array(mesh.vertices.float(), wp.vec3)
     arrays.faces = warp_array(mesh.faces.to(torch.int32).reshape(-1))
@@ -49,6 +55,7 @@ def mesh_arrays(mesh: TriangleMesh, lift: float) -> Any:
     arrays.roughness = warp_array(mesh.roughness.float())
     arrays.metallic = warp_array(mesh.metallic.float())
     arrays.lift = lift
+    arrays.horizon = warp_array(mesh.roughness[:0].float() if horizon is None else horizon)
     return arrays
 
 
@@ -84,6 +91,16 @@ def surface_at(mesh: MeshArrays, face: int, barycentric: wp.vec2) -> Surface:
     surface.roughness = x * mesh.roughness[a] + y * mesh.roughness[b] + z * mesh.roughness[c]
     surface.metallic = x * mesh.metallic[a] + y * mesh.metallic[b] + z * mesh.metallic[c]
     return surface
+
+
+@wp.func
+def far_along(direction: wp.vec3) -> wp.vec3:
+    """An origin far outside from which a ray leads away: it misses at the root of the tree."""
+    return wp.vec3(
+        wp.where(direction[0] < 0.0, -1.0e15, 1.0e15),
+        wp.where(direction[1] < 0.0, -1.0e15, 1.0e15),
+        wp.where(direction[2] < 0.0, -1.0e15, 1.0e15),
+    )
 
 
 @wp.func
@@ -154,6 +171,9 @@ def scatter_hits(
     diffuse = (1.0 - surface.metallic) * wp.max(surface.albedo)
     share = wp.clamp(specular / (specular + diffuse), 0.1, 1.0)
     carried = throughput[i]
+    horizon = wp.float32(2.0)
+    if mesh.horizon.shape[0] > 0:
+        horizon = mesh.horizon[face[i]]
 
     wi = environment_direction(light, u_light)
     n_dot_l = wp.dot(n, wi)
@@ -161,7 +181,7 @@ def scatter_hits(
         uv = table_place(light, wi)
         density = lookup_pdf(light, uv) + share * ggx_pdf(wi, wo, n, alpha) + (1.0 - share) * n_dot_l / PI
         if density > 0.0:
-            origin[i] = start
+            origin[i] = wp.where(wp.dot(surface.face_normal, wi) <= horizon, start, far_along(wi))
             direction[i] = wi
             incoming = lookup_radiance(light, uv)
             contribution[i] = wp.cw_mul(carried, wp.cw_mul(brdf_times_cosine(surface, wi, wo, alpha), incoming)) / density
@@ -176,7 +196,7 @@ def scatter_hits(
         own = share * ggx_pdf(wi, wo, n, alpha) + (1.0 - share) * n_dot_l / PI
         if own > 0.0:
             reflected = wp.cw_mul(carried, brdf_times_cosine(surface, wi, wo, alpha))
-            origin[j] = start
+            origin[j] = wp.where(wp.dot(surface.face_normal, wi) <= horizon, start, far_along(wi))
             direction[j] = wi
             contribution[j] = wp.cw_mul(reflected, lookup_radiance(light, uv)) / (own + lookup_pdf(light, uv))
             survival = wp.float32(1.0)

@@ -6,7 +6,6 @@ accumulation. Shading normals are the interpolated vertex normals, not turned to
 where they face away the surface is black, as in any path tracer; the back of a triangle is not seen at all.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +13,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from drgs.render.image_tiles import pixels_of_tiles, tiles_of_mesh
 from drgs.render.random_warp import hash_combine, sobol_2d
 from drgs.render.records import GBuffer, ShadingPoints
 from drgs.render.sample_rays import PointArrays, point_arrays
@@ -39,6 +39,8 @@ class PrimaryPoints:
     starts: RayStarts
     depth: Float[Tensor, "point"]
     """Along the viewing axis [world units]."""
+    barycentric: Float[Tensor, "point 2"] | None = None
+    """In the starts' triangles, where the camera sees the mesh."""
 
 
 @wp.kernel
@@ -47,10 +49,8 @@ def primary_rays(
     camera_from_pixel: wp.mat33,
     world_from_camera: wp.mat33,
     center: wp.vec3,
+    pixels: wp.array[int],
     image_width: int,
-    left: int,
-    top: int,
-    width: int,
     seed: wp.uint32,
     index: wp.uint32,
     jitter: float,
@@ -59,9 +59,9 @@ def primary_rays(
     direction: wp.array[wp.vec3],
 ):
     i = first + wp.tid()
-    x = left + i % width
-    y = top + i // width
-    u = sobol_2d(index, hash_combine(hash_combine(seed, wp.uint32(y * image_width + x)), wp.uint32(PRIMARY_STREAM)))
+    x = pixels[i] % image_width
+    y = pixels[i] // image_width
+    u = sobol_2d(index, hash_combine(hash_combine(seed, wp.uint32(pixels[i])), wp.uint32(PRIMARY_STREAM)))
     place = wp.vec3(float(x) + 0.5 + jitter * (u[0] - 0.5), float(y) + 0.5 + jitter * (u[1] - 0.5), 1.0)
     origin[i] = center
     direction[i] = wp.normalize(world_from_camera * (camera_from_pixel * place))
@@ -77,10 +77,7 @@ def surface_points(
     mesh: MeshArrays,
     center: wp.vec3,
     view_axis: wp.vec3,
-    image_width: int,
-    left: int,
-    top: int,
-    width: int,
+    pixels: wp.array[int],
     # outputs
     points: PointArrays,
     face_normal: wp.array[wp.vec3],
@@ -101,7 +98,7 @@ def surface_points(
     points.albedo[i] = surface.albedo
     points.roughness[i] = surface.roughness
     points.metallic[i] = surface.metallic
-    points.pixel[i] = (r // width + top) * image_width + r % width + left
+    points.pixel[i] = pixels[r]
     face_normal[i] = surface.face_normal
     start[i] = surface.position + mesh.lift * surface.face_normal
     depth[i] = wp.dot(surface.position - center, view_axis)
@@ -111,40 +108,28 @@ def _mat33(matrix: Tensor) -> wp.mat33:
     return wp.mat33(*matrix.detach().double().cpu().reshape(-1).tolist())
 
 
-def screen_box(mesh: TriangleMesh, camera: Camera) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom [pixels, right and bottom exclusive] of the mesh's picture; the whole image when part of it is behind."""
-    camera_from_world = camera.camera_from_world.to(mesh.vertices.device)
-    in_camera = mesh.vertices.detach() @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    if float(in_camera[:, 2].amin()) <= 1e-6:
-        return 0, 0, camera.width, camera.height
-    on_screen = in_camera @ camera.intrinsics.to(mesh.vertices.device).T
-    places = on_screen[:, :2] / on_screen[:, 2:]
-    (x0, y0), (x1, y1) = places.amin(0).tolist(), places.amax(0).tolist()
-    left, top = max(0, math.floor(x0)), max(0, math.floor(y0))
-    return left, top, max(left, min(camera.width, math.ceil(x1))), max(top, min(camera.height, math.ceil(y1)))
-
-
 def trace_primary_points(
-    tracer: AbstractTracer, camera: Camera, seed: int, pass_index: int, jitter: bool = True, box: tuple[int, int, int, int] | None = None
+    tracer: AbstractTracer, camera: Camera, seed: int, pass_index: int, jitter: bool = True, pixels: Tensor | None = None
 ) -> PrimaryPoints:
     """One ray through each pixel that may see the mesh.
 
     Args:
         jitter: False sends it through the pixel's centre.
-        box: `screen_box` of the mesh, where the caller knows it.
+        pixels: (pixel,) int32, ascending; None: of all tiles that the mesh may be seen in.
     """
     mesh, device = tracer.mesh, tracer.mesh.vertices.device
-    left, top, right, bottom = screen_box(mesh, camera) if box is None else box
-    ray_count = (right - left) * (bottom - top)
+    if pixels is None:
+        pixels = pixels_of_tiles(tiles_of_mesh(mesh, camera), camera.width, camera.height)
+    ray_count = len(pixels)
     origin, direction = torch.empty(ray_count, 3, device=device), torch.empty(ray_count, 3, device=device)
     world_from_camera = camera.camera_from_world[:3, :3].T
     center, view_axis = wp.vec3(*camera.center_world.tolist()), wp.vec3(*camera.camera_from_world[2, :3].tolist())
-    width = max(1, right - left)
+    pixel_array = warp_array(pixels)
     launch(
         primary_rays,
         ray_count,
         [_mat33(torch.linalg.inv(camera.intrinsics.double())), _mat33(world_from_camera), center,
-         camera.width, left, top, width, wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
+         pixel_array, camera.width, wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
         [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3)],
         warp_device(origin),
     )  # fmt: skip
@@ -158,11 +143,11 @@ def trace_primary_points(
         surface_points,
         count,
         [warp_array(ray), warp_array(hits.face), warp_array(hits.barycentric, wp.vec2), warp_array(direction, wp.vec3),
-         mesh_arrays(mesh, tracer.lift), center, view_axis, camera.width, left, top, width],
+         mesh_arrays(mesh, tracer.lift), center, view_axis, pixel_array],
         [point_arrays(points), warp_array(face_normal, wp.vec3), warp_array(start, wp.vec3), warp_array(depth)],
         warp_device(origin),
     )  # fmt: skip
-    return PrimaryPoints(points, RayStarts(start, face_normal), depth)
+    return PrimaryPoints(points, RayStarts(start, face_normal, hits.face[ray]), depth, hits.barycentric[ray])
 
 
 def trace_primary(

@@ -1,10 +1,13 @@
 """What every ray tracer against a mesh offers. Implementations: tracer_embree (CPU), tracer_warp (CPU and CUDA)."""
 
+import copy
 from abc import ABC, abstractmethod
+from typing import Self
 
 import torch
 from torch import Tensor
 
+from drgs.render.horizon import Horizons
 from drgs.render.records import Hits
 from drgs.scene.mesh import TriangleMesh
 
@@ -26,6 +29,14 @@ class AbstractTracer(ABC):
     """How far ray origins must stand off the surface [world units]."""
     extent: float
     """Diagonal of the mesh's box [world units]."""
+    horizons: Horizons | None = None
+    """Rays that leave a face above its horizon need not be asked about; None until somebody looks for them."""
+
+    def with_materials(self, mesh: TriangleMesh) -> Self:
+        """A tracer of a mesh of the same shape with other materials; shares the tree."""
+        other = copy.copy(self)
+        other.mesh = mesh
+        return other
 
     @abstractmethod
     def closest_hits(self, origins: Tensor, directions: Tensor) -> Hits:

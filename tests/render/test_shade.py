@@ -210,8 +210,8 @@ def test_sixteen_rays_at_once_are_the_rays_one_by_one(by_material: bool, sky: En
     rays = (len(points.pixel) - first // counts.total) * counts.total - 6
     light = environment_light(sky, build_environment_table(sky), rotation_degrees=70.0, intensity=2.0)
     inputs = [
-        first, point_arrays(points), warp_array(points.position_world, wp.vec3), warp_array(surface, wp.vec3), light,
-        sample_set(counts, 11, 3, by_material), 0,
+        first, point_arrays(points), warp_array(points.position_world, wp.vec3), warp_array(surface, wp.vec3),
+        warp_array(2 * torch.rand(len(surface))), light, sample_set(counts, 11, 3, by_material), 0,
     ]  # fmt: skip
     results = []
     for kernel, dim, extra in ((start_rays, rays, []), (start_rays_simd, -(-rays // 16), [rays])):
@@ -227,7 +227,9 @@ def test_sixteen_rays_at_once_are_the_rays_one_by_one(by_material: bool, sky: En
     if float(sky.radiance.max()) == 0:
         assert not bool(live.any())
         return
-    assert torch.equal(plain[0][live], vector[0][live])
+    # Rays above their point's horizon leave from outside, in both kernels but for those right at it.
+    assert float((plain[0] == vector[0])[live].all(-1).float().mean()) > 0.995
+    assert 0.1 < float((vector[0][live][:, 0].abs() > 1e14).float().mean()) < 0.9
     assert float((plain[1] - vector[1])[live].norm(dim=-1).quantile(0.99)) < 1e-4
     for a, b in zip(plain[2:], vector[2:], strict=True):
         error = (a - b)[live].abs() / (a[live].abs() + 1e-3 * a[live].abs().mean() + 1e-6)

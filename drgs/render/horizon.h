@@ -1,0 +1,98 @@
+// raise_horizons of horizon.py for one face against 16 triangles at a time, CPU only. Body of a Warp native function; horizon.py
+// prepends the rasteriser's tile_vector.h and the constants. A test keeps both equal.
+//
+// in   f (face), lanes (group, 9, 16: corners by coordinate), boxes of groups and of groups of groups, group_count, corners, lift
+// out  tangent_out[f]
+struct P3 { float x, y, z; };
+const auto dot = [](P3 a, P3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; };
+const auto minus = [](P3 a, P3 b) { return P3{a.x - b.x, a.y - b.y, a.z - b.z}; };
+const auto cross = [](P3 a, P3 b) { return P3{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; };
+const auto scaled = [](P3 a, float s) { return P3{a.x * s, a.y * s, a.z * s}; };
+const auto unit = [&](P3 a) { const float l = __builtin_sqrtf(dot(a, a)); return scaled(a, l > 0.0f ? 1.0f / l : 0.0f); };
+const auto largest = [](float a, float b) { return a > b ? a : b; };
+const auto smallest = [](float a, float b) { return a < b ? a : b; };
+const P3* const corner = (const P3*)corners.data + 3 * (long)f;
+const P3 a = corner[0], b = corner[1], c = corner[2];
+const P3 area = cross(minus(b, a), minus(c, a));
+const float length = __builtin_sqrtf(dot(area, area));
+if (!(length > 0.0f)) {
+    tangent_out.data[f] = 1e30f;
+    return;
+}
+const P3 n = scaled(area, 1.0f / length);
+const float base = largest(largest(dot(n, a), dot(n, b)), dot(n, c)) + 0.5f * lift;
+P3 longest = minus(b, a);
+if (dot(minus(c, b), minus(c, b)) > dot(longest, longest)) longest = minus(c, b);
+if (dot(minus(a, c), minus(a, c)) > dot(longest, longest)) longest = minus(a, c);
+const P3 u = unit(longest), v = cross(n, u);
+P3 h[DIRECTIONS];
+float support[DIRECTIONS];
+const float turn[8][2] = {{1, 0}, {0.70710678f, 0.70710678f}, {0, 1}, {-0.70710678f, 0.70710678f},
+                          {-1, 0}, {-0.70710678f, -0.70710678f}, {0, -1}, {0.70710678f, -0.70710678f}};
+for (int k = 0; k < 8; ++k) h[k] = {turn[k][0] * u.x + turn[k][1] * v.x, turn[k][0] * u.y + turn[k][1] * v.y, turn[k][0] * u.z + turn[k][1] * v.z};
+h[8] = unit(cross(minus(b, a), n));
+h[9] = unit(cross(minus(c, b), n));
+h[10] = unit(cross(minus(a, c), n));
+for (int k = 0; k < DIRECTIONS; ++k) support[k] = largest(largest(dot(h[k], a), dot(h[k], b)), dot(h[k], c));
+float tangent = 0.0f;
+const auto absolute = [](float x) { return x < 0.0f ? -x : x; };
+const auto box_above = [&](P3 low, P3 high) {
+    const P3 middle = {0.5f * (low.x + high.x), 0.5f * (low.y + high.y), 0.5f * (low.z + high.z)};
+    const P3 half = {0.5f * (high.x - low.x), 0.5f * (high.y - low.y), 0.5f * (high.z - low.z)};
+    const float above = dot(n, middle) + absolute(n.x) * half.x + absolute(n.y) * half.y + absolute(n.z) * half.z - base;
+    if (above <= 0.0f) return false;
+    for (int k = 0; k < DIRECTIONS; ++k) {
+        const float beyond = dot(h[k], middle) - absolute(h[k].x) * half.x - absolute(h[k].y) * half.y - absolute(h[k].z) * half.z - support[k];
+        if (beyond > 0.0f && above <= tangent * beyond) return false;
+    }
+    return true;
+};
+const auto against = [&](const float* lane) {
+    v16 x[3], y[3], z[3], above[3];
+    for (int p = 0; p < 3; ++p) {
+        x[p] = load16(lane + 48 * p);
+        y[p] = load16(lane + 48 * p + 16);
+        z[p] = load16(lane + 48 * p + 32);
+        above[p] = n.x * x[p] + n.y * y[p] + n.z * z[p] - base;
+    }
+    i16 open = max16(max16(above[0], above[1]), above[2]) > 0.0f;
+    if (!any(open)) return;
+    // First by products alone: most triangles lie below the tangent found so far.
+    const float tolerance = 0.1f * lift;
+    for (int k = 0; k < DIRECTIONS; ++k) {
+        i16 below = open;
+        for (int p = 0; p < 3; ++p) {
+            const v16 beyond = h[k].x * x[p] + h[k].y * y[p] + h[k].z * z[p] - support[k];
+            below &= ((above[p] <= 0.0f) & (beyond >= -tolerance)) | ((beyond > 0.0f) & (above[p] <= tangent * beyond));
+        }
+        open &= ~below;
+        if (!any(open)) return;
+    }
+    v16 lowest(1e30f);
+    for (int k = 0; k < DIRECTIONS; ++k) {
+        v16 needed(0.0f);
+        for (int p = 0; p < 3; ++p) {
+            const v16 beyond = h[k].x * x[p] + h[k].y * y[p] + h[k].z * z[p] - support[k];
+            const v16 under = select(beyond >= -tolerance, v16(0.0f), v16(1e30f));
+            const v16 over = select(beyond > 0.0f, above[p] / max16(beyond, v16(1e-30f)), v16(1e30f));
+            needed = max16(needed, select(above[p] <= 0.0f, under, over));
+        }
+        lowest = min16(lowest, needed);
+    }
+    alignas(64) float found[16];
+    store16(found, select(open, lowest, v16(0.0f)));
+    for (int lane_index = 0; lane_index < 16; ++lane_index) tangent = largest(tangent, found[lane_index]);
+};
+const P3* const low = (const P3*)group_low.data;
+const P3* const high = (const P3*)group_high.data;
+const P3* const super_low_of = (const P3*)super_low.data;
+const P3* const super_high_of = (const P3*)super_high.data;
+const int supers = (group_count + SUPER - 1) / SUPER, own = f / (GROUP * SUPER);
+for (int step = 0; step < supers && tangent < STEEPEST; ++step) {
+    const int s = own + step < supers ? own + step : own + step - supers;
+    if (!box_above(super_low_of[s], super_high_of[s])) continue;
+    const int last = min_int((s + 1) * SUPER, group_count);
+    for (int g = s * SUPER; g < last && tangent < STEEPEST; ++g)
+        if (box_above(low[g], high[g])) against((const float*)lanes.data + (long)g * 144);
+}
+tangent_out.data[f] = tangent;

@@ -1,0 +1,134 @@
+"""What rays met, remembered over an edit: rays that are the same to the bit are not traced again.
+
+Between two frames of an unmoved camera and shape most first rays stay as they are: a new environment changes only those sampled from it, a
+new albedo hardly any. The comparison is exact, so nothing need be known about what an edit did to the samples.
+Only a frame's first pass is remembered: it is the one that somebody waits for.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from drgs.render.records import Hits
+from drgs.render.tracer import AbstractTracer
+from drgs.warp_torch import warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_RAYS = 1 << 22
+"""More are not remembered: 25 bytes each, 37 with surfaces."""
+OUTSIDE = wp.constant(1.0e14)
+"""Origins beyond are those of rays that need no tracing [world units]."""
+
+_NO_FACE = torch.full((1,), -1, dtype=torch.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class TracedRays:
+    """The rays of one estimate, from starts that must still be the same when they are used again."""
+
+    direction_world: Float[Tensor, "ray 3"]
+    """NaN for rays that were not traced."""
+    hit: Bool[Tensor, "ray"]
+    face: Int[Tensor, "ray"] | None
+    """None where only visibility was asked for."""
+    barycentric: Float[Tensor, "ray 2"] | None
+
+
+@dataclass
+class RayMemory:
+    """Holds the rays of the last estimate that was made with it."""
+
+    rays: TracedRays | None = None
+
+
+@wp.kernel
+def mark_changed_rays(
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    known_direction: wp.array[wp.vec3],
+    # outputs
+    changed: wp.array[wp.bool],
+):
+    i = wp.tid()
+    d = direction[i]
+    k = known_direction[i]
+    outside = wp.abs(origin[i][0]) > OUTSIDE
+    changed[i] = not outside and not (d[0] == k[0] and d[1] == k[1] and d[2] == k[2])
+
+
+@wp.kernel
+def note_directions(
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    # outputs
+    noted: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    noted[i] = direction[i]
+    if wp.abs(origin[i][0]) > OUTSIDE:
+        noted[i] = wp.vec3(wp.nan, wp.nan, wp.nan)
+
+
+def room_for_rays(count: int, surfaces: bool, device: torch.device) -> TracedRays | None:
+    """Unwritten rays; None for more than are remembered."""
+    if count > MAX_RAYS:
+        return None
+    hit, direction = torch.empty(count, dtype=torch.bool, device=device), torch.empty(count, 3, device=device)
+    if not surfaces:
+        return TracedRays(direction, hit, None, None)
+    return TracedRays(direction, hit, torch.empty(count, dtype=torch.int32, device=device), torch.empty(count, 2, device=device))
+
+
+def usable_rays(memory: RayMemory | None, count: int, surfaces: bool) -> TracedRays | None:
+    """The remembered rays, where they are those of an estimate of this many."""
+    rays = None if memory is None else memory.rays
+    return None if rays is None or len(rays.hit) != count or (surfaces and rays.face is None) else rays
+
+
+def trace_batch(
+    origin: Tensor, direction: Tensor, first: int, tracer: AbstractTracer, surfaces: bool, known: TracedRays | None, kept: TracedRays | None
+) -> Hits:
+    """What a batch of rays (ray, 3) meets. Runs on the calling thread.
+
+    Args:
+        first: number of the batch's first ray among those known and kept.
+        surfaces: False asks only whether a ray meets anything; then only `hit` means something.
+        known: rays whose answers may be used. kept: where to write these down.
+    """
+    rays, device = slice(first, first + len(direction)), warp_device(direction)
+    vectors = [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3)]
+    if known is None:
+        hits = _ask(origin, direction, tracer, surfaces)
+    else:
+        changed = torch.empty(len(direction), dtype=torch.bool, device=direction.device)
+        known_direction = warp_array(known.direction_world[rays], wp.vec3)
+        wp.launch(mark_changed_rays, dim=len(direction), inputs=[*vectors, known_direction], outputs=[warp_array(changed)], device=device)
+        again = torch.nonzero(changed).squeeze(-1)
+        found = _ask(origin[again], direction[again], tracer, surfaces)
+        hit = known.hit[rays] & (origin[:, 0].abs() < float(OUTSIDE))
+        hit[again] = found.hit
+        face, barycentric = found.face, found.barycentric
+        if known.face is not None and known.barycentric is not None and surfaces:
+            face, barycentric = known.face[rays].clone(), known.barycentric[rays].clone()
+            face[again], barycentric[again] = found.face, found.barycentric
+        hits = Hits(hit, direction[:, 0], face, barycentric) if surfaces else _visibility(hit, direction)
+    if kept is not None:
+        noted = warp_array(kept.direction_world[rays], wp.vec3)
+        wp.launch(note_directions, dim=len(direction), inputs=vectors, outputs=[noted], device=device)
+        kept.hit[rays] = hits.hit
+        if kept.face is not None and kept.barycentric is not None:
+            kept.face[rays], kept.barycentric[rays] = hits.face, hits.barycentric
+    return hits
+
+
+def _ask(origin: Tensor, direction: Tensor, tracer: AbstractTracer, surfaces: bool) -> Hits:
+    return tracer.closest_hits(origin, direction) if surfaces else _visibility(tracer.occluded(origin, direction), direction)
+
+
+def _visibility(hit: Tensor, direction: Tensor) -> Hits:
+    """A record of which nothing but `hit` is true."""
+    return Hits(hit, direction[:, 0], _NO_FACE.to(hit.device).expand(len(hit)), direction[:, :2])

@@ -1,0 +1,233 @@
+"""A camera's move takes along what was already known: the temporal half of SVGF.
+
+In: the picture before the move with the samples behind each pixel, and what the camera sees now. Out: for each pixel what the picture
+before says about it, and how many samples that is worth. A point of the surface is looked up where the old camera saw it, among the four pixels
+around that place; one that lies off the point's tangent plane, too far along it, or faces elsewhere shows another surface and is rejected. Both parts
+are stored without the reflectance that textures carry. Specular light moves over the surface with the camera: its samples are worth
+less the more the view has turned in units of the lobe's width, and nothing on a mirror.
+
+History only helps a frame begin: its worth is at most MOST_SAMPLES and fades to nothing at FADE_SAMPLES of the frame's own, so a frame
+that is left alone is the plain mean. After any other change than the camera's (an edit, another light) there is no history at all.
+
+Source: Schied et al. 2017, section 4.1; we weigh by samples instead of a fixed share, and take no filtered colour back. Twin:
+drgs/reference/reproject.py.
+"""
+
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from drgs.render.denoise import reflectances
+from drgs.render.records import GBuffer, Radiance
+from drgs.scene.camera import Camera
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+MOST_SAMPLES = 64.0
+"""What a pixel's history is worth at most [samples]: more would let old errors live long."""
+FADE_SAMPLES = 256.0
+"""A frame's own samples after which history counts for nothing."""
+PLANE = wp.constant(2.0)
+"""Largest distance of an old point from the new one's tangent plane [pixel footprints at its distance]."""
+SPREAD = wp.constant(2.0)
+"""Largest distance of an old point from the new one, seen face on [pixel footprints]: the planes of two surfaces may be one."""
+GRAZING = wp.constant(0.1)
+"""Cosine towards the old camera below which a point was hardly seen."""
+FACING = wp.constant(0.9)
+"""Smallest cosine between old and new normal."""
+LOBE = wp.constant(4.0)
+"""Specular samples fall by exp(-(LOBE angle / alpha)^2) when the view turns by `angle`."""
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """A picture before the camera moved. Written by remember, read by reproject."""
+
+    camera: Camera
+    gbuffer: GBuffer
+    diffuse: Float[Tensor, "height width 3"]
+    """Over reflectance (denoise.reflectances), as is specular."""
+    specular: Float[Tensor, "height width 3"]
+    variance: Float[Tensor, "height width 2"]
+    """Of the diffuse and specular luminance above."""
+    samples: Float[Tensor, "height width 2"]
+    """Behind the diffuse and the specular part."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reprojected:
+    """History in the pixels of the present view."""
+
+    diffuse: Float[Tensor, "height width 3"]
+    specular: Float[Tensor, "height width 3"]
+    variance: Float[Tensor, "height width 2"]
+    samples: Float[Tensor, "height width 2"]
+    """0 where history was rejected."""
+
+
+Picture = TypeVar("Picture", History, Reprojected)
+
+
+def brighten(picture: Picture, factor: float) -> Picture:
+    """The same under a light `factor` times as strong."""
+    return replace(picture, diffuse=picture.diffuse * factor, specular=picture.specular * factor, variance=picture.variance * factor**2)
+
+
+@wp.kernel
+def look_up_history(
+    first: int,
+    width: int,
+    height: int,
+    old_width: int,
+    old_height: int,
+    camera_from_world: wp.mat44,
+    intrinsics: wp.mat33,
+    old_center: wp.vec3,
+    most_samples: float,
+    coverage: wp.array[float],
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    old_coverage: wp.array[float],
+    old_position: wp.array[wp.vec3],
+    old_normal: wp.array[wp.vec3],
+    old_diffuse: wp.array[wp.vec3],
+    old_specular: wp.array[wp.vec3],
+    old_variance: wp.array[wp.vec2],
+    old_samples: wp.array[wp.vec2],
+    # outputs
+    diffuse: wp.array[wp.vec3],
+    specular: wp.array[wp.vec3],
+    variance: wp.array[wp.vec2],
+    samples: wp.array[wp.vec2],
+):
+    p = first + wp.tid()
+    diffuse[p] = wp.vec3(0.0, 0.0, 0.0)
+    specular[p] = wp.vec3(0.0, 0.0, 0.0)
+    variance[p] = wp.vec2(0.0, 0.0)
+    samples[p] = wp.vec2(0.0, 0.0)
+    if coverage[p] <= 0.0:
+        return
+    x = position[p]
+    n = normal[p]
+    in_camera = wp.transform_point(camera_from_world, x)
+    if in_camera[2] <= 0.0:
+        return
+    on_screen = intrinsics * in_camera
+    u = on_screen[0] / on_screen[2] - 0.5
+    v = on_screen[1] / on_screen[2] - 0.5
+    column = int(wp.floor(u))
+    row = int(wp.floor(v))
+    if column < -1 or row < -1 or column >= old_width or row >= old_height:
+        return
+    footprint = in_camera[2] / intrinsics[0, 0]
+    reach = PLANE * footprint
+    towards_old = wp.dot(n, wp.normalize(old_center - x))
+    if towards_old <= GRAZING:
+        return
+    spread = SPREAD * footprint / wp.max(towards_old, 0.25)
+    sum_d = wp.vec3(0.0, 0.0, 0.0)
+    sum_s = wp.vec3(0.0, 0.0, 0.0)
+    sum_variance = wp.vec2(0.0, 0.0)
+    sum_samples = wp.vec2(0.0, 0.0)
+    weights = wp.float32(0.0)
+    for tap in range(4):
+        dx = tap % 2
+        dy = tap // 2
+        qx = column + dx
+        qy = row + dy
+        if qx >= 0 and qy >= 0 and qx < old_width and qy < old_height:
+            q = qy * old_width + qx
+            apart = old_position[q] - x
+            near = wp.abs(wp.dot(n, apart)) <= reach and wp.length(apart) <= spread
+            if near and old_coverage[q] > 0.0 and wp.dot(n, old_normal[q]) >= FACING:
+                w = wp.abs(1.0 - float(dx) - (u - float(column))) * wp.abs(1.0 - float(dy) - (v - float(row)))
+                sum_d += w * old_diffuse[q]
+                sum_s += w * old_specular[q]
+                sum_variance += w * old_variance[q]
+                sum_samples += w * old_samples[q]
+                weights += w
+    if weights < 0.05:
+        return
+    # The lobe of a rougher surface forgives a larger turn.
+    alpha = wp.max(roughness[p] * roughness[p], 1.0e-4)
+    turned = wp.length(wo[p] - wp.normalize(old_center - x))
+    still = wp.exp(-wp.min((LOBE * turned / alpha) * (LOBE * turned / alpha), 80.0))
+    worth = sum_samples / weights
+    diffuse[p] = sum_d / weights
+    specular[p] = sum_s / weights
+    variance[p] = sum_variance / weights
+    samples[p] = wp.vec2(wp.min(worth[0], most_samples), still * wp.min(worth[1], most_samples))
+
+
+def reproject(history: History, gbuffer: GBuffer, camera: Camera) -> Reprojected:
+    """What the picture before says about each pixel of the present view."""
+    height, width = gbuffer.coverage.shape
+    old_height, old_width = history.gbuffer.coverage.shape
+    device = gbuffer.coverage.device
+    vectors = [torch.empty(height, width, 3, device=device) for _ in range(2)]
+    pairs = [torch.empty(height, width, 2, device=device) for _ in range(2)]
+    old, old_map = history.camera, history.gbuffer
+
+    def flat(values: Tensor, dtype: object = None) -> wp.array:
+        return warp_array(values.float().reshape(height * width if values.shape[:2] == (height, width) else -1, *values.shape[2:]), dtype)
+
+    launch(
+        look_up_history,
+        height * width,
+        [
+            width, height, old_width, old_height, wp.mat44(*old.camera_from_world.flatten().tolist()),
+            wp.mat33(*old.intrinsics.flatten().tolist()), wp.vec3(*old.center_world.tolist()), MOST_SAMPLES,
+            flat(gbuffer.coverage), flat(gbuffer.position_world, wp.vec3), flat(gbuffer.normal_world, wp.vec3),
+            flat(gbuffer.wo_world, wp.vec3), flat(gbuffer.roughness),
+            flat(old_map.coverage), flat(old_map.position_world, wp.vec3), flat(old_map.normal_world, wp.vec3),
+            flat(history.diffuse, wp.vec3), flat(history.specular, wp.vec3), flat(history.variance, wp.vec2), flat(history.samples, wp.vec2),
+        ],
+        [*(flat(t, wp.vec3) for t in vectors), *(flat(t, wp.vec2) for t in pairs)],
+        warp_device(gbuffer.coverage),
+    )  # fmt: skip
+    return Reprojected(*vectors, *pairs)
+
+
+def history_weights(reprojected: Reprojected, samples: Tensor) -> Tensor:
+    """(height, width, 2) share of the diffuse and specular mean that history has, beside `samples` (height, width) of the frame's own."""
+    worth = reprojected.samples * (1 - samples / FADE_SAMPLES).clamp(min=0)[..., None]
+    return worth / (worth + samples[..., None]).clamp(min=1e-6)
+
+
+def blend_history(radiance: Radiance, reprojected: Reprojected, gbuffer: GBuffer, samples: Tensor) -> Radiance:
+    """The mean of the frame's own samples (height, width) and what history is worth."""
+    assert radiance.diffuse_variance is not None and radiance.specular_variance is not None
+    share = history_weights(reprojected, samples)
+    factors = reflectances(gbuffer)
+    scales = [f.square().mean(-1) for f in factors]
+    parts, variances = [], []
+    own = ((radiance.diffuse, radiance.diffuse_variance), (radiance.specular, radiance.specular_variance))
+    for k, ((mean, variance), old) in enumerate(zip(own, (reprojected.diffuse, reprojected.specular), strict=True)):
+        w = share[..., k]
+        parts.append(torch.lerp(mean, old * factors[k], w[..., None]))
+        variances.append((1 - w).square() * variance + w.square() * reprojected.variance[..., k] * scales[k])
+    return replace(radiance, diffuse=parts[0], specular=parts[1], diffuse_variance=variances[0], specular_variance=variances[1])
+
+
+def remember(radiance: Radiance, gbuffer: GBuffer, camera: Camera, samples: Tensor, reprojected: Reprojected | None) -> History:
+    """A picture as history of the next.
+
+    Args:
+        radiance: with history blended in, not filtered. samples: (height, width) of the frame's own.
+        reprojected: the history that was blended in.
+    """
+    assert radiance.diffuse_variance is not None and radiance.specular_variance is not None
+    factors = reflectances(gbuffer)
+    scales = [f.square().mean(-1) for f in factors]
+    variance = torch.stack([radiance.diffuse_variance / scales[0], radiance.specular_variance / scales[1]], -1)
+    behind = samples[..., None].expand(*samples.shape, 2)
+    if reprojected is not None:
+        behind = behind + reprojected.samples * (1 - samples / FADE_SAMPLES).clamp(min=0)[..., None]
+    return History(camera, gbuffer, radiance.diffuse / factors[0], radiance.specular / factors[1], variance, behind)

@@ -1,0 +1,132 @@
+"""Horizons: a proof must never be wrong, so rays above them are traced and must all escape."""
+
+import math
+
+import pytest
+import torch
+import trimesh
+
+from drgs.render import horizon as horizon_module
+from drgs.render.horizon import BLOCKED, Horizons, find_horizons, usable_horizons
+from drgs.render.trace_rays import build_tracer
+from drgs.scene.mesh import TriangleMesh
+from drgs.warp_torch import warp_array
+from tests.render.closed_form_scenes import mesh_of, on_device, sphere_mesh, two_spheres
+
+
+def crumpled_sphere() -> TriangleMesh:
+    """Bumps, dents and folds of many sizes."""
+    shape = trimesh.creation.icosphere(3)
+    noise = torch.rand(len(shape.vertices), generator=torch.Generator().manual_seed(3)).numpy()
+    shape.vertices *= (1 + 0.15 * noise)[:, None]
+    return mesh_of(shape, 0.7, 0.5, 0.0)
+
+
+def open_box() -> TriangleMesh:
+    """A box without a lid, outside only: its inner sides are the backs of its triangles; and a smaller, closed box in it."""
+    box, inner = trimesh.creation.box(extents=(2, 2, 2)), trimesh.creation.box(extents=(0.5, 0.5, 0.5))
+    box.update_faces(box.triangles_center[:, 2] < 0.99)
+    return mesh_of(trimesh.util.concatenate([box, inner]), 0.7, 0.5, 0.0)
+
+
+def floor_and_ball() -> TriangleMesh:
+    ball, floor = trimesh.creation.icosphere(2), trimesh.creation.box(extents=(40, 40, 0.1))
+    ball.apply_translation([0, 0, 1.2])
+    return mesh_of(trimesh.util.concatenate([ball, floor]), 0.7, 0.5, 0.0)
+
+
+SCENES = {"crumpled": crumpled_sphere, "two spheres": two_spheres, "open box": open_box, "floor": floor_and_ball}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_rays_above_the_horizon_never_meet_the_mesh(name: str) -> None:
+    mesh = SCENES[name]()
+    tracer = build_tracer(mesh)
+    sine = find_horizons(mesh, tracer.lift)
+    face = torch.nonzero(sine < 1).squeeze(-1)
+    assert len(face)
+    face = face.repeat(-(-60_000 // len(face)))
+    corners = mesh.vertices[mesh.faces[face].long()]
+    weights = torch.rand(len(face), 3).pow(2.0)  # towards the edges, where neighbours rise
+    weights /= weights.sum(1, keepdim=True)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
+    origin = (weights[..., None] * corners).sum(1) + tracer.lift * normal
+    # Just above the horizon, all around.
+    height = (sine[face] + (1 - sine[face]) * torch.rand(len(face)).pow(4.0)).clamp(max=1)
+    across = torch.nn.functional.normalize(torch.linalg.cross(normal, torch.randn(len(face), 3)), dim=-1)
+    direction = torch.nn.functional.normalize(height[:, None] * normal + torch.sqrt(1 - height**2)[:, None] * across, dim=-1)
+    above = (direction * normal).sum(-1) > sine[face]
+    assert not bool(tracer.occluded(origin[above].contiguous(), direction[above].contiguous()).any())
+
+
+def test_a_convex_mesh_sees_nothing_of_itself() -> None:
+    assert float(find_horizons(sphere_mesh(3), 1e-5).max()) < 1e-4
+
+
+def test_the_horizon_of_a_step_is_its_slope() -> None:
+    """A floor of 1 by 1 before a wall of height 1 at distance 1: seen from the floor's edge the wall rises to 45 degrees."""
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0], [2, 0, 1], [2, 1, 1]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 6, 5], [5, 6, 7]], dtype=torch.int32)
+    one = torch.ones(8)
+    mesh = TriangleMesh(vertices, faces, torch.tensor([0.0, 0, 1]).expand(8, 3).contiguous(), torch.ones(8, 3), one, 0 * one)
+    sine = find_horizons(mesh, 1e-6)
+    assert abs(float(sine[0]) - math.sin(math.pi / 4)) < 1e-3
+    assert float(sine[1]) < float(sine[0]) + 1e-3
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_sixteen_triangles_at_once_are_the_triangles_one_by_one(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = SCENES[name]()
+    together = find_horizons(mesh, 1e-5)
+    launch, plain = horizon_module.launch, horizon_module.raise_horizons
+
+    def launch_plain(kernel, count, inputs, outputs, device):
+        which, corners, _, _, *boxes, lift = inputs
+        launch(plain, count, [which, corners, len(mesh.faces), *boxes, lift], outputs, device)
+
+    monkeypatch.setattr(horizon_module, "launch", launch_plain)
+    torch.testing.assert_close(together, find_horizons(mesh, 1e-5), rtol=0, atol=1e-4)
+
+
+def test_kernel_finds_the_same_on_each_device(device: str) -> None:
+    mesh = two_spheres()
+    torch.testing.assert_close(find_horizons(on_device(mesh, device), 1e-5).cpu(), find_horizons(mesh, 1e-5), rtol=0, atol=1e-4)
+
+
+def test_faces_without_area_are_never_let_off() -> None:
+    mesh = sphere_mesh(1)
+    faces = torch.cat([mesh.faces, torch.tensor([[0, 0, 1], [2, 2, 2]], dtype=torch.int32)])
+    flat = TriangleMesh(mesh.vertices, faces, mesh.normals, mesh.albedo, mesh.roughness, mesh.metallic)
+    assert find_horizons(flat, 1e-5)[-2:].tolist() == [BLOCKED, BLOCKED]
+
+
+def test_horizons_are_found_as_rays_pay_for_them() -> None:
+    horizons = Horizons(sphere_mesh(3), 1e-5)
+    horizons.pay(1000)
+    assert horizons.found == 0 and usable_horizons(horizons) is None
+    horizons.pay(400 * horizons.faces // 2)
+    assert 0 < horizons.found < horizons.faces
+    known = horizons.sine < BLOCKED
+    assert int(known.sum()) == horizons.found
+    horizons.pay(400 * horizons.faces)
+    assert horizons.found == horizons.faces and bool((horizons.sine < BLOCKED).all())
+
+
+def test_the_search_ends_where_hardly_a_ray_would_be_spared() -> None:
+    """A sphere turned inside out: every face looks at all the others."""
+    shape = trimesh.creation.icosphere(3)
+    shape.invert()
+    horizons = Horizons(mesh_of(shape, 0.7, 0.5, 0.0), 1e-5)
+    for _ in range(20):
+        horizons.pay(400 * 256)
+    assert horizons.found < horizons.faces
+
+
+def test_a_share_of_sky_may_be_given_up_where_little_is_blocked() -> None:
+    horizons = Horizons(floor_and_ball(), 1e-5)
+    horizons.find(horizons.faces)
+    allowed = usable_horizons(horizons, 0.05)
+    assert allowed is not None
+    given_up = allowed < 0
+    assert torch.equal(given_up, horizons.sine.square() <= 0.05) and bool(given_up.any()) and not bool(given_up.all())
+    assert warp_array(allowed).shape[0] == horizons.faces
