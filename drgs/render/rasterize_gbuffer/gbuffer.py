@@ -58,7 +58,7 @@ def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSet
         coverage=maps.coverage,
         depth=depth,
         position_world=position,
-        normal_world=face_camera(normalised[..., :3], -directions),
+        normal_world=face_camera(normalised[..., :3], -directions) * covered[..., None],
         wo_world=-directions,
         albedo=normalised[..., 3:6].clamp(0, 1),
         roughness=normalised[..., 6].clamp(0, 1),
