@@ -18,7 +18,7 @@ from torch import Tensor
 
 from drgs.maths.brdf import ggx_d, smith_v
 from drgs.scene.environment import direction_from_uv
-from drgs.warp_torch import thread_pool, warp_array, warp_device
+from drgs.warp_torch import load_kernel, thread_pool, warp_array, warp_device
 
 ENVIRONMENT_SIZE = (128, 256)
 """Rows and columns of the learned table."""
@@ -206,7 +206,7 @@ def _launch_slices(inputs, radiance: Tensor, point_gradients: list[Tensor] | Non
         return
     arrays = [warp_array(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True)]
     out = warp_array(radiance, wp.vec3)
-    split_sum_kernel.module.load(device)
+    load_kernel(split_sum_kernel, device)
 
     def run(k: int) -> None:
         first, last = count * k // GRADIENT_SLICES, count * (k + 1) // GRADIENT_SLICES

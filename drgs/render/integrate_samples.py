@@ -13,7 +13,7 @@ from torch import Tensor
 
 from drgs.render.brdf_warp import MIN_R, PI, ggx_d, smith_v
 from drgs.render.records import Rays, ShadingPoints
-from drgs.warp_torch import thread_pool, warp_array, warp_device
+from drgs.warp_torch import load_kernel, thread_pool, warp_array, warp_device
 
 GRADIENT_SLICES = 4
 """Points are cut into this many slices, each with its own gradient of the environment: same bits for any thread count."""
@@ -109,7 +109,7 @@ def _launch(height: int, inputs, contribution: Tensor, point_gradients: list[Ten
     samples = len(contribution) // points
     arrays = [warp_array(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True)]
     out = warp_array(contribution, wp.vec3)
-    ray_contributions.module.load(device)
+    load_kernel(ray_contributions, device)
 
     def run(k: int) -> None:
         # Slices end between points, so no two threads add to one point's gradient.
