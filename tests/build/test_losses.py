@@ -14,7 +14,10 @@ from drgs.build.losses import (
     mask_loss,
     normal_consistency,
     normals_from_depth,
+    rough_light,
     structural_dissimilarity,
+    texel_areas,
+    white_light,
 )
 from drgs.maths.color import linear_from_srgb
 from drgs.scene.camera import Camera, pixel_rays_world
@@ -146,3 +149,31 @@ def test_smoothness_counts_steps_between_solid_pixels_only_and_less_at_the_photo
     assert float(edge_aware_smoothness(maps, photo, solid)) == pytest.approx(plain * math.exp(-4), rel=1e-4)
     solid[:, 5] = 0.0
     assert float(edge_aware_smoothness(maps, photo, solid)) == 0.0
+
+
+def test_grey_light_is_white_at_any_brightness_and_coloured_light_is_not():
+    grey = torch.rand(16, 32, 1).expand(16, 32, 3) + 0.1
+    assert float(white_light(grey)) == pytest.approx(0.0, abs=1e-6)
+    red = grey * torch.tensor([2.0, 0.5, 0.5])
+    assert float(white_light(red)) == pytest.approx(2 / 3, rel=1e-4)  # (|2 - 1| + 2 |0.5 - 1|) / 3
+    assert float(white_light(100 * red)) == pytest.approx(float(white_light(red)), rel=1e-4)
+
+
+def test_texels_share_the_sphere_and_those_at_the_poles_count_less():
+    areas = texel_areas(torch.zeros(16, 32, 3))
+    assert float(areas.sum() * 32) == pytest.approx(1.0, rel=1e-5)
+    colour = torch.ones(16, 32, 3)
+    pole, equator = colour.clone(), colour.clone()
+    pole[0, 3, 0] = equator[8, 3, 0] = 2.0
+    assert float(white_light(pole)) < 0.2 * float(white_light(equator))
+
+
+def test_even_light_is_not_rough_and_a_step_counts_the_same_at_the_seam_and_at_any_brightness():
+    even = torch.full((8, 16, 3), 0.3)
+    assert float(rough_light(even)) == 0.0
+    middle, seam = even.clone(), even.clone()
+    middle[3, 7] = 0.6
+    seam[3, 15] = 0.6
+    assert float(rough_light(middle)) > 0
+    assert float(rough_light(seam)) == pytest.approx(float(rough_light(middle)))
+    assert float(rough_light(100 * middle)) == pytest.approx(float(rough_light(middle)), rel=1e-4)

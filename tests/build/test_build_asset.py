@@ -1,0 +1,213 @@
+"""From a capture to an asset on a tiny preset: what is written, how it stops and resumes, and what is refused."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import pytest
+import simplejpeg
+import torch
+
+from drgs.build.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, drop_unseen, encode_preview
+from drgs.build.densify import DensifySettings
+from drgs.build.extract_mesh import MeshSettings
+from drgs.build.fit_gaussians import FitSettings
+from drgs.build.fit_materials import MaterialSettings
+from drgs.render.sample_rays import SampleCounts
+from drgs.scene.asset import Asset, load_asset
+from tests.build.surfel_spheres import joined, surfel_sphere
+from tests.build.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
+from tests.render.closed_form_scenes import front_camera
+
+TINY = Preset(
+    points=600,
+    image_side=72,
+    fit=FitSettings(iterations=20, densify=DensifySettings(every=5, budget=700)),
+    mesh=MeshSettings(resolution=48, face_limit=2000),
+    materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
+)
+SETTINGS = BuildSettings(preset="tiny", device="cpu")
+
+
+@pytest.fixture(autouse=True)
+def _tiny_preset(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setitem(PRESETS, "other", TINY)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_nerf_synthetic(tmp_path_factory.mktemp("capture"))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Build:
+    asset: Asset
+    path: Path
+    progress: list[Progress]
+
+
+@pytest.fixture(scope="module")
+def build(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Build:
+    """One build, never stopped."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", TINY)
+        progress: list[Progress] = []
+        out = tmp_path_factory.mktemp("built") / "sphere"
+        return Build(build_asset(capture, out, SETTINGS, progress.append), out, progress)
+
+
+def stop_when(stage: str, progress: list[Progress], after: int = 1):
+    """should_stop that says yes from the `after`-th report of a stage on."""
+    return lambda: sum(p.stage == stage for p in progress) >= after
+
+
+def asset_tensors(asset: Asset) -> dict[str, torch.Tensor]:
+    parts = {"gaussians": asset.gaussians, "mesh": asset.mesh, "binding": asset.binding, "environment": asset.environment}
+    return {f"{part}.{f.name}": getattr(record, f.name) for part, record in parts.items() for f in dataclasses.fields(record)}
+
+
+def test_a_build_makes_an_asset_that_loads_with_the_same_numbers(build: Build):
+    loaded = asset_tensors(load_asset(build.path))
+    for name, value in asset_tensors(build.asset).items():
+        assert torch.equal(loaded[name], value), name
+    assert (build.path / "thumb.jpg").read_bytes()[:2] == b"\xff\xd8"
+    assert len(load_asset(build.path).cameras) == len(sphere_views())
+
+
+def test_the_mesh_is_the_sphere_and_its_vertices_carry_materials(build: Build):
+    mesh = build.asset.mesh
+    distance = (mesh.vertices - torch.tensor(SPHERE_CENTER, dtype=torch.float32)).norm(dim=-1) / SPHERE_RADIUS
+    # So short a fit leaves holes, behind which the fusion finds inner sheets; the outside is the sphere.
+    assert 0.95 < float(distance.quantile(0.9)) < 1.1
+    for name in ("albedo", "roughness", "metallic"):
+        value = getattr(mesh, name)
+        assert float(value.min()) >= 0 and float(value.max()) <= 1, name
+    assert float(mesh.albedo.std()) > 0.02  # not the grey that a fresh mesh has
+    assert len(build.asset.binding.face) == len(build.asset.gaussians.centers)
+    assert float(build.asset.environment.radiance.min()) > 0
+
+
+def test_provenance_says_how_the_asset_came_about(build: Build, capture: Path):
+    facts = load_asset(build.path).provenance
+    assert (facts["preset"], facts["seed"], facts["device"], facts["source"], facts["dataset"]) == (
+        "tiny",
+        0,
+        "cpu",
+        "nerf-synthetic",
+        capture.name,
+    )
+    assert set(facts["seconds"]) >= {"read", "fit", "mesh", "materials"} and all(s >= 0 for s in facts["seconds"].values())
+
+
+def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
+    fractions = [p.fraction for p in build.progress]
+    assert fractions == sorted(fractions) and fractions[0] == 0.0 and fractions[-1] == pytest.approx(1.0)
+    stages = list(dict.fromkeys(p.stage for p in build.progress))
+    assert stages == ["read", "fit", "mesh", "materials", "pack"]
+    last_fit = [p for p in build.progress if p.stage == "fit"][-1]
+    assert (last_fit.iteration, last_fit.iterations) == (20, 20) and last_fit.psnr > 5
+
+
+@pytest.mark.parametrize("stage", ["fit", "mesh", "materials"])
+def test_a_stopped_build_leaves_a_checkpoint_and_resumes_to_the_same_asset(build: Build, capture: Path, tmp_path: Path, stage: str):
+    progress: list[Progress] = []
+    out = tmp_path / "sphere"
+    with pytest.raises(BuildStopped):
+        build_asset(capture, out, SETTINGS, progress.append, stop_when(stage, progress))
+    assert not out.exists()
+    checkpoint = "stage2.safetensors" if stage == "materials" else "stage1.safetensors"
+    assert (Path(f"{out}.build") / checkpoint).is_file()
+    resumed = asset_tensors(build_asset(capture, out, dataclasses.replace(SETTINGS, resume=True)))
+    for name, value in asset_tensors(build.asset).items():
+        if stage == "materials" and not name.startswith(("mesh.vertices", "mesh.faces")):
+            # Resuming stage 2 refreshes the radiance that rays meet, earlier than the build that ran through did.
+            assert float((resumed[name].float() - value.float()).abs().median()) < 1e-3, name
+        else:
+            assert torch.equal(resumed[name], value), name
+    assert load_asset(out).gaussians is not None
+
+
+def test_stopping_before_anything_is_fitted_can_be_resumed(capture: Path, tmp_path: Path):
+    with pytest.raises(BuildStopped):
+        build_asset(capture, tmp_path / "a", SETTINGS, should_stop=lambda: True)
+    assert (tmp_path / "a.build" / "stage1.safetensors").is_file()
+
+
+@pytest.fixture(scope="module")
+def stopped(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """OUT of a build that stopped at once."""
+    out = tmp_path_factory.mktemp("stopped") / "a"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", TINY)
+        with pytest.raises(BuildStopped):
+            build_asset(capture, out, SETTINGS, should_stop=lambda: True)
+    return out
+
+
+def copy_of(stopped: Path, folder: Path) -> Path:
+    shutil.copytree(f"{stopped}.build", folder / "a.build")
+    return folder / "a"
+
+
+@pytest.mark.parametrize("change", [{"preset": "other"}, {"seed": 9}])
+def test_the_checkpoint_of_another_build_is_refused(capture: Path, stopped: Path, tmp_path: Path, change: dict):
+    out = copy_of(stopped, tmp_path)
+    with pytest.raises(ValueError, match=r"is of another build .* delete its folder or choose another OUT"):
+        build_asset(capture, out, dataclasses.replace(SETTINGS, resume=True, **change))
+    assert not out.exists()
+
+
+def test_the_checkpoint_of_another_capture_is_refused(stopped: Path, tmp_path: Path):
+    fewer = write_nerf_synthetic(tmp_path / "fewer", sphere_views(20, square=True))
+    with pytest.raises(ValueError, match="is of another build"):
+        build_asset(fewer, copy_of(stopped, tmp_path), dataclasses.replace(SETTINGS, resume=True))
+
+
+def test_a_damaged_checkpoint_is_refused_on_resume_and_ignored_without(capture: Path, stopped: Path, tmp_path: Path):
+    out = copy_of(stopped, tmp_path)
+    path = Path(f"{out}.build") / "stage1.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"checkpoint stage1\.safetensors is damaged"):
+        build_asset(capture, out, dataclasses.replace(SETTINGS, resume=True))
+    with pytest.raises(BuildStopped):  # a fresh build starts
+        build_asset(capture, out, SETTINGS, should_stop=lambda: True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        (BuildSettings(preset="best"), "preset 'best' is unknown; expected one of draft, fast, full"),
+        (BuildSettings(binding="ropes"), "binding 'ropes' is not available"),
+        (BuildSettings(device="tpu"), "device 'tpu' is unknown"),
+    ],
+)
+def test_unknown_settings_are_refused_before_anything_is_read(tmp_path: Path, settings: BuildSettings, sentence: str):
+    with pytest.raises(ValueError, match=sentence):
+        build_asset(tmp_path / "no such capture", tmp_path / "out", settings)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_no_capture_is_refused(tmp_path: Path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="not a capture"):
+        build_asset(tmp_path / "empty", tmp_path / "out", SETTINGS)
+
+
+def test_surfels_that_no_camera_sees_are_dropped():
+    outer, inner = surfel_sphere(1200, opacity=0.99, overlap=2.0), surfel_sphere(50, radius=0.4, opacity=0.99)
+    # One camera sees the front of the outer sphere; what is inside and behind hides.
+    kept = drop_unseen(joined(outer, inner), (front_camera(64),), radius=1.0)
+    distance = kept.centers.norm(dim=-1)
+    assert float(distance.min()) > 0.9
+    assert float(kept.centers[:, 1].median()) < 0 and 400 < len(kept.centers) < 900
+    assert len(kept.sh) == len(kept.albedo) == len(kept.centers)
+
+
+def test_a_preview_is_a_jpeg_of_the_picture_on_grey():
+    radiance = torch.full((16, 24, 3), 0.5, requires_grad=True)
+    coverage = torch.zeros(16, 24)
+    coverage[:, 12:] = 1.0
+    image = simplejpeg.decode_jpeg(encode_preview(radiance, coverage))
+    assert image.shape == (16, 24, 3)
+    assert abs(int(image[8, 2, 0]) - 51) < 4 and abs(int(image[8, 20, 0]) - 188) < 4
