@@ -130,7 +130,9 @@ def render(
     seed: Annotated[int, typer.Option()] = 0,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Picture size instead of the file's.")] = None,
     device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
+    error: Annotated[float | None, typer.Option(min=1e-5, help="Relative error at which parts of a picture get no more rays.")] = None,
     explain: Annotated[bool, typer.Option("--explain", help="Say what was left out of the work, and why.")] = False,
+    skip: Annotated[bool, typer.Option("--skip/--no-skip", help="Leave out work that the scene does not need.")] = True,
     as_json: Json = False,
 ) -> None:
     """Render an asset from the cameras of a file: <name>.png (RGBA, straight alpha, sRGB), and maps with --aov."""
@@ -151,6 +153,8 @@ def render(
         bounces=bounces,
         primary=primary.value if primary else ("gaussians" if scene.surfels is not None else "mesh"),
         denoise=denoise.value,
+        target_error=error,
+        skip=skip,
         seed=seed,
     )
     with frame_progress("Rendering", len(views)) as advance:
@@ -159,6 +163,8 @@ def render(
         print(json.dumps({"out": str(out), "frames": frames}))
     elif explain:
         for frame in frames:
+            for left_out in frame["skipped"]:
+                print(f"{frame['name']}: left out {left_out['what']}: {left_out['why']} ({left_out['bound']})")
             print(json.dumps(frame, indent=1))
 
 

@@ -35,6 +35,7 @@ def resolve_frame(state: FrameState) -> Frame:
         "bounces": settings.bounces,
         "counts": asdict(state.plan.counts),
         "skipped": [asdict(skip) for skip in state.plan.skips],
+        "horizons": _horizons(state),
         "made": list(state.made),
         "error": round(float(frame_errors(state).max()), 6),
         "tiles_at_rest": int((~state.active).sum()),
@@ -43,6 +44,14 @@ def resolve_frame(state: FrameState) -> Frame:
         "milliseconds": {step: round(1000 * duration, 3) for step, duration in seconds.items()},
     }
     return Frame(rgba, linear, gbuffer, shown, metadata)
+
+
+def _horizons(state: FrameState) -> dict[str, float]:
+    """How far the search for rays that need no tracing has come, and what it found."""
+    horizons = state.tracer.horizons if state.settings.skip else None
+    if horizons is None:
+        return {"faces": 0, "faces_known": 0, "rays_spared": 0.0}
+    return {"faces": horizons.faces, "faces_known": horizons.found, "rays_spared": round(horizons.spared(), 4)}
 
 
 def pixel_passes(state: FrameState) -> Tensor:

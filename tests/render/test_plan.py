@@ -1,18 +1,21 @@
 """Each skip against the same frame with nothing skipped, and the scenes where it must not fire."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
-from drgs.render.accumulate import RenderSettings
+from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, start_frame
 from drgs.render.environment_table import build_environment_table, environment_light
-from drgs.render.plan import plan_frame
+from drgs.render.horizon import Horizons
+from drgs.render.plan import SceneFacts, plan_frame, scene_facts
 from drgs.render.render_frame import render_frame
 from drgs.render.sample_rays import SampleCounts
 from drgs.render.shade import RayStarts, shade
 from drgs.render.trace_rays import build_tracer
 from drgs.scene.environment import Environment
+from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedScene
 from tests.render.closed_form_scenes import constant_sky, front_camera, points_seen_at, sphere_mesh, sunny_sky, two_spheres
 
@@ -80,3 +83,90 @@ def test_frames_with_and_without_skipping_agree(sky: Environment) -> None:
     covered = frames[0].gbuffer.coverage == 1
     a, b = (torch.mean(frame.radiance_linear[covered]) for frame in frames)
     assert abs(float(a / b) - 1) < 5e-3
+
+
+def skipped(scene: PosedScene, **settings) -> list[str]:
+    return [skip["what"] for skip in render_frame(scene, front_camera(8, 12.0), RenderSettings(8, **settings)).metadata["skipped"]]
+
+
+def with_one_vertex(mesh: TriangleMesh, **values: float) -> TriangleMesh:
+    """The mesh with the materials of its first vertex changed."""
+    changed = {name: getattr(mesh, name).clone() for name in values}
+    for name, value in values.items():
+        changed[name][0] = value
+    return dataclasses.replace(mesh, **changed)
+
+
+def test_rough_dielectrics_need_no_ggx_samples_but_one_shiny_or_metal_vertex_does() -> None:
+    rough, sky = sphere_mesh(2, roughness=0.8), sunny_sky()
+    assert "GGX samples" in skipped(PosedScene(None, rough, sky))
+    for values in ({"roughness": 0.3}, {"metallic": 0.2}):
+        assert "GGX samples" not in skipped(PosedScene(None, with_one_vertex(rough, **values), sky))
+
+
+def test_bare_metal_needs_no_cosine_samples_but_one_diffuse_vertex_does() -> None:
+    metal, sky = sphere_mesh(2, metallic=1.0), sunny_sky()
+    assert "cosine samples" in skipped(PosedScene(None, metal, sky))
+    assert "cosine samples" not in skipped(PosedScene(None, with_one_vertex(metal, metallic=0.9), sky))
+
+
+@pytest.mark.parametrize(("metallic", "roughness", "what"), [(0.0, 0.85, "GGX samples"), (1.0, 0.4, "cosine samples")])
+def test_dropping_a_strategy_keeps_the_mean(metallic: float, roughness: float, what: str) -> None:
+    scene = PosedScene(None, two_spheres(roughness=roughness, metallic=metallic), sunny_sky(sun=3.0))
+    frames = [render_frame(scene, front_camera(16, 8.0), RenderSettings(512, skip=skip, seed=int(skip))) for skip in (True, False)]
+    assert what in [skip["what"] for skip in frames[0].metadata["skipped"]] and frames[1].metadata["skipped"] == []
+    covered = frames[0].gbuffer.coverage == 1
+    a, b = (torch.mean(frame.radiance_linear[covered]) for frame in frames)
+    assert abs(float(a / b) - 1) < 6e-3
+
+
+def test_strategies_are_dropped_for_what_reflections_show_too() -> None:
+    """Facts are those of all surfaces: one metal vertex on the far side is in them."""
+    mesh = with_one_vertex(sphere_mesh(2, roughness=0.8), metallic=1.0)
+    assert scene_facts(PosedScene(None, mesh, sunny_sky())) == SceneFacts(pytest.approx(0.7), 1.0, pytest.approx(0.8))
+
+
+def test_a_triangle_smaller_than_a_pixel_is_in_no_empty_tile() -> None:
+    mesh = sphere_mesh(2, radius=0.02)
+    frames = [
+        render_frame(PosedScene(None, mesh, constant_sky()), front_camera(64), RenderSettings(256, skip=skip)) for skip in (True, False)
+    ]
+    assert "rays through empty tiles" in [skip["what"] for skip in frames[0].metadata["skipped"]]
+    assert float(frames[0].gbuffer.coverage.sum()) > 0
+    assert torch.equal(frames[0].gbuffer.coverage, frames[1].gbuffer.coverage)
+
+
+@pytest.mark.parametrize("bounces", [0, 1, 2])
+def test_rays_spared_by_horizons_change_not_one_bit(bounces: int) -> None:
+    scene = PosedScene(None, two_spheres(metallic=0.5), sunny_sky(sun=30.0))
+    pictures = []
+    for found in (False, True):
+        tracer = build_tracer(scene.mesh)
+        tracer.horizons = Horizons(scene.mesh, tracer.lift)
+        if found:
+            tracer.horizons.find(tracer.horizons.faces)
+        state = start_frame(scene, front_camera(16, 8.0), RenderSettings(bounces=bounces), tracer)
+        pictures.append(resolve_frame(refine_frame(state, 2)).radiance_linear)
+        assert (tracer.horizons.spared() > 0.5) == found
+    assert torch.equal(*pictures)
+
+
+def test_giving_up_a_share_of_the_sky_errs_by_no_more_than_it() -> None:
+    """Under an even sky, direct light, the error of a white surface is the share of the sky that is wrongly open."""
+    scene = PosedScene(None, two_spheres(albedo=1.0, roughness=1.0), constant_sky())
+    error = 0.1
+    frames = []
+    for settings in (RenderSettings(bounces=0, skip_error=error), RenderSettings(bounces=0)):
+        tracer = build_tracer(scene.mesh)
+        tracer.horizons = Horizons(scene.mesh, tracer.lift)
+        tracer.horizons.find(tracer.horizons.faces)
+        frames.append(resolve_frame(refine_frame(start_frame(scene, front_camera(24, 8.0), settings, tracer), 32)))
+    assert any(f"{100 * error:g} %" in skip["bound"] for skip in frames[0].metadata["skipped"])
+    brighter = (frames[0].radiance.diffuse - frames[1].radiance.diffuse)[frames[1].gbuffer.coverage == 1]
+    assert 0 < float(brighter.max()) <= error + 0.02 and float(brighter.min()) > -1e-6
+
+
+def test_a_black_sky_with_one_bright_texel_is_not_black() -> None:
+    sky = constant_sky(0.0).radiance.clone()
+    sky[3, 7] = 1e-3
+    assert "light rays" not in skipped(PosedScene(None, sphere_mesh(1), Environment(sky)))
