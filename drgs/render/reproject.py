@@ -176,7 +176,7 @@ def reproject(history: History, gbuffer: GBuffer, camera: Camera) -> Reprojected
     old, old_map = history.camera, history.gbuffer
 
     def flat(values: Tensor, dtype: object = None) -> wp.array:
-        return warp_array(values.float().reshape(height * width if values.shape[:2] == (height, width) else -1, *values.shape[2:]), dtype)
+        return warp_array(values.float().reshape(-1, *values.shape[2:]), dtype)
 
     launch(
         look_up_history,
