@@ -4,6 +4,7 @@ Reads like the method: each step is a function of its own file; here they meet, 
 Checkpoints live in OUT.build/ beside the asset; a build that was stopped or killed goes on from the last one.
 """
 
+import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -41,6 +42,7 @@ from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians, surfel_tangents
 from drgs.scene.mesh import TriangleMesh, vertex_normals
+from drgs.scene.views import Views
 from drgs.warp_torch import device_from_name
 
 PREVIEW_SECONDS = 3.0
@@ -205,7 +207,10 @@ def build_asset(
     views = load_views(dataset, max_side=preset.image_side)
     points = initial_points(views, preset.points, settings.seed)
     timed("read", started)
-    identity = {"preset": settings.preset, "seed": settings.seed, "views": len(views.cameras), "source": views.source}
+    identity = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
+    if not settings.resume:
+        for stale in ("stage1.safetensors", "stage2.safetensors"):  # else a later --resume would take them for this build's
+            (work / stale).unlink(missing_ok=True)
 
     started = time.monotonic()
     fit_settings = replace(preset.fit, seed=settings.seed)
@@ -253,6 +258,14 @@ def build_asset(
     save_asset(asset, out, _thumbnail(materials, views.cameras))
     reporter.report("pack", 1.0, "done")
     return asset
+
+
+def capture_digest(views: Views) -> str:
+    """Hex digest of the photos, masks and poses: a checkpoint belongs to these and no others."""
+    digest = hashlib.sha256()
+    for part in (views.images_srgb, views.coverage, *(camera.camera_from_world for camera in views.cameras)):
+        digest.update(part.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _stage_one(views, points, fit_settings, device, work, identity, resume, reporter, stop_now) -> FitState:
