@@ -11,6 +11,7 @@ tangent plane instead of depth gradients, which splats make noisy. Twin: drgs/re
 """
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -149,15 +150,78 @@ def reflectances(gbuffer: GBuffer) -> tuple[Tensor, Tensor]:
     return diffuse.clamp(min=MIN_REFLECTANCE), f0_from_base(gbuffer.albedo, gbuffer.metallic).clamp(min=MIN_REFLECTANCE)
 
 
-def denoise_svgf(radiance: Radiance, gbuffer: GBuffer, camera: Camera) -> Radiance:
-    """The spatial filter; radiance must carry the variances of both parts."""
-    if radiance.diffuse_variance is None or radiance.specular_variance is None:
-        raise ValueError("denoising needs the variance of the diffuse and specular part; this radiance carries none")
+PAD = 32
+"""Empty pixels at both ends of a row: as far as the widest kernel reaches."""
+
+
+def _native_source(part: int) -> str:
+    folder = Path(__file__).parent
+    vectors = (folder / "rasterize_gbuffer" / "tile_vector.h").read_text()
+    return f"constexpr int NORMAL_POWER = {int(NORMAL_POWER)};\n" + vectors + (folder / "denoise.h").read_text().split("// ----\n")[part]
+
+
+@wp.func_native(_native_source(0))
+def smooth_sixteen(
+    at: int, height: int, pitch: int, step: int, coverage: wp.array(dtype=float), variance: wp.array(dtype=float), smooth: wp.array(dtype=float)
+): ...  # fmt: skip
+
+
+@wp.func_native(_native_source(1))
+def filter_sixteen(
+    at: int, height: int, pitch: int, step: int, sigma_luminance: float, sigma_plane: float, neighbour_variance: float,
+    guides: wp.array(dtype=float), source: wp.array(dtype=float), smooth: wp.array(dtype=float), target: wp.array(dtype=float),
+): ...  # fmt: skip
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def smooth_variance_simd(
+    first: int,
+    groups: wp.array[int],
+    height: int,
+    pitch: int,
+    step: int,
+    coverage: wp.array[float],
+    variance: wp.array[float],
+    # outputs
+    smooth: wp.array[float],
+):
+    """smooth_variance on the CPU, for maps in planes (denoise.h)."""
+    smooth_sixteen(groups[first + wp.tid()], height, pitch, step, coverage, variance, smooth)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def filter_level_simd(
+    first: int,
+    groups: wp.array[int],
+    height: int,
+    pitch: int,
+    step: int,
+    sigma_luminance: float,
+    sigma_plane: float,
+    neighbour_variance: float,
+    guides: wp.array[float],
+    source: wp.array[float],
+    smooth: wp.array[float],
+    # outputs
+    target: wp.array[float],
+):
+    """filter_level on the CPU, for maps in planes (denoise.h)."""
+    at = groups[first + wp.tid()]
+    filter_sixteen(at, height, pitch, step, sigma_luminance, sigma_plane, neighbour_variance, guides, source, smooth, target)
+
+
+Maps = tuple[Tensor, Tensor, Tensor]
+"""Diffuse and specular light over reflectance (height, width, 3), and the variance of their luminance (height, width, 2)."""
+
+
+def filter_maps(maps: Maps, gbuffer: GBuffer, footprint: float) -> Maps:
+    """All levels, one pixel after another.
+
+    Args:
+        footprint: of a pixel at distance 1 [world units].
+    """
     height, width = gbuffer.coverage.shape
-    factors = reflectances(gbuffer)
-    luminance_squared = [f.square().mean(-1) for f in factors]
-    variance = torch.stack([radiance.diffuse_variance / luminance_squared[0], radiance.specular_variance / luminance_squared[1]], -1)
-    source = [(radiance.diffuse / factors[0]).contiguous(), (radiance.specular / factors[1]).contiguous(), variance.contiguous()]
+    source = [t.contiguous().clone() for t in maps]
     target = [t.clone() for t in source]
     pixels = torch.nonzero(gbuffer.coverage.reshape(-1) > 0).squeeze(-1).int()
     depth = torch.where(torch.isfinite(gbuffer.depth), gbuffer.depth, 0.0)
@@ -167,13 +231,12 @@ def denoise_svgf(radiance: Radiance, gbuffer: GBuffer, camera: Camera) -> Radian
         warp_array(gbuffer.position_world.reshape(-1, 3), wp.vec3),
         warp_array(gbuffer.normal_world.reshape(-1, 3), wp.vec3),
     ]
-    footprint = 1.0 / float(camera.intrinsics[0, 0])  # of a pixel at distance 1
 
     def arrays(buffers: list[Tensor]) -> list:
         flat = [t.view(height * width, -1) for t in buffers]
         return [warp_array(flat[0], wp.vec3), warp_array(flat[1], wp.vec3), warp_array(flat[2], wp.vec2)]
 
-    smooth = torch.zeros_like(variance)
+    smooth = torch.zeros_like(source[2])
     smooth_array = warp_array(smooth.view(-1, 2), wp.vec2)
     for level in range(LEVELS):
         step = 1 << level
@@ -182,12 +245,60 @@ def denoise_svgf(radiance: Radiance, gbuffer: GBuffer, camera: Camera) -> Radian
         settings = [warp_array(pixels), width, height, step, footprint, SIGMA_LUMINANCE, SIGMA_PLANE, NEIGHBOUR_VARIANCE]
         launch(filter_level, len(pixels), [*settings, *guides, *arrays(source), smooth_array], arrays(target), warp_device(depth))
         source, target = target, source
+    return source[0], source[1], source[2]
+
+
+def filter_maps_simd(maps: Maps, gbuffer: GBuffer, footprint: float) -> Maps:
+    """filter_maps, sixteen pixels at once on the CPU; 0 where nothing is covered."""
+    height, width = gbuffer.coverage.shape
+    columns = -(-width // 16) * 16
+    pitch = columns + 2 * PAD
+
+    def planes(*values: Tensor) -> Tensor:
+        """(plane, height, pitch)."""
+        count = sum(1 if v.dim() == 2 else v.shape[-1] for v in values)
+        result = torch.zeros(count, height, pitch)
+        at = 0
+        for v in values:
+            size = 1 if v.dim() == 2 else v.shape[-1]
+            result[at : at + size, :, PAD : PAD + width] = v[None] if v.dim() == 2 else v.permute(2, 0, 1)
+            at += size
+        return result
+
+    depth = torch.where(torch.isfinite(gbuffer.depth), gbuffer.depth, 0.0)
+    guides = planes(gbuffer.coverage, footprint * depth, gbuffer.position_world, gbuffer.normal_world)
+    source = planes(*maps)
+    target, smooth = torch.zeros_like(source), torch.zeros(2, height, pitch)
+    full = (guides[0, :, PAD : PAD + columns].reshape(height, -1, 16) > 0).any(-1).nonzero()
+    groups = warp_array((full[:, 0] * pitch + PAD + 16 * full[:, 1]).int())
+    smooth_array, guide_array = warp_array(smooth.view(-1)), warp_array(guides.view(-1))
+    for level in range(LEVELS):
+        place = [groups, height, pitch, 1 << level]
+        variance = warp_array(source[6:].view(-1))
+        launch(smooth_variance_simd, len(full), [*place, warp_array(guides[0].view(-1)), variance], [smooth_array], "cpu")
+        inputs = [*place, SIGMA_LUMINANCE, SIGMA_PLANE, NEIGHBOUR_VARIANCE, guide_array, warp_array(source.view(-1)), smooth_array]
+        launch(filter_level_simd, len(full), inputs, [warp_array(target.view(-1))], "cpu")
+        source, target = target, source
+    inside = source[:, :, PAD : PAD + width].permute(1, 2, 0)
+    return inside[..., :3], inside[..., 3:6], inside[..., 6:]
+
+
+def denoise_svgf(radiance: Radiance, gbuffer: GBuffer, camera: Camera) -> Radiance:
+    """The spatial filter; radiance must carry the variances of both parts."""
+    if radiance.diffuse_variance is None or radiance.specular_variance is None:
+        raise ValueError("denoising needs the variance of the diffuse and specular part; this radiance carries none")
+    factors = reflectances(gbuffer)
+    squares = [f.square().mean(-1) for f in factors]
+    variance = torch.stack([radiance.diffuse_variance / squares[0], radiance.specular_variance / squares[1]], -1)
+    filter_all = filter_maps if gbuffer.coverage.is_cuda else filter_maps_simd
+    footprint = 1.0 / float(camera.intrinsics[0, 0])  # of a pixel at distance 1
+    diffuse, specular, variance = filter_all((radiance.diffuse / factors[0], radiance.specular / factors[1], variance), gbuffer, footprint)
     return replace(
         radiance,
-        diffuse=source[0] * factors[0],
-        specular=source[1] * factors[1],
-        diffuse_variance=source[2][..., 0] * luminance_squared[0],
-        specular_variance=source[2][..., 1] * luminance_squared[1],
+        diffuse=diffuse * factors[0],
+        specular=specular * factors[1],
+        diffuse_variance=variance[..., 0] * squares[0],
+        specular_variance=variance[..., 1] * squares[1],
     )
 
 

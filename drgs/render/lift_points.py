@@ -25,10 +25,8 @@ FACING = 0.2
 
 def lift_points(points: ShadingPoints, tracer: AbstractTracer) -> RayStarts:
     """Ray starts of shading points; carries no gradient."""
-    mesh = tracer.mesh
     position, normal, wo = points.position_world.detach(), points.normal_world.detach(), points.wo_world.detach()
-    corners = mesh.vertices.detach()[mesh.faces.long()]
-    face_normals = torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
+    face_normals = tracer.face_normals
 
     start, surface_normal = position + tracer.lift * normal, normal.clone()
     face = torch.full((len(position),), -1, dtype=torch.int32, device=position.device)

@@ -2,6 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import Self
 
 import torch
@@ -31,6 +32,12 @@ class AbstractTracer(ABC):
     """Diagonal of the mesh's box [world units]."""
     horizons: Horizons | None = None
     """Rays that leave a face above its horizon need not be asked about; None until somebody looks for them."""
+
+    @cached_property
+    def face_normals(self) -> Tensor:
+        """(face, 3) unit normals of the triangles."""
+        a, b, c = self.mesh.vertices.detach()[self.mesh.faces.long()].unbind(1)
+        return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
 
     def with_materials(self, mesh: TriangleMesh) -> Self:
         """A tracer of a mesh of the same shape with other materials; shares the tree."""

@@ -7,7 +7,7 @@ import torch
 
 from drgs.reference import denoise as reference
 from drgs.render.accumulate import RenderSettings
-from drgs.render.denoise import LEVELS, denoise, denoise_svgf, reflectances
+from drgs.render.denoise import LEVELS, denoise, denoise_svgf, filter_maps, filter_maps_simd, reflectances
 from drgs.render.records import GBuffer, Radiance
 from drgs.render.render_frame import render_frame
 from drgs.render.trace_primary import trace_primary
@@ -42,6 +42,17 @@ def test_kernel_filters_as_the_reference_does(device: str) -> None:
     covered = gbuffer.coverage > 0
     torch.testing.assert_close(ours.diffuse.cpu()[covered].double(), (parts[0] * factors[0])[covered], atol=1e-4, rtol=1e-3)
     torch.testing.assert_close(ours.specular.cpu()[covered].double(), (parts[1] * factors[1])[covered], atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("size", [40, 7])
+def test_sixteen_pixels_at_once_are_the_pixels_one_by_one(size: int) -> None:
+    camera = front_camera(size)
+    gbuffer = trace_primary(sphere_mesh(3), camera)
+    maps = (torch.rand(size, size, 3), torch.rand(size, size, 3), 0.1 * torch.rand(size, size, 2))
+    covered = gbuffer.coverage > 0
+    footprint = 1 / float(camera.intrinsics[0, 0])
+    for one, other in zip(filter_maps(maps, gbuffer, footprint), filter_maps_simd(maps, gbuffer, footprint), strict=True):
+        torch.testing.assert_close(one[covered], other[covered], atol=1e-5, rtol=1e-4)
 
 
 def test_independent_noise_falls_and_the_mean_stays() -> None:
