@@ -1,10 +1,7 @@
 """The renderer of the service: drgs' own progressive frames, with everything kept that a change leaves as it was.
 
-    camera or size      the G-buffer is rasterised again
-    environment         nothing but the light is computed again
-    material            no geometry: the tracer's tree stays, its mesh gets the new materials
-    shape               the tree is built again
-    exposure, background  nothing is computed again, the sums are shown anew
+What an edit makes old is drgs/render/invalidate.py's table; frames are handed on from picture to picture, so that a new environment keeps
+what the camera sees, a new exposure all samples, and a moving camera what its last picture showed of the same places.
 
 Imported only on the render thread, and torch only inside functions: the API process must start fast.
 """
@@ -123,8 +120,8 @@ class Pose(AbstractPose):
         same_view = known is not None and known.view_key == _view_key(camera, width, height)
         if known is not None and same_view and known.pose is self and known.rays_key == _rays_key(settings):
             return known.shown_with(settings)
-        gbuffer = known.gbuffer if known is not None and same_view and _same_surfels(known.pose.scene, self.scene) else None
-        state = start_frame(self.scene, _camera(camera, width, height), _render_settings(settings), self.tracer, gbuffer)
+        before = None if known is None else known._state
+        state = start_frame(self.scene, _camera(camera, width, height), _render_settings(settings), self.tracer, previous=before)
         return Picture(self, state, settings, _view_key(camera, width, height))
 
 
@@ -152,11 +149,6 @@ class Picture(AbstractPicture):
         if self._settings.channel != "final" and self._state.fixed is not None:
             wanted = 1  # maps of Gaussians are exact from the first pass on
         return max(wanted, self._samples_a_pass)
-
-    @property
-    def gbuffer(self) -> "GBuffer | None":
-        """Of the Gaussians; None where the mesh is traced."""
-        return self._state.gbuffer
 
     def shown_with(self, settings: Settings) -> "Picture":
         """The same sums under another exposure, background, channel or target."""
@@ -210,15 +202,6 @@ def _view_key(camera: CameraMessage, width: int, height: int) -> tuple:
 def _rays_key(settings: Settings) -> tuple:
     """What of the settings changes the light that is summed, not only how it is shown."""
     return (settings.bounces if settings.channel == "final" else 0,)
-
-
-def _same_surfels(a: "PosedScene", b: "PosedScene") -> bool:
-    """Whether a G-buffer of one is one of the other; pose_scene keeps what edits leave alone, so identity tells."""
-    if a.surfels is None or b.surfels is None:
-        return False
-    pairs = [(getattr(a.surfels, name), getattr(b.surfels, name)) for name in ("centers", "tangents", "opacities")]
-    pairs += [(getattr(a.surfels.materials, name), getattr(b.surfels.materials, name)) for name in ("albedo", "roughness", "metallic")]
-    return all(left is right for left, right in pairs)
 
 
 def _camera(message: CameraMessage, width: int, height: int):
