@@ -1,16 +1,20 @@
 """Light transport against an independent path tracer: error, bias and time, in one run.
 
-    python -m benchmarks integrator --reference DIR [--spp 8 32 128] [--json] [--pictures OUT]
+    python -m benchmarks integrator --reference DIR [--spp 8 32 128] [--mitsuba] [--json] [--pictures OUT]
 
 DIR holds mesh.ply, cameras.json, env_*.exr, `<env>_<direct|bounce1>_<camera>.exr` (linear, premultiplied, many
 samples) and `*_se.npy` (standard error of each pixel's mean). relmse = mean over covered pixels and channels of
 (x - ref)^2 / (ref^2 + 0.01); bias = (sum x - sum ref) / sum ref; its error bar has both sides' noise.
 seconds is wall time from a built tracer on, cpu_seconds the sum over threads (steadier on a busy machine). within_4se = share of covered pixels whose RGB mean is within four standard errors (both sides' noise).
+With --mitsuba the same images are rendered by Mitsuba's path tracer in the same run (_mitsuba.py), and `time_to_error` gives for both the time
+to relmse 0.01 and 0.003, read off the measured points (log-log between them, error ~ 1 / time beyond).
 """
 
 import argparse
 import json
 import time
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +24,7 @@ import torch
 from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, samples_a_pass, start_frame
 from drgs.render.sample_rays import SampleCounts
 from drgs.render.trace_rays import build_tracer
+from drgs.render.tracer import AbstractTracer
 from drgs.scene.camera import Camera, camera_from_opengl
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh
@@ -87,6 +92,43 @@ def mitsuba_rows(radiance: np.ndarray) -> np.ndarray:
     return radiance[row] * (1 - part) + radiance[row + 1] * part
 
 
+def time_to_error(rows: list[dict], target: float, clock: str) -> float:
+    """Seconds until relmse falls to `target`, from rows of one image by one renderer."""
+    rows = sorted(rows, key=lambda row: row["spp"])
+    seconds, errors = (np.log([row[name] for row in rows]) for name in (clock, "relmse"))
+    wanted = np.log(target)
+    if wanted >= errors[0]:
+        return float(np.exp(seconds[0] + errors[0] - wanted))
+    if wanted <= errors[-1]:
+        return float(np.exp(seconds[-1] + errors[-1] - wanted))
+    return float(np.exp(np.interp(-wanted, -errors, seconds)))
+
+
+def ours(scene: PosedScene, camera: Camera, settings: RenderSettings, tracer: AbstractTracer, samples: list[int]) -> Iterator[tuple]:
+    """(samples a pixel, premultiplied mean, its variance, wall seconds, seconds over threads) as samples grow."""
+    refine_frame(start_frame(scene, camera, settings, tracer))  # compile and warm up
+    started, cpu_started = time.perf_counter(), time.process_time()
+    state = start_frame(scene, camera, settings, tracer)
+    for spp in sorted(samples):
+        state = refine_frame(state, max(0, -(-spp // samples_a_pass(settings, True).total) - state.passes))
+        seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
+        frame = resolve_frame(state)
+        coverage = frame.gbuffer.coverage
+        mean, variance = (frame.radiance_linear * coverage[..., None]).numpy(), (frame.radiance.variance * coverage**2).numpy()
+        yield frame.radiance.samples, mean, variance, seconds, cpu_seconds
+
+
+def mitsubas(scene: PosedScene, camera: Camera, bounces: int, seed: int, samples: list[int]) -> Iterator[tuple]:
+    """As `ours`; each picture is made from nothing, its own variance is not told."""
+    from benchmarks._mitsuba import MitsubaScene
+
+    renderer = MitsubaScene(scene.mesh, scene.environment.radiance.numpy(), camera, bounces)
+    renderer.render(4, seed + 1)  # compile
+    for spp in sorted(samples):
+        mean, seconds, cpu_seconds = renderer.render(spp, seed)
+        yield spp, mean, np.zeros(mean.shape[:2], np.float32), seconds, cpu_seconds
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks integrator", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -102,49 +144,55 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--pictures", type=Path, help="folder for linear images and differences (npy)")
     parser.add_argument("--no-skip", action="store_true", help="without the plan: fixed sample counts")
     parser.add_argument("--mitsuba-rows", action="store_true", help="look the environment up as Mitsuba does (mitsuba_rows)")
+    parser.add_argument("--mitsuba", action="store_true", help="also render with Mitsuba, in the same run")
+    parser.add_argument("--mitsuba-spp", type=int, nargs="+", default=[16, 64, 256], help="its samples a pixel")
     arguments = parser.parse_args(argv)
 
     folder: Path = arguments.reference
     mesh = read_mesh(folder / "mesh.ply")
     tracer = build_tracer(mesh)
-    rows = []
+    rows, times = [], []
     for env in arguments.env:
         table = read_exr(folder / f"env_{env}.exr")[..., :3]
         environment = Environment(torch.from_numpy(mitsuba_rows(table) if arguments.mitsuba_rows else table.copy()))
         scene = PosedScene(None, mesh, environment)
-        for light in arguments.light:
-            for number in arguments.cameras:
-                reference = read_exr(folder / f"{env}_{light}_{number}.exr")
-                standard_error = np.load(folder / f"{env}_{light}_{number}_se.npy")
-                camera = read_cameras(folder / "cameras.json", len(reference))[number]
-                counts = SampleCounts(*arguments.counts) if arguments.counts else None
-                settings = RenderSettings(
-                    bounces=int(light == "bounce1"), primary="mesh", seed=arguments.seed, counts=counts, skip=not arguments.no_skip
-                )
-                refine_frame(start_frame(scene, camera, settings, tracer))  # compile and warm up
-                started, cpu_started = time.perf_counter(), time.process_time()
-                state = start_frame(scene, camera, settings, tracer)
-                for spp in sorted(arguments.spp):
-                    state = refine_frame(state, max(0, -(-spp // samples_a_pass(settings, True).total) - state.passes))
-                    seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-                    frame = resolve_frame(state)
-                    coverage = frame.gbuffer.coverage
-                    mean = (frame.radiance_linear * coverage[..., None]).numpy()
-                    variance = (frame.radiance.variance * coverage**2).numpy()
-                    row = {"env": env, "light": light, "camera": number, "spp": frame.radiance.samples, "seconds": round(seconds, 4)}
-                    row["cpu_seconds"] = round(cpu_seconds, 4)
+        as_given = PosedScene(None, mesh, Environment(torch.from_numpy(table.copy())))
+        for light, number in product(arguments.light, arguments.cameras):
+            reference = read_exr(folder / f"{env}_{light}_{number}.exr")
+            standard_error = np.load(folder / f"{env}_{light}_{number}_se.npy")
+            camera = read_cameras(folder / "cameras.json", len(reference))[number]
+            counts = SampleCounts(*arguments.counts) if arguments.counts else None
+            bounces = int(light == "bounce1")
+            settings = RenderSettings(bounces=bounces, primary="mesh", seed=arguments.seed, counts=counts, skip=not arguments.no_skip)
+            runs = {"drgs": ours(scene, camera, settings, tracer, arguments.spp)}
+            if arguments.mitsuba:
+                runs["mitsuba"] = mitsubas(as_given, camera, bounces, arguments.seed, arguments.mitsuba_spp)
+            of_image: dict[str, list[dict]] = {}
+            for renderer, run in runs.items():
+                for spp, mean, variance, seconds, cpu_seconds in run:
+                    row = {"renderer": renderer, "env": env, "light": light, "camera": number, "spp": spp}
+                    row |= {"seconds": round(seconds, 4), "cpu_seconds": round(cpu_seconds, 4)}
                     row |= compare(mean, variance, reference, standard_error)
-                    rows.append(row)
-                    if not arguments.json:
-                        print("  ".join(f"{k} {v:.5g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
-                if arguments.pictures:
+                    of_image.setdefault(renderer, []).append(row)
+                    _print(row, arguments.json)
+                if renderer == "drgs" and arguments.pictures:
                     arguments.pictures.mkdir(parents=True, exist_ok=True)
-                    np.save(
-                        arguments.pictures / f"{env}_{light}_{number}.npy",
-                        np.stack([mean, reference[..., :3], np.repeat(variance[..., None], 3, -1)]),
-                    )
+                    maps = np.stack([mean, reference[..., :3], np.repeat(variance[..., None], 3, -1)])
+                    np.save(arguments.pictures / f"{env}_{light}_{number}.npy", maps)
+            rows += [row for of_renderer in of_image.values() for row in of_renderer]
+            for target in (0.01, 0.003) if arguments.mitsuba else ():
+                row = {"env": env, "light": light, "camera": number, "relmse": target}
+                for renderer, clock in product(of_image, ("seconds", "cpu_seconds")):
+                    row[f"{renderer}_{clock}"] = round(time_to_error(of_image[renderer], target, clock), 4)
+                times.append(row)
+                _print(row, arguments.json)
     if arguments.json:
-        print(json.dumps({"rows": rows}))
+        print(json.dumps({"rows": rows, "time_to_error": times}))
+
+
+def _print(row: dict, as_json: bool) -> None:
+    if not as_json:
+        print("  ".join(f"{k} {v:.5g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
 
 
 if __name__ == "__main__":
