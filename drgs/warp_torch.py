@@ -7,6 +7,7 @@ them to a thread pool. Kernels launched this way take `first: int` as their firs
 
 import os
 import tempfile
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
@@ -39,6 +40,16 @@ def _init_warp() -> None:
 _init_warp()
 
 _pool: ThreadPoolExecutor | None = None
+_here = threading.local()
+
+
+def in_thread_pool() -> bool:
+    """Whether the caller is one of the pool's threads: then its launches run where it is, since waiting for the pool could last for ever."""
+    return getattr(_here, "pooled", False)
+
+
+def _mark_thread() -> None:
+    _here.pooled = True
 
 
 def thread_count() -> int:
@@ -51,7 +62,7 @@ def thread_pool() -> ThreadPoolExecutor:
     """The pool shared by all CPU launches (and by other callers of code that releases the GIL)."""
     global _pool
     if _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="drgs")
+        _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="drgs", initializer=_mark_thread)
     return _pool
 
 
@@ -84,7 +95,7 @@ def launch(kernel: Any, count: int, inputs: list, outputs: list, device: Any, sl
         return
     load_kernel(kernel, device)
     threads = thread_count()
-    slices = min(count, threads * slices_per_thread) if threads > 1 else 1
+    slices = min(count, threads * slices_per_thread) if threads > 1 and not in_thread_pool() else 1
     if slices == 1:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=outputs, device=device)
         return

@@ -30,16 +30,20 @@ from drgs.render.resolve_frame import frame_errors, frame_gbuffer, frame_history
 from drgs.render.sample_rays import PointArrays, point_arrays, shading_points
 from drgs.render.shade import RayStarts, shade
 from drgs.render.trace_primary import PrimaryPoints, trace_primary_points
-from drgs.render.trace_rays import build_tracer
+from drgs.render.trace_rays import build_tracer, over_slices
 from drgs.render.tracer import AbstractTracer
 from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedScene
-from drgs.warp_torch import launch, warp_array, warp_device
+from drgs.warp_torch import launch, thread_count, warp_array, warp_device
 
 __all__ = ["FrameState", "RenderSettings", "passes_needed", "refine_frame", "resolve_frame", "samples_a_pass", "start_frame"]
 
 wp.set_module_options({"enable_backward": False})
 
+SLICES_A_THREAD = 2
+"""Slices of the image for each thread when passes run side by side: some hold more surface than others."""
+PIXELS_AT_ONCE = 32768
+"""Camera rays that a thread takes together, of as many passes as that makes: Python's share of the time falls with it."""
 SUMS = ("diffuse", "specular", "weight", "luminance", "luminance_squared", "scatter", "visibility")
 
 
@@ -51,7 +55,7 @@ def add_pass(
     pass_specular: wp.array[wp.vec3],
     pass_variance: wp.array[wp.vec3],
     pass_visibility: wp.array[float],
-    # outputs; each pixel occurs once a pass, so plain adds are exact and ordered
+    # outputs; each pixel occurs once a launch, or all launch indices run on one thread, so plain adds are exact and ordered
     diffuse: wp.array[wp.vec3],
     specular: wp.array[wp.vec3],
     weight: wp.array[float],
@@ -225,25 +229,71 @@ def refine_frame(state: FrameState, passes: int = 1) -> FrameState:
     sums = {name: getattr(state, name).clone() for name in SUMS}
     surface = state.surface if state.fixed is not None else state.surface.clone()
     state = replace(state, **sums, surface=surface, tile_passes=state.tile_passes.clone(), memory=RayMemory(state.memory.rays))
-    for _ in range(passes):
-        if not bool(state.active.any()):
-            break
-        state = _add_pass(state)
+    while passes > 0 and bool(state.active.any()):
+        # Tiles that rested while others went on catch up first, so that passes of one tile follow each other.
+        index = int(state.tile_passes[state.active].min())
+        chosen = state.active & (state.tile_passes == index)
+        count = _passes_at_once(state, chosen, index, passes)
+        state = _add_first_pass(state, chosen, index) if count == 1 else _add_passes(state, chosen, index, count)
+        state.tile_passes[chosen] += count
+        passes -= count
+        if state.history is not None:
+            state = replace(state, reprojected=reproject(state.history, frame_gbuffer(state), state.camera), history=None)
+        if state.settings.target_error is not None and index + count >= MIN_PASSES:
+            state = replace(state, active=_still_active(state, state.active))
     return state
 
 
-def _add_pass(state: FrameState) -> FrameState:
-    """One pass over the active tiles that have had fewest; adds to the given state's sums."""
+def _passes_at_once(state: FrameState, chosen: Tensor, index: int, passes: int) -> int:
+    """How many of the next `passes` need nobody to look between them."""
+    if state.fixed is not None or index == 0 or state.weight.is_cuda:
+        return 1
+    if state.settings.target_error is not None:
+        passes = min(passes, max(MIN_PASSES, 1 << index.bit_length()) - index)  # the next look
+    behind = state.tile_passes[state.active & ~chosen]
+    return min(passes, int(behind.min()) - index) if len(behind) else passes
+
+
+def _add_first_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
+    """One pass over chosen tiles; adds to the given state's sums."""
     clock = time.perf_counter()
-    plan, settings, device = state.plan, state.settings, warp_device(state.surface)
-    index = int(state.tile_passes[state.active].min())
-    chosen = state.active & (state.tile_passes == index)
     whole_first_pass = index == 0 and bool((chosen == state.seen).all())
     primary = _primary_points(state, chosen, index, whole_first_pass)
-    points = primary.points
     traced = time.perf_counter()
+    _shade_and_add(state, primary, index, state.memory if whole_first_pass else None)
+    if state.fixed is None and whole_first_pass:
+        state = replace(state, first=primary)
+    return _pay(state, len(primary.points.pixel), {"trace_primary": traced - clock, "shade": time.perf_counter() - traced})
+
+
+def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> FrameState:
+    """Several passes over chosen tiles of a mesh, each thread with pixels of its own: nobody waits for the others between passes."""
+    clock = time.perf_counter()
+    pixels = pixels_of_tiles(chosen, state.camera.width, state.camera.height)
+
+    def work(first: int, last: int) -> tuple[int, float]:
+        points, tracing, at_once = 0, 0.0, max(1, PIXELS_AT_ONCE // (last - first))
+        for round_ in range(index, index + count, at_once):
+            began = time.perf_counter()
+            together = min(at_once, index + count - round_)
+            primary = trace_primary_points(
+                state.tracer, state.camera, state.settings.seed, round_, pixels=pixels[first:last], passes=together
+            )  # fmt: skip
+            tracing += time.perf_counter() - began
+            _shade_and_add(state, primary, round_ if primary.round is None else primary.round, None)
+            points += len(primary.points.pixel)
+        return points, tracing
+
+    done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // (SLICES_A_THREAD * thread_count()))))
+    traced = sum(seconds for _, seconds in done) / max(1, min(thread_count(), len(done)))
+    seconds = {"trace_primary": traced, "shade": max(0.0, time.perf_counter() - clock - traced)}
+    return _pay(state, sum(points for points, _ in done), seconds)
+
+
+def _shade_and_add(state: FrameState, primary: PrimaryPoints, index: int | Tensor, memory: RayMemory | None) -> None:
+    """Light of the points of pass `index`, or of several passes, added to the sums of their pixels."""
+    plan, settings, points, device = state.plan, state.settings, primary.points, warp_device(state.surface)
     horizon = usable_horizons(state.tracer.horizons, settings.skip_error) if settings.skip else None
-    memory = state.memory if whole_first_pass else None
     light = shade(
         points,
         primary.starts,
@@ -257,25 +307,21 @@ def _add_pass(state: FrameState) -> FrameState:
         memory,
         horizon,
     )
-    if settings.skip and state.tracer.horizons is not None:
-        state.tracer.horizons.pay(len(points.pixel) * plan.counts.total)
-    shaded = time.perf_counter()
     vectors = [warp_array(light.diffuse, wp.vec3), warp_array(light.specular, wp.vec3)]
     numbers = [warp_array(light.variance, wp.vec3), warp_array(light.visibility)]
     arrays = [warp_array(sum_, wp.vec3 if sum_.dim() == 2 else None) for sum_ in (getattr(state, name) for name in SUMS)]
     launch(add_pass, len(points.pixel), [warp_array(points.pixel), *vectors, *numbers], arrays, device)
     if state.fixed is None:
         launch(add_surface, len(points.pixel), [point_arrays(points), warp_array(primary.depth)], [warp_array(state.surface)], device)
-    state.tile_passes[chosen] += 1
-    if state.fixed is None and whole_first_pass:
-        state = replace(state, first=primary)
-    if state.history is not None:
-        state = replace(state, reprojected=reproject(state.history, frame_gbuffer(state), state.camera), history=None)
-    if settings.target_error is not None and index + 1 >= MIN_PASSES:
-        state = replace(state, active=_still_active(state, state.active))
-    ended = time.perf_counter()
+
+
+def _pay(state: FrameState, points: int, durations: dict[str, float]) -> FrameState:
+    """Books a step's time, and the search for horizons on its rays."""
+    clock = time.perf_counter()
+    if state.settings.skip and state.tracer.horizons is not None:
+        state.tracer.horizons.pay(points * state.plan.counts.total)
     seconds = dict(state.seconds)
-    for step, duration in (("trace_primary", traced - clock), ("shade", shaded - traced), ("accumulate", ended - shaded)):
+    for step, duration in (*durations.items(), ("horizons", time.perf_counter() - clock)):
         seconds[step] = seconds.get(step, 0.0) + duration
     return replace(state, seconds=seconds)
 

@@ -76,6 +76,8 @@ class PointArrays:
     roughness: wp.array[float]
     metallic: wp.array[float]
     pixel: wp.array[int]
+    round: wp.array[int]
+    """Each point's own rounds, added to SampleSet.round; empty where all are the same."""
 
 
 @wp.struct
@@ -118,6 +120,13 @@ def split_at(samples: SampleSet, points: PointArrays, point: int) -> wp.vec3i:
 
 
 @wp.func
+def round_at(samples: SampleSet, points: PointArrays, point: int) -> int:
+    if points.round.shape[0] > 0:
+        return samples.round + points.round[point]
+    return samples.round
+
+
+@wp.func
 def strategy_of(split: wp.vec3i, samples_round: int, slot: int) -> wp.vec2i:
     """(strategy, index in its sequence) of a point's slot-th sample."""
     if slot < split[0]:
@@ -134,10 +143,18 @@ def strategy_seed(samples: SampleSet, pixel: int, strategy: int) -> wp.uint32:
 
 @wp.func
 def sampled_direction(
-    samples: SampleSet, split: wp.vec3i, light: EnvironmentLight, pixel: int, slot: int, wo: wp.vec3, n: wp.vec3, alpha: float
+    samples: SampleSet,
+    split: wp.vec3i,
+    light: EnvironmentLight,
+    pixel: int,
+    samples_round: int,
+    slot: int,
+    wo: wp.vec3,
+    n: wp.vec3,
+    alpha: float,
 ) -> wp.vec3:
     """World direction of a point's slot-th sample; possibly below the horizon."""
-    place = strategy_of(split, samples.round, slot)
+    place = strategy_of(split, samples_round, slot)
     u = sobol_2d(wp.uint32(place[1]), strategy_seed(samples, pixel, place[0]))
     if place[0] == 0:
         return cosine_direction(u, n)
@@ -181,15 +198,19 @@ def sample_directions(
     w = wp.float32(0.0)
     if wp.dot(n, wo) > 0.0:
         split = split_at(samples, points, point)
-        wi = sampled_direction(samples, split, light, points.pixel[point], i % count, wo, n, alpha)
+        wi = sampled_direction(samples, split, light, points.pixel[point], round_at(samples, points, point), i % count, wo, n, alpha)
         if wp.dot(n, wi) > 0.0:
             w = balance_weight(split, light, wi, wo, n, alpha, table_place(light, wi))
     direction[i] = wi
     weight[i] = w
 
 
-def point_arrays(points: ShadingPoints) -> Any:
-    """The struct that kernels read; shares memory with the tensors."""
+def point_arrays(points: ShadingPoints, rounds: torch.Tensor | None = None) -> Any:
+    """The struct that kernels read; shares memory with the tensors.
+
+    Args:
+        rounds: (point,) int32, where points of several passes come together.
+    """
     arrays = PointArrays()
     arrays.position = warp_array(points.position_world.float(), wp.vec3)
     arrays.normal = warp_array(points.normal_world.float(), wp.vec3)
@@ -198,6 +219,7 @@ def point_arrays(points: ShadingPoints) -> Any:
     arrays.roughness = warp_array(points.roughness.float())
     arrays.metallic = warp_array(points.metallic.float())
     arrays.pixel = warp_array(points.pixel.int())
+    arrays.round = warp_array(points.pixel[:0].int() if rounds is None else rounds)
     return arrays
 
 

@@ -29,6 +29,7 @@ from drgs.render.sample_rays import (
     SampleSet,
     balance_weight,
     point_arrays,
+    round_at,
     sample_set,
     sampled_direction,
     split_at,
@@ -37,12 +38,14 @@ from drgs.render.trace_indirect import far_along, mesh_arrays, scatter_hits, tra
 from drgs.render.trace_rays import over_slices
 from drgs.render.tracer import AbstractTracer
 from drgs.render.tracer_warp import query_any
-from drgs.warp_torch import load_kernel, thread_count, warp_array, warp_device
+from drgs.warp_torch import in_thread_pool, load_kernel, thread_count, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
 
 RAYS_A_BATCH = 65536
 """Rays of one CPU batch: its 4 MB of ray data stay in the cache between sampling, tracing and shading."""
+MIN_RAYS_A_BATCH = 16384
+"""Fewer are not cut up further to balance threads: launches cost about a millisecond a batch."""
 RAYS_A_BATCH_GPU = 1 << 23
 
 
@@ -107,7 +110,9 @@ def start_rays(
     seen = wp.vec3(0.0, 0.0, 0.0)
     if wp.dot(n, wo) > 0.0:
         split = split_at(samples, points, point)
-        candidate = sampled_direction(samples, split, light, points.pixel[point], (first + i) % count, wo, n, alpha)
+        candidate = sampled_direction(
+            samples, split, light, points.pixel[point], round_at(samples, points, point), (first + i) % count, wo, n, alpha
+        )
         if wp.dot(n, candidate) > 0.0 and wp.dot(surface_normals[point], candidate) > 0.0:
             place = table_place(light, candidate)
             seen = lookup_radiance(light, place)
@@ -236,7 +241,7 @@ def shade(
     counts: SampleCounts,
     bounces: int,
     seed: int,
-    samples_round: int = 0,
+    samples_round: int | Tensor = 0,
     by_material: bool = False,
     memory: RayMemory | None = None,
     horizon: Tensor | None = None,
@@ -247,7 +252,7 @@ def shade(
         light: EnvironmentLight struct (environment_table.environment_light).
         bounces: surfaces that light may meet between the environment and the points.
         by_material: each point shares its samples out by its material (sample_rays.split_at).
-        samples_round: how many estimates of the same counts and seed came before; continues their sequences.
+        samples_round: how many estimates of the same counts and seed came before; continues their sequences. (point,) int32 where it differs.
         memory: of an estimate of the same counts from the same starts: rays that are known are not traced, and it then knows these.
         horizon: (face,) sines (horizon.Horizons); rays above them are not traced.
     """
@@ -265,7 +270,8 @@ def shade(
     known = usable_rays(memory, ray_count, bounces > 0)
     kept = None if memory is None else room_for_rays(ray_count, bounces > 0, device)
     warp_dev = warp_device(result.diffuse)
-    arrays, samples = point_arrays(points), sample_set(counts, seed, samples_round, by_material)
+    rounds, samples_round = (samples_round, 0) if isinstance(samples_round, Tensor) else (None, samples_round)
+    arrays, samples = point_arrays(points, rounds), sample_set(counts, seed, samples_round, by_material)
     start_arrays = [
         warp_array(starts.origin_world, wp.vec3),
         warp_array(starts.surface_normal_world, wp.vec3),
@@ -314,7 +320,10 @@ def shade(
         )
 
     if device.type == "cpu":
-        batch_points = max(1, min(RAYS_A_BATCH // counts.total, -(-point_count // (4 * thread_count()))))
+        threads = 1 if in_thread_pool() else thread_count()
+        even = -(-point_count // (4 * threads)) if threads > 1 else point_count
+        even = max(even, MIN_RAYS_A_BATCH // counts.total)
+        batch_points = max(1, min(RAYS_A_BATCH // counts.total, even))
     else:
         batch_points = max(1, RAYS_A_BATCH_GPU // counts.total)
     over_slices(point_count, device, batch, batch_points)

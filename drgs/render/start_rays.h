@@ -95,7 +95,7 @@ for (int lane = 0; lane < 16; ++lane) {
     const int before = strategy == 0 ? 0 : (strategy == 1 ? n_cosine : n_cosine + n_ggx);
     point_lane[lane] = point;
     strategy_lane[lane] = (unsigned)strategy;
-    index_lane[lane] = (unsigned)(samples.round * own + slot - before);
+    index_lane[lane] = (unsigned)((samples.round + (points.round.shape[0] > 0 ? points.round.data[point] : 0)) * own + slot - before);
     pixel_lane[lane] = (unsigned)points.pixel.data[point];
     for (int k = 0; k < 3; ++k) {
         gathered[k][lane] = normals[3 * point + k];

@@ -17,7 +17,7 @@ from drgs.render.brdf_warp import PI, alpha_of, cosine_direction, ggx_direction,
 from drgs.render.environment_table import EnvironmentLight, environment_direction, lookup_pdf, lookup_radiance, table_place
 from drgs.render.random_warp import hash_combine, shuffle_index, sobol_2d
 from drgs.render.records import Hits
-from drgs.render.sample_rays import PointArrays, SampleSet, split_at, strategy_of, strategy_seed
+from drgs.render.sample_rays import PointArrays, SampleSet, round_at, split_at, strategy_of, strategy_seed
 from drgs.render.tracer import AbstractTracer
 from drgs.scene.mesh import TriangleMesh
 from drgs.warp_torch import warp_array, warp_device
@@ -152,7 +152,7 @@ def scatter_hits(
     ray = int(path_ray[i])
     point = first_point + ray // count
     pixel = points.pixel[point]
-    place = strategy_of(split_at(samples, points, point), samples.round, ray % count)
+    place = strategy_of(split_at(samples, points, point), round_at(samples, points, point), ray % count)
     base = strategy_seed(samples, pixel, place[0])
     index = wp.uint32(place[1])
     seed_light = hash_combine(base, wp.uint32(16 + 4 * depth))

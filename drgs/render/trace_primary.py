@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.render.image_tiles import pixels_of_tiles, tiles_of_mesh
@@ -41,6 +41,8 @@ class PrimaryPoints:
     """Along the viewing axis [world units]."""
     barycentric: Float[Tensor, "point 2"] | None = None
     """In the starts' triangles, where the camera sees the mesh."""
+    round: Int[Tensor, "point"] | None = None
+    """int32; the pass of each point, where there are several."""
 
 
 @wp.kernel
@@ -50,6 +52,7 @@ def primary_rays(
     world_from_camera: wp.mat33,
     center: wp.vec3,
     pixels: wp.array[int],
+    pixel_count: int,
     image_width: int,
     seed: wp.uint32,
     index: wp.uint32,
@@ -59,9 +62,10 @@ def primary_rays(
     direction: wp.array[wp.vec3],
 ):
     i = first + wp.tid()
-    x = pixels[i] % image_width
-    y = pixels[i] // image_width
-    u = sobol_2d(index, hash_combine(hash_combine(seed, wp.uint32(pixels[i])), wp.uint32(PRIMARY_STREAM)))
+    pixel = pixels[i % pixel_count]
+    x = pixel % image_width
+    y = pixel // image_width
+    u = sobol_2d(index + wp.uint32(i / pixel_count), hash_combine(hash_combine(seed, wp.uint32(pixel)), wp.uint32(PRIMARY_STREAM)))
     place = wp.vec3(float(x) + 0.5 + jitter * (u[0] - 0.5), float(y) + 0.5 + jitter * (u[1] - 0.5), 1.0)
     origin[i] = center
     direction[i] = wp.normalize(world_from_camera * (camera_from_pixel * place))
@@ -78,6 +82,7 @@ def surface_points(
     center: wp.vec3,
     view_axis: wp.vec3,
     pixels: wp.array[int],
+    pixel_count: int,
     # outputs
     points: PointArrays,
     face_normal: wp.array[wp.vec3],
@@ -98,7 +103,7 @@ def surface_points(
     points.albedo[i] = surface.albedo
     points.roughness[i] = surface.roughness
     points.metallic[i] = surface.metallic
-    points.pixel[i] = pixels[r]
+    points.pixel[i] = pixels[r % pixel_count]
     face_normal[i] = surface.face_normal
     start[i] = surface.position + mesh.lift * surface.face_normal
     depth[i] = wp.dot(surface.position - center, view_axis)
@@ -109,18 +114,19 @@ def _mat33(matrix: Tensor) -> wp.mat33:
 
 
 def trace_primary_points(
-    tracer: AbstractTracer, camera: Camera, seed: int, pass_index: int, jitter: bool = True, pixels: Tensor | None = None
+    tracer: AbstractTracer, camera: Camera, seed: int, pass_index: int, jitter: bool = True, pixels: Tensor | None = None, passes: int = 1
 ) -> PrimaryPoints:
-    """One ray through each pixel that may see the mesh.
+    """One ray a pass through each pixel that may see the mesh.
 
     Args:
         jitter: False sends it through the pixel's centre.
         pixels: (pixel,) int32, ascending; None: of all tiles that the mesh may be seen in.
+        passes: from `pass_index` on; points come pass after pass, `round` tells which.
     """
     mesh, device = tracer.mesh, tracer.mesh.vertices.device
     if pixels is None:
         pixels = pixels_of_tiles(tiles_of_mesh(mesh, camera), camera.width, camera.height)
-    ray_count = len(pixels)
+    ray_count = passes * len(pixels)
     origin, direction = torch.empty(ray_count, 3, device=device), torch.empty(ray_count, 3, device=device)
     world_from_camera = camera.camera_from_world[:3, :3].T
     center, view_axis = wp.vec3(*camera.center_world.tolist()), wp.vec3(*camera.camera_from_world[2, :3].tolist())
@@ -129,7 +135,7 @@ def trace_primary_points(
         primary_rays,
         ray_count,
         [_mat33(torch.linalg.inv(camera.intrinsics.double())), _mat33(world_from_camera), center,
-         pixel_array, camera.width, wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
+         pixel_array, len(pixels), camera.width, wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
         [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3)],
         warp_device(origin),
     )  # fmt: skip
@@ -143,11 +149,12 @@ def trace_primary_points(
         surface_points,
         count,
         [warp_array(ray), warp_array(hits.face), warp_array(hits.barycentric, wp.vec2), warp_array(direction, wp.vec3),
-         mesh_arrays(mesh, tracer.lift), center, view_axis, pixel_array],
+         mesh_arrays(mesh, tracer.lift), center, view_axis, pixel_array, len(pixels)],
         [point_arrays(points), warp_array(face_normal, wp.vec3), warp_array(start, wp.vec3), warp_array(depth)],
         warp_device(origin),
     )  # fmt: skip
-    return PrimaryPoints(points, RayStarts(start, face_normal, hits.face[ray]), depth, hits.barycentric[ray])
+    rounds = None if passes == 1 else (pass_index + ray // max(1, len(pixels))).int()
+    return PrimaryPoints(points, RayStarts(start, face_normal, hits.face[ray]), depth, hits.barycentric[ray], rounds)
 
 
 def trace_primary(

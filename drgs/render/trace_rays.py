@@ -15,7 +15,7 @@ from drgs.render.tracer import AbstractTracer
 from drgs.render.tracer_embree import EmbreeTracer
 from drgs.render.tracer_warp import WarpTracer, query_any
 from drgs.scene.mesh import TriangleMesh
-from drgs.warp_torch import load_kernel, thread_count, thread_pool
+from drgs.warp_torch import in_thread_pool, load_kernel, thread_count, thread_pool
 
 SLICE_RAYS = 65536
 """Rays of a CPU slice: long enough to hide Python, short enough to balance threads."""
@@ -28,15 +28,12 @@ def build_tracer(mesh: TriangleMesh) -> AbstractTracer:
 
 
 def over_slices(count: int, device: torch.device, work: Callable[[int, int], object], slice_length: int | None = None) -> list:
-    """work(first, last) for slices of range(count): over the thread pool on the CPU, one after the other elsewhere.
-
-    `work` may call kernels by wp.launch and tracers, but nothing that waits for the pool itself.
-    """
+    """work(first, last) for slices of range(count): over the thread pool on the CPU; one after the other elsewhere, and in the pool."""
     if count == 0:
         return []
     slices = -(-count // (slice_length or (SLICE_RAYS if device.type == "cpu" else SLICE_RAYS_GPU)))
     edges = [count * k // slices for k in range(slices + 1)]
-    if device.type != "cpu" or thread_count() == 1 or slices == 1:
+    if device.type != "cpu" or thread_count() == 1 or slices == 1 or in_thread_pool():
         return [work(a, b) for a, b in pairwise(edges)]
     return [done.result() for done in [thread_pool().submit(work, a, b) for a, b in pairwise(edges)]]
 

@@ -54,6 +54,19 @@ def test_refining_twice_is_refining_by_two_passes() -> None:
     assert start.passes == 0 and float(start.weight.max()) == 0  # the given state is left alone
 
 
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_passes_side_by_side_are_those_one_after_another(bounces: int) -> None:
+    """Five passes at once, threads with pixels of their own and several passes in a batch, against five single ones."""
+    scene = PosedScene(None, two_spheres(metallic=0.3), sunny_sky(sun=20.0))
+    apart = at_once = refine_frame(start_frame(scene, front_camera(37, distance=8), RenderSettings(seed=3, bounces=bounces)))
+    for _ in range(5):
+        apart = refine_frame(apart)
+    at_once = refine_frame(at_once, 5)
+    assert at_once.passes == 6
+    for name in ("diffuse", "specular", "weight", "luminance_squared", "scatter", "visibility", "surface"):
+        assert torch.equal(getattr(apart, name), getattr(at_once, name))
+
+
 def test_same_seed_same_bits_on_the_cpu() -> None:
     scene = PosedScene(None, two_spheres(), sunny_sky())
     a, b, other = (render_frame(scene, front_camera(distance=8), RenderSettings(samples_per_pixel=16, seed=s)) for s in (1, 1, 2))
