@@ -6,7 +6,7 @@ Checkpoints live in OUT.build/ beside the asset; a build that was stopped or kil
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -186,6 +186,22 @@ def build_asset(
         ValueError: the capture, a setting or a checkpoint is wrong, in one sentence.
         BuildStopped: as asked.
     """
+    *_, (_, asset) = build_stages(dataset, out, settings, progress, should_stop)
+    assert asset is not None
+    return asset
+
+
+def build_stages(
+    dataset: Path,
+    out: Path,
+    settings: BuildSettings,
+    progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Iterator[tuple[str, Asset | None]]:
+    """build_asset in stages: gives the name of each as it is finished, its result on disk, and with the last one the asset.
+
+    Who stops between two stages and calls again with `resume` repeats none but the reading of the capture.
+    """
     if settings.preset not in PRESETS:
         raise ValueError(f"preset {settings.preset!r} is unknown; expected one of {', '.join(PRESETS)}")
     if settings.binding != "particles":
@@ -208,20 +224,26 @@ def build_asset(
     points = initial_points(views, preset.points, settings.seed)
     timed("read", started)
     identity = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
+    yield "read", None
     if not settings.resume:
-        for stale in ("stage1.safetensors", "stage2.safetensors"):  # else a later --resume would take them for this build's
+        for stale in (
+            "stage1.safetensors",
+            "mesh.safetensors",
+            "stage2.safetensors",
+        ):  # else a later --resume would take them for this build's
             (work / stale).unlink(missing_ok=True)
 
     started = time.monotonic()
     fit_settings = replace(preset.fit, seed=settings.seed)
     fit = _stage_one(views, points, fit_settings, device, work, identity, settings.resume, reporter, stop_now)
     timed("fit", started)
+    yield "fit", None
 
     started = time.monotonic()
     reporter.report("mesh", 0.0, "extracting the mesh")
-    gaussians = drop_unseen(gaussians_from_state(fit), views.cameras, points.bounds_radius)
-    mesh = mesh_from_gaussians(gaussians, views.cameras, points, preset.mesh)
+    gaussians, mesh = _mesh_stage(views, points, fit, preset.mesh, work, identity, settings.resume)
     timed("mesh", started)
+    yield "mesh", None
     if stop_now():
         raise BuildStopped
 
@@ -231,6 +253,7 @@ def build_asset(
         views, gaussians, fit, mesh, points.bounds_radius, material_settings, work, identity, settings.resume, reporter, stop_now
     )
     timed("materials", started)
+    yield "materials", None
 
     started = time.monotonic()
     reporter.report("pack", 0.0, "baking materials and writing the asset")
@@ -257,7 +280,7 @@ def build_asset(
     timed("pack", started)
     save_asset(asset, out, _thumbnail(materials, views.cameras))
     reporter.report("pack", 1.0, "done")
-    return asset
+    yield "pack", asset
 
 
 def capture_digest(views: Views) -> str:
@@ -300,6 +323,24 @@ def _stage_one(views, points, fit_settings, device, work, identity, resume, repo
     if state.iteration < fit_settings.iterations:
         raise BuildStopped
     return state
+
+
+def _mesh_stage(views, points, fit, mesh_settings, work, identity, resume) -> tuple[Gaussians, TriangleMesh]:
+    """The surfels that cameras see and the mesh around them, kept in `work`."""
+    path = work / "mesh.safetensors"
+    device = fit.parameters["centers"].device
+    if resume and path.exists():
+        tensors, facts = read_tensors(path, device)
+        _same_build(facts, identity, path)
+        records = [
+            record(*(tensors[f"{record.__name__}.{name}"] for name in record.__dataclass_fields__)) for record in (Gaussians, TriangleMesh)
+        ]
+        return records[0], records[1]
+    gaussians = drop_unseen(gaussians_from_state(fit), views.cameras, points.bounds_radius)
+    mesh = mesh_from_gaussians(gaussians, views.cameras, points, mesh_settings)
+    tensors = {f"{type(record).__name__}.{name}": value for record in (gaussians, mesh) for name, value in vars(record).items()}
+    write_tensors(path, tensors, identity)
+    return gaussians, mesh
 
 
 def _stage_two(views, gaussians, fit, mesh, radius, material_settings, work, identity, resume, reporter, stop_now) -> MaterialState:
