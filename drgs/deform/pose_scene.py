@@ -5,7 +5,6 @@ edits, in their order, and remembered for the asset. A scene posed again with on
 same tensors for the rest, and a renderer sees by identity what it must rebuild.
 """
 
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -23,7 +22,7 @@ from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.maps import check_map, evaluate_map
 from drgs.deform.simulate import Simulation
 from drgs.deform.simulation_scene import parse_simulation_scene
-from drgs.exchange.npz import read_npz_array
+from drgs.deform.vertex_sequence import vertices_at
 from drgs.scene.asset import Asset
 from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, SimulateEdit
 from drgs.scene.environment import Environment
@@ -110,12 +109,12 @@ class _Files:
     base_directory: Path | None
     confine: bool
 
-    def path(self, name: str) -> Path:
+    def path(self, name: str, or_folder: bool = False) -> Path:
         base = Path.cwd() if self.base_directory is None else Path(self.base_directory)
         path = (base / name).resolve()
         if self.confine and not path.is_relative_to(base.resolve()):
             raise ValueError(f"the file {name!r} lies outside the folder that edits may read")
-        if not path.is_file():
+        if not path.is_file() and not (or_folder and path.is_dir()):
             raise ValueError(f"{path}: does not exist")
         return path
 
@@ -123,8 +122,9 @@ class _Files:
         """Changes when the file does."""
         if name is None:
             return None
-        state = os.stat(self.path(name))
-        return str(self.path(name)), state.st_mtime_ns, state.st_size
+        path = self.path(name, or_folder=True)
+        states = [(file.name, file.stat()) for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+        return str(path), tuple((file, state.st_mtime_ns, state.st_size) for file, state in states)
 
 
 def _rest(asset: Asset) -> _Rest:
@@ -183,8 +183,7 @@ def _apply_deformations(asset: Asset, edits: list[ShapeEdit], files: _Files) -> 
                 tangents = carry_tangents(tangents, gradient)
         elif edit.vertices is not None:
             # The file says where the vertices are, whatever came before: everything is carried from rest.
-            array = read_npz_array(files.path(edit.vertices), "vertices", tuple(mesh.vertices.shape))
-            vertices = torch.from_numpy(array).to(mesh.vertices)
+            vertices = vertices_at(files.path(edit.vertices, or_folder=True), edit.time, edit.frames_per_second, mesh)
             gradient = vertex_gradients(mesh.vertices, vertices, mesh.faces)
             normals = carry_normals(mesh.normals, gradient)
             if gaussians is not None:

@@ -120,7 +120,10 @@ class DeformEdit(_Plain):
     op: Literal["deform"]
     map: AnalyticMap | None = None
     vertices: str | None = None
-    """NPZ with `vertices` (vertex, 3): the mesh's new vertex positions."""
+    """The mesh's new vertex positions: NPZ with `vertices` (vertex, 3) or (frame, vertex, 3), an OBJ or PLY, or a folder of those."""
+    time: Annotated[float, Field(ge=0)] = 0.0
+    """Seconds into a sequence of `vertices`; frames are blended linearly, the last one holds."""
+    frames_per_second: Annotated[float, Field(gt=0)] = 24.0
 
     @model_validator(mode="after")
     def _exactly_one(self) -> "DeformEdit":

@@ -127,6 +127,8 @@ export interface DeformEdit {
   op: "deform";
   map?: TwistMap | BendMap | StretchMap | LatticeMap | null;
   vertices?: string | null;
+  time?: number;
+  frames_per_second?: number;
 }
 
 /** The session's edits. The same document answers REST calls. */
