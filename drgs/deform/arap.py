@@ -1,10 +1,12 @@
 """Handles: some vertices are dragged, the rest of the object follows as rigidly as it can.
 
 In: a mesh, the vertices held, and any points to carry along (its own vertices, surfel centres). Each drag gives the points' positions and
-deformation gradients. The energy is minimised on a coarser control mesh by libigl; moving least squares carry it to the points. Source:
-docs/sources.md (sorkine2007).
+deformation gradients, and depends on its targets alone: it starts at the rest pose, placed as the targets lie, goes to them in a few
+steps on a coarse mesh, then to rest on a finer one. Both are prepared once; libigl minimises the energy, moving least squares carry the
+pose from mesh to mesh and to the points. Source: docs/sources.md (sorkine2007).
 """
 
+import threading
 from dataclasses import dataclass
 
 import fast_simplification
@@ -17,24 +19,34 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.deform.drive_mesh import vertex_gradients
-from drgs.deform.gmls import GmlsSettings, build_weights, interpolate, polar_rotation
+from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate, polar_rotation
 
 SLIVER = 1e-9
 """Faces with less area than this part of the mean are left out: their cotangents mean nothing."""
+WORTH_TWO_MESHES = 1.5
+"""A mesh with fewer faces than this many coarse ones is solved by itself."""
+FARTHEST = 1e3
+"""Sizes of the object that a handle may go."""
 
 
 @dataclass(frozen=True)
 class ArapSettings:
     control_faces: int = 20_000
     """Of the control mesh; a mesh with fewer faces is its own."""
-    iterations: int = 4
-    """Of each drag, which starts from the one before."""
+    coarse_faces: int = 1_500
+    """Of the mesh on which drags are found."""
+    steps: int = 4
+    """From rest to the targets, on the coarse mesh."""
+    coarse_iterations: int = 12
+    """Of each step; the last takes twice as many."""
+    iterations: int = 2
+    """On the control mesh, from where the coarse one leads."""
     neighbours: int = 12
-    """Control vertices that carry a point."""
+    """Vertices that carry a point."""
 
 
 class ArapHandles:
-    """A mesh held by some of its vertices. Final; remembers its last pose, so that small drags take few iterations."""
+    """A mesh held by some of its vertices. Final; drags leave no trace in it."""
 
     def __init__(self, vertices: Tensor, faces: Tensor, handles: Tensor, points: Tensor, settings: ArapSettings | None = None) -> None:
         """Prepare the mesh (vertex, 3), (face, 3) for drags of the vertices that `handles` (handle,) names, and points (point, 3) to carry.
@@ -47,40 +59,83 @@ class ArapHandles:
         settings = settings or ArapSettings()
         if not len(handles) or int(handles.min()) < 0 or int(handles.max()) >= len(vertices):
             raise ValueError(f"handles name vertices 0 to {len(vertices) - 1}, at least one; found {handles.tolist()[:8]}")
-        where, corners = _control_mesh(vertices.detach().cpu().numpy(), faces.cpu().numpy(), settings.control_faces)
-        _, nearest = cKDTree(where).query(vertices[handles.long()].detach().cpu().double().numpy())
-        self._held, first = np.unique(nearest, return_index=True)
-        self._first = torch.from_numpy(first)
-        # Where a handle lies beside the control vertex that stands for it, the difference goes along, turned as that vertex last was.
-        beside = where[self._held] - vertices[handles.long()].detach().cpu().double().numpy()[first]
-        self._beside = torch.from_numpy(beside)[..., None]
-        self._turn = torch.eye(3, dtype=torch.float64).expand(len(beside), 3, 3)
-        loose = _without_handle(len(where), corners, self._held)
-        self._pinned = where[loose]
-        self._data = igl.ARAPData()
-        self._data.max_iter = settings.iterations
-        self._rest, self._pose, self._corners = where, where.copy(), torch.from_numpy(corners.astype(np.int32))
-        igl.arap_precomputation(where, corners.astype(np.int64), 3, np.concatenate([self._held, loose]).astype(np.int32), self._data)
-        control = torch.from_numpy(where).float()
+        self._settings = settings
+        mesh, triangles = vertices.detach().cpu().numpy(), faces.cpu().numpy()
+        self._handles = vertices[handles.long()].detach().cpu().double()
+        self._control = _Level(mesh, triangles, settings.control_faces, self._handles)
+        self._coarse, self._refine = self._control, None
+        gmls = GmlsSettings(neighbours=settings.neighbours)
+        if len(self._control.corners) > WORTH_TWO_MESHES * settings.coarse_faces:
+            self._coarse = _Level(mesh, triangles, settings.coarse_faces, self._handles)
+            self._refine: Weights | None = build_weights(self._coarse.rest.float(), self._control.rest.float(), gmls)
         self._device = points.device
-        self._weights = build_weights(control, points.detach().cpu(), GmlsSettings(neighbours=settings.neighbours))
+        self._weights = build_weights(self._control.rest.float(), points.detach().cpu(), gmls)
 
     def drag(self, targets: Tensor) -> tuple[Tensor, Tensor]:
         """Positions (point, 3) and gradients (point, 3, 3) of the points when the handles are at targets (handle, 3).
 
         Raises:
-            ValueError: targets are not finite.
+            ValueError: targets are not finite, or far beyond the object's size.
         """
-        if not bool(torch.isfinite(targets).all()):
-            raise ValueError("the targets of handles must be finite")
-        goal = (targets.detach().cpu().double()[self._first] + (self._turn @ self._beside)[..., 0]).numpy()
-        bounds = np.concatenate([goal, self._pinned])
-        self._pose = np.ascontiguousarray(igl.arap_solve(bounds, self._data, self._pose))
-        rest, moved = torch.from_numpy(self._rest), torch.from_numpy(self._pose)
-        gradients = vertex_gradients(rest, moved, self._corners)
-        self._turn = polar_rotation(gradients[torch.from_numpy(self._held)])
-        position, gradient = interpolate(self._weights, moved.float(), gradients.float())
+        far = FARTHEST * float((self._control.rest.amax(0) - self._control.rest.amin(0)).norm())
+        if not bool(((targets.detach().cpu() - self._handles).abs() <= far).all()):
+            raise ValueError(f"the targets of handles must be finite, and not too far away: within {far:.3g} of where the handles are")
+        settings, coarse, control = self._settings, self._coarse, self._control
+        goal = targets.detach().cpu().double()
+        turn, shift = _rigid_fit(self._handles, goal)
+        begin = self._handles @ turn.T + shift
+        pose, turns = coarse.rest @ turn.T + shift, turn.expand(len(coarse.held), 3, 3)
+        for step in range(1, settings.steps + 1):
+            iterations = settings.coarse_iterations * (2 if step == settings.steps else 1)
+            pose, turns = coarse.solve(begin + (goal - begin) * (step / settings.steps), turns, pose, iterations)
+        if self._refine is not None:
+            pose, gradients = interpolate(self._refine, pose.float(), vertex_gradients(coarse.rest, pose, coarse.corners).float())
+            pose, turns = control.solve(goal, polar_rotation(gradients[control.held].double()), pose.double(), settings.iterations)
+        gradients = vertex_gradients(control.rest, pose, control.corners)
+        position, gradient = interpolate(self._weights, pose.float(), gradients.float())
         return position.to(self._device), gradient.to(self._device)
+
+
+class _Level:
+    """A control mesh, held where the handles are, and factorised. Final; nothing in it changes."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, most_faces: int, handles: Tensor) -> None:
+        where, corners = _control_mesh(vertices, faces, most_faces)
+        _, nearest = cKDTree(where).query(handles.numpy())
+        held, group = np.unique(nearest, return_inverse=True)
+        self.rest, self.corners = torch.from_numpy(where), torch.from_numpy(corners.astype(np.int32))
+        self.held, self._group = torch.from_numpy(held).long(), torch.from_numpy(group.reshape(-1)).long()
+        # Several handles may share a vertex, which then goes with their mean; what it lies beside that goes along, turned as it was.
+        self._beside = self.rest[self.held] - self._mean(handles)
+        loose = _without_handle(len(where), corners, held)
+        self._pinned = where[loose]
+        self._data, self._lock = igl.ARAPData(), threading.Lock()
+        igl.arap_precomputation(where, corners.astype(np.int64), 3, np.concatenate([held, loose]).astype(np.int32), self._data)
+
+    def solve(self, targets: Tensor, turns: Tensor, start: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+        """Pose (vertex, 3) and rotations (held, 3, 3) of the held vertices, from a pose nearby, with handles at targets (handle, 3)."""
+        goal = self._mean(targets) + (turns @ self._beside[..., None])[..., 0]
+        with self._lock:
+            self._data.max_iter = iterations
+            pose = igl.arap_solve(np.concatenate([goal.numpy(), self._pinned]), self._data, np.ascontiguousarray(start.numpy()))
+        moved = torch.from_numpy(np.ascontiguousarray(pose))
+        if not bool(torch.isfinite(moved).all()):
+            raise ValueError("these handles cannot be solved for: the mesh is degenerate")
+        return moved, polar_rotation(vertex_gradients(self.rest, moved, self.corners)[self.held])
+
+    def _mean(self, values: Tensor) -> Tensor:
+        """(held, 3) means of (handle, 3)."""
+        count = torch.bincount(self._group, minlength=len(self.held)).double()
+        return torch.zeros(len(self.held), 3, dtype=torch.float64).index_add_(0, self._group, values) / count[:, None]
+
+
+def _rigid_fit(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation (3, 3) and shift (3,) that take points (n, 3) nearest to targets; no turn beyond what they tell."""
+    middle, goal = points.mean(0), targets.mean(0)
+    spread = (targets - goal).T @ (points - middle)
+    # What a point or a line leaves open stays as it is: the identity, by a little.
+    turn = polar_rotation((spread + 1e-6 * (spread.norm() + 1e-30) * torch.eye(3, dtype=spread.dtype))[None])[0]
+    return turn, goal - turn @ middle
 
 
 def _control_mesh(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:

@@ -19,6 +19,7 @@ from torch import Tensor
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
 from drgs.deform.clip import ClipFrame, frame_at, open_clip
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
+from drgs.deform.hold_handles import HeldObject
 from drgs.deform.maps import check_map, evaluate_map
 from drgs.deform.simulate import Simulation
 from drgs.deform.simulation_scene import parse_simulation_scene
@@ -65,7 +66,7 @@ def pose_scene(
     deform = [edit for edit in edits if isinstance(edit, ShapeEdit)]
 
     vertex_materials, surfel_materials = _remembered(asset, ("material", *map(_text, material)), lambda: _apply_materials(asset, material))
-    shape_key = ("shape", *((_text(edit), files.stamp(_file(edit))) for edit in deform))
+    shape_key = ("shape", *_shape_texts(deform, files))
     shape = _remembered(asset, shape_key, lambda: _apply_deformations(asset, deform, files))
 
     mesh, surfels = asset.mesh, None
@@ -169,7 +170,7 @@ def _apply_deformations(asset: Asset, edits: list[ShapeEdit], files: _Files) -> 
     mesh, gaussians = asset.mesh, asset.gaussians
     vertices, normals = mesh.vertices, mesh.normals
     centers, tangents = (None, None) if gaussians is None else (gaussians.centers, _rest(asset).tangents)
-    for edit in edits:
+    for index, edit in enumerate(edits):
         if isinstance(edit, PoseEdit | SimulateEdit):
             # Like a file of vertices, it says where everything is, whatever came before.
             frame = _moment(asset, edit, files)
@@ -193,6 +194,16 @@ def _apply_deformations(asset: Asset, edits: list[ShapeEdit], files: _Files) -> 
                 centers, tangents = drive_surfels(
                     mesh.vertices, vertices, mesh.faces, gradient, asset.binding, gaussians.centers, rest_tangents
                 )
+        elif edit.handles is not None:
+            handles, points = edit.handles, vertices if centers is None else torch.cat([vertices, centers])
+            # What is held is prepared once for all targets that a drag passes through.
+            grips = ("handles", *_shape_texts(edits[:index], files), _text_of_grips(edit))
+            held = _remembered(asset, grips, lambda h=handles, v=vertices, p=points: HeldObject(mesh.vertices, v, mesh.faces, h, p))
+            positions, gradient = held.pull(handles)
+            count = len(vertices)
+            vertices, normals = positions[:count].contiguous(), carry_normals(normals, gradient[:count])
+            if centers is not None and tangents is not None:
+                centers, tangents = positions[count:].contiguous(), carry_tangents(tangents, gradient[count:])
         if not all(torch.isfinite(values).all() for values in (vertices, normals, centers, tangents) if values is not None):
             raise ValueError(f"the {edit.op} edit {_text(edit)[:120]} moves parts of this object to infinity")
     return _Shape(vertices, normals, centers, tangents)
@@ -234,6 +245,16 @@ def _environment(asset: Asset, name: str, files: _Files, environments: Callable[
         return Environment(load_environment(files.path(name)).radiance.to(device))
 
     return _remembered(asset, ("environment", files.stamp(name)), load)
+
+
+def _shape_texts(edits: list[ShapeEdit], files: _Files) -> tuple:
+    """Differ where shapes may."""
+    return tuple((_text(edit), files.stamp(_file(edit))) for edit in edits)
+
+
+def _text_of_grips(edit: DeformEdit) -> str:
+    """What is held, whatever the targets."""
+    return edit.model_dump_json(exclude={"handles": {"drag": {"__all__": {"target", "turn"}}}})
 
 
 def _text(edit: Edit) -> str:

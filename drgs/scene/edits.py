@@ -116,7 +116,41 @@ class LatticeMap(_Plain):
 AnalyticMap = Annotated[TwistMap | BendMap | StretchMap | LatticeMap, Field(discriminator="type")]
 
 
+class Grip(_Plain):
+    """A part of the surface that is held: some vertices by number, or those around a picked point."""
+
+    vertices: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1, max_length=200_000)] | None = None
+    point: Triple | None = None
+    """World position on the object at rest."""
+    radius: Annotated[float, Field(ge=0)] = 0.0
+    """Around the point [world units]; its nearest vertex is held in any case."""
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> "Grip":
+        if (self.vertices is None) == (self.point is None):
+            raise ValueError("a grip has either vertices or point; found both or neither")
+        return self
+
+
+class Handle(Grip):
+    """A grip that is dragged: it moves as a rigid piece."""
+
+    target: Triple
+    """Where the picked point goes, or the middle of the vertices [world units]."""
+    turn: Triple = (0.0, 0.0, 0.0)
+    """Rotation vector of the piece about that point [degrees]."""
+
+
+class Handles(_Plain):
+    """What is dragged and what is held in place; the rest follows as rigidly as it can. Parts without a grip stay."""
+
+    drag: Annotated[list[Handle], Field(min_length=1, max_length=64)]
+    pin: Annotated[list[Grip], Field(max_length=64)] = []
+
+
 class DeformEdit(_Plain):
+    """Exactly one of map, vertices, handles."""
+
     op: Literal["deform"]
     map: AnalyticMap | None = None
     vertices: str | None = None
@@ -125,10 +159,13 @@ class DeformEdit(_Plain):
     """Seconds into a sequence of `vertices`; frames are blended linearly, the last one holds."""
     frames_per_second: Annotated[float, Field(gt=0)] = 24.0
 
+    handles: Handles | None = None
+
     @model_validator(mode="after")
     def _exactly_one(self) -> "DeformEdit":
-        if (self.map is None) == (self.vertices is None):
-            raise ValueError("a deform edit has either map or vertices; found both or neither")
+        given = [name for name in ("map", "vertices", "handles") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"a deform edit has exactly one of map, vertices, handles; found {given or 'none'}")
         return self
 
 

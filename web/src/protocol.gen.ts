@@ -123,12 +123,14 @@ export interface ClientHello {
   client?: string;
 }
 
+/** Exactly one of map, vertices, handles. */
 export interface DeformEdit {
   op: "deform";
   map?: TwistMap | BendMap | StretchMap | LatticeMap | null;
   vertices?: string | null;
   time?: number;
   frames_per_second?: number;
+  handles?: Handles | null;
 }
 
 /** The session's edits. The same document answers REST calls. */
@@ -179,6 +181,28 @@ export interface ErrorMessage {
   type: "error";
   message: string;
   fatal: boolean;
+}
+
+/** A part of the surface that is held: some vertices by number, or those around a picked point. */
+export interface Grip {
+  vertices?: number[] | null;
+  point?: [number, number, number] | null;
+  radius?: number;
+}
+
+/** A grip that is dragged: it moves as a rigid piece. */
+export interface Handle {
+  vertices?: number[] | null;
+  point?: [number, number, number] | null;
+  radius?: number;
+  target: [number, number, number];
+  turn?: [number, number, number];
+}
+
+/** What is dragged and what is held in place; the rest follows as rigidly as it can. Parts without a grip stay. */
+export interface Handles {
+  drag: Handle[];
+  pin?: Grip[];
 }
 
 export interface JobInfo {
