@@ -20,6 +20,9 @@ from drgs.maths.sampling import sample_linear
 from drgs.scene.environment import Environment, direction_from_uv, uv_from_direction
 from drgs.warp_torch import warp_array
 
+MAX_RADIANCE = 1e12
+"""Of a texel; a half-float picture holds 65504, squared luminance overflows at 1e19."""
+
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentTable:
@@ -34,12 +37,24 @@ class EnvironmentTable:
 
 
 def build_environment_table(environment: Environment) -> EnvironmentTable:
-    """The table of an environment; a few torch operations, cheap enough to repeat in training."""
+    """The table of an environment; a few torch operations, cheap enough to repeat in training.
+
+    Raises:
+        ValueError: a texel is negative, not finite or above MAX_RADIANCE.
+    """
     radiance = environment.radiance.detach()
     height, width, _ = radiance.shape
+    darkest, brightest = (float(x) for x in radiance.aminmax())  # NaN where there is one
+    if not (darkest >= 0 and brightest <= MAX_RADIANCE):
+        raise ValueError(
+            f"the environment's texels span {darkest:g} to {brightest:g}; expected finite radiance from 0 to {MAX_RADIANCE:g}: "
+            "clamp it, or scale it and raise the edit's intensity"
+        )
     polar = (torch.arange(height, device=radiance.device, dtype=radiance.dtype) + 0.5) * (math.pi / height)
     pole = radiance.new_zeros(1, width)
-    nodes = torch.cat([pole, radiance.amax(-1).clamp(min=0) * torch.sin(polar)[:, None], pole])
+    nodes = torch.cat([pole, radiance.amax(-1) * torch.sin(polar)[:, None], pole])
+    # A density knows no unit: the brightest texel becomes 0.5 to 1 by a power of two, which is exact, and no square under- or overflows.
+    nodes = torch.ldexp(nodes, torch.tensor(-math.frexp(brightest)[1], device=nodes.device))
     # Sums run in float64: after a sun of 1e6, a float32 sum would forget the dim texels behind it.
     cells = (0.5 / width) * (nodes + torch.roll(nodes, -1, dims=1)).double()
     column_sums = torch.cat([cells.new_zeros(height + 2, 1), cells.cumsum(1)], 1)

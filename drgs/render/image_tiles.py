@@ -1,9 +1,10 @@
-"""Square tiles of the image: which of them a mesh can be seen in, and their pixels.
+"""Square tiles of the image: which of them a mesh can be seen in, their pixels, and the window around them.
 
 Tiles are numbered row-major, as pixels are. Knows nothing of rays or light.
 """
 
 import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,8 +18,70 @@ MARGIN = 0.01
 """By which triangles are widened on the screen, against rounding [pixels]."""
 
 
+@dataclass(frozen=True)
+class Window:
+    """The part of an image that holds all there is to see: what lies outside need not be filtered, blended or tone mapped."""
+
+    height: int
+    """Of the whole image, as is width [pixels]."""
+    width: int
+    rows: slice
+    columns: slice
+
+    @property
+    def tiles(self) -> tuple[slice, slice]:
+        """Rows and columns of the tiles; the window begins at a tile's corner."""
+        return tuple(slice(side.start // TILE, -(-side.stop // TILE)) for side in (self.rows, self.columns))
+
+    def crop(self, image: Tensor) -> Tensor:
+        """The window (rows, columns, ...) of an image (height, width, ...); shares its memory."""
+        return image[self.rows, self.columns]
+
+    def pad(self, part: Tensor, outside: float = 0.0) -> Tensor:
+        """The image (height, width, ...) that is `part` in the window and `outside` around it."""
+        if part.shape[:2] == (self.height, self.width):
+            return part
+        image = part.new_full((self.height, self.width, *part.shape[2:]), outside)
+        image[self.rows, self.columns] = part
+        return image
+
+    def camera(self, camera: Camera) -> Camera:
+        """The one that sees the window alone."""
+        intrinsics = camera.intrinsics.clone()
+        intrinsics[0, 2] -= self.columns.start
+        intrinsics[1, 2] -= self.rows.start
+        height, width = self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+        return replace(camera, intrinsics=intrinsics, width=width, height=height)
+
+
+def window_of_tiles(tiles: Tensor, width: int, height: int) -> Window:
+    """The smallest window around chosen tiles (tile,) bool, at least one of them."""
+    across, down = tile_grid(width, height)
+    chosen = tiles.view(down, across)
+    rows, columns = (torch.nonzero(chosen.any(axis)).squeeze(-1).tolist() for axis in (1, 0))
+    return Window(
+        height,
+        width,
+        slice(TILE * rows[0], min(height, TILE * (rows[-1] + 1))),
+        slice(TILE * columns[0], min(width, TILE * (columns[-1] + 1))),
+    )
+
+
+def spread_over_pixels(of_tiles: Tensor, window: Window) -> Tensor:
+    """(rows, columns) of a window: the value of each pixel's tile (tile,)."""
+    across, down = tile_grid(window.width, window.height)
+    wide = of_tiles.view(down, across)[window.tiles].repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
+    return wide[: window.rows.stop - window.rows.start, : window.columns.stop - window.columns.start]
+
+
 def tile_grid(width: int, height: int) -> tuple[int, int]:
-    """Tiles across and down."""
+    """Tiles across and down.
+
+    Raises:
+        ValueError: the picture has no area.
+    """
+    if width < 1 or height < 1:
+        raise ValueError(f"the picture is {width}x{height} pixels; expected at least 1x1")
     return math.ceil(width / TILE), math.ceil(height / TILE)
 
 

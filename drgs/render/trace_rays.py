@@ -20,11 +20,35 @@ from drgs.warp_torch import in_thread_pool, load_kernel, thread_count, thread_po
 SLICE_RAYS = 65536
 """Rays of a CPU slice: long enough to hide Python, short enough to balance threads."""
 SLICE_RAYS_GPU = 1 << 24
+EXTENTS = (1e-5, 1e9)
+"""Diagonals of a mesh's box between which squared areas of triangles neither under- nor overflow [world units]."""
+MAX_OFFSET = 1e5
+"""Largest coordinate of a mesh, in diagonals of its box."""
 
 
 def build_tracer(mesh: TriangleMesh) -> AbstractTracer:
-    """The fastest tracer of the mesh's device."""
+    """The fastest tracer of the mesh's device.
+
+    Raises:
+        ValueError: float32 cannot hold this mesh (docs/stability.md).
+    """
+    _check_numbers(mesh)
     return EmbreeTracer(mesh) if mesh.vertices.device.type == "cpu" else WarpTracer(mesh)
+
+
+def _check_numbers(mesh: TriangleMesh) -> None:
+    """Refuse a mesh of which pictures would be wrong without a word."""
+    if len(mesh.vertices) == 0:
+        raise ValueError("the mesh has no vertices")
+    low, high = mesh.vertices.detach().amin(0), mesh.vertices.detach().amax(0)
+    extent, reach = float(torch.linalg.norm(high - low)), float(torch.maximum(low.abs(), high.abs()).max())  # NaN where there is one
+    if not EXTENTS[0] <= extent <= EXTENTS[1]:
+        raise ValueError(f"the mesh spans {extent:g} world units; expected {EXTENTS[0]:g} to {EXTENTS[1]:g}: scale it")
+    if reach > MAX_OFFSET * extent:
+        raise ValueError(
+            f"the mesh spans {extent:g} world units and lies up to {reach:g} from the origin, where float32 keeps too few digits of its "
+            f"shape; expected at most {MAX_OFFSET:g} times its span: move it nearer"
+        )
 
 
 def over_slices(count: int, device: torch.device, work: Callable[[int, int], object], slice_length: int | None = None) -> list:

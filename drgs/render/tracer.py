@@ -37,7 +37,7 @@ class AbstractTracer(ABC):
     def face_normals(self) -> Tensor:
         """(face, 3) unit normals of the triangles."""
         a, b, c = self.mesh.vertices.detach()[self.mesh.faces.long()].unbind(1)
-        return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+        return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1, eps=1e-30)
 
     def with_materials(self, mesh: TriangleMesh) -> Self:
         """A tracer of a mesh of the same shape with other materials; shares the tree."""
