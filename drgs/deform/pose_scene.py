@@ -21,11 +21,12 @@ from drgs.deform.clip import ClipFrame, frame_at, open_clip
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.hold_handles import HeldObject
 from drgs.deform.maps import check_map, evaluate_map
+from drgs.deform.rig_clip import bind_rig
 from drgs.deform.simulate import Simulation
 from drgs.deform.simulation_scene import parse_simulation_scene
 from drgs.deform.vertex_sequence import vertices_at
 from drgs.scene.asset import Asset
-from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, SimulateEdit
+from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, SimulateEdit, split_rig_clip
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.load_environment import load_environment
@@ -210,13 +211,18 @@ def _apply_deformations(asset: Asset, edits: list[ShapeEdit], files: _Files) -> 
 
 
 def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files) -> ClipFrame:
-    """What a clip or a simulation shows at the edit's time; at rest, the asset's own tensors."""
+    """What a clip, a rig or a simulation shows at the edit's time; at rest, the asset's own tensors."""
+    centers, tangents = (None, None) if asset.gaussians is None else (asset.gaussians.centers, _rest(asset).tangents)
+    rest = ClipFrame(asset.mesh.vertices, asset.mesh.normals, centers, tangents)
     if isinstance(edit, SimulateEdit):
         scene = parse_simulation_scene(edit.scene)
         if edit.time == 0:
-            centers, tangents = (None, None) if asset.gaussians is None else (asset.gaussians.centers, _rest(asset).tangents)
-            return ClipFrame(asset.mesh.vertices, asset.mesh.normals, centers, tangents)
+            return rest
         frame = _remembered(asset, ("simulation", scene.model_dump_json()), lambda: Simulation(asset, scene)).at(edit.time)
+    elif (rig := split_rig_clip(edit.clip)) is not None:
+        key = ("rig", files.stamp(rig[0]), edit.model_dump_json(exclude={"time"}))
+        bound = _remembered(asset, key, lambda: bind_rig(files.path(rig[0]), rig[1], rest, asset.meters_per_unit, edit.rig))
+        frame = bound.at(edit.time)
     else:
         clip = open_clip(files.path(f"{edit.clip}/clip.json").parent)
         surfels = 0 if asset.gaussians is None else len(asset.gaussians.centers)
@@ -232,7 +238,8 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files) -> ClipF
 def _file(edit: ShapeEdit) -> str | None:
     """The file that an edit reads, whose change must be noticed."""
     if isinstance(edit, PoseEdit):
-        return f"{edit.clip}/clip.json"
+        rig = split_rig_clip(edit.clip)
+        return f"{edit.clip}/clip.json" if rig is None else rig[0]
     return edit.vertices if isinstance(edit, DeformEdit) else None
 
 

@@ -1,5 +1,6 @@
 """Edits as plain data: one schema for file, REST and WebSocket, applied in order, each undoable (design: Edits)."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -169,11 +170,45 @@ class DeformEdit(_Plain):
         return self
 
 
+class RigBinding(_Plain):
+    """How a glTF rig, turned to z up and world units, is laid over the object at rest, and how the object follows it."""
+
+    turn: Triple = (0.0, 0.0, 0.0)
+    """Rotation vector about the origin [degrees]; first of all."""
+    fit: bool = False
+    """Then scale and move the rig until its box has the diagonal and the centre of the object's."""
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    """Then scale, about the fitted centre, or the origin without `fit`."""
+    translation: Triple = (0.0, 0.0, 0.0)
+    """Then move [world units]."""
+    method: Literal["closest", "mls"] = "closest"
+    """closest: with the closest triangle that faces alike. mls: moving least squares over the triangles; smoother, blind to narrow gaps."""
+    rest: Annotated[float, Field(ge=0)] | None = None
+    """Seconds into the animation where the rig stands as the object does at rest; None: where the file's nodes stand."""
+    loop: bool = False
+    """Start again after the animation's end; else its last pose holds."""
+
+
 class PoseEdit(_Plain):
     op: Literal["pose"]
     clip: str
+    """A clip folder, or a glTF file and one of its animations: robot.glb#Walk."""
     time: Annotated[float, Field(ge=0)]
     """Seconds."""
+    rig: RigBinding | None = None
+    """For glTF files only."""
+
+    @model_validator(mode="after")
+    def _rig_has_a_file(self) -> "PoseEdit":
+        if self.rig is not None and split_rig_clip(self.clip) is None:
+            raise ValueError(f"a pose edit has rig for a .glb or .gltf file only; its clip is {self.clip!r}")
+        return self
+
+
+def split_rig_clip(clip: str) -> tuple[str, str] | None:
+    """File and animation ("" if none is named) of a glTF clip; None for a clip folder."""
+    found = re.fullmatch(r"(.+?\.(?:glb|gltf))(?:#(.*))?", clip, re.IGNORECASE | re.DOTALL)
+    return None if found is None else (found[1], found[2] or "")
 
 
 class SimulateEdit(_Plain):

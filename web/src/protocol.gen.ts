@@ -286,6 +286,7 @@ export interface PoseEdit {
   op: "pose";
   clip: string;
   time: number;
+  rig?: RigBinding | null;
 }
 
 /** RFC 9457 problem details; `detail` is a sentence a user can act on. */
@@ -305,6 +306,17 @@ export interface RejectedMessage {
   type: "rejected";
   id: number;
   reason: string;
+}
+
+/** How a glTF rig, turned to z up and world units, is laid over the object at rest, and how the object follows it. */
+export interface RigBinding {
+  turn?: [number, number, number];
+  fit?: boolean;
+  scale?: number;
+  translation?: [number, number, number];
+  method?: "closest" | "mls";
+  rest?: number | null;
+  loop?: boolean;
 }
 
 /** Exactly one field is set. */
