@@ -26,7 +26,7 @@ from drgs.render.ray_memory import RayMemory
 from drgs.render.records import GBuffer, ShadingPoints
 from drgs.render.refresh_materials import refresh_gbuffer, refresh_points, refresh_primary
 from drgs.render.reproject import brighten, reproject
-from drgs.render.resolve_frame import frame_errors, frame_gbuffer, frame_history, resolve_frame
+from drgs.render.resolve_frame import frame_errors, frame_history, resolve_frame, window_gbuffer
 from drgs.render.sample_rays import PointArrays, point_arrays, shading_points
 from drgs.render.shade import RayStarts, shade
 from drgs.render.trace_primary import PrimaryPoints, trace_primary_points
@@ -186,12 +186,13 @@ def start_frame(
         return _continued(replace(previous, scene=scene, settings=settings, **parts), factor)
     memory = RayMemory() if previous is None or "first_rays" in make else RayMemory(previous.memory.rays)
     pixels, device = camera.width * camera.height, seen.device
-    numbers = [torch.zeros(pixels, *tail, device=device) for tail in ((3,), (3,), (), (), (), (3,), (), (15,))]
+    numbers = [torch.zeros(pixels, *tail, device=device) for tail in ((3,), (3,), (), (), (), (3,), ())]
+    surface = torch.zeros(pixels if mesh_seen else 1, 15, device=device).expand(pixels, 15)
     history = frame_history(previous) if previous is not None and changed == {"camera"} and settings.denoise != "none" else None
     tile_passes = torch.zeros(across * down, dtype=torch.int64, device=device)
     lap("history")
     return FrameState(
-        scene, camera, settings, tracer, table, light, plan, fixed, seen, memory, first, gbuffer, *numbers,
+        scene, camera, settings, tracer, table, light, plan, fixed, seen, memory, first, gbuffer, *numbers, surface,
         tile_passes, seen.clone(), history, None, made, seconds,
     )  # fmt: skip
 
@@ -238,7 +239,9 @@ def refine_frame(state: FrameState, passes: int = 1) -> FrameState:
         state.tile_passes[chosen] += count
         passes -= count
         if state.history is not None:
-            state = replace(state, reprojected=reproject(state.history, frame_gbuffer(state), state.camera), history=None)
+            state = replace(
+                state, reprojected=reproject(state.history, window_gbuffer(state), state.window.camera(state.camera)), history=None
+            )
         if state.settings.target_error is not None and index + count >= MIN_PASSES:
             state = replace(state, active=_still_active(state, state.active))
     return state
@@ -263,7 +266,9 @@ def _add_first_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState
     _shade_and_add(state, primary, index, state.memory if whole_first_pass else None)
     if state.fixed is None and whole_first_pass:
         state = replace(state, first=primary)
-    return _pay(state, len(primary.points.pixel), {"trace_primary": traced - clock, "shade": time.perf_counter() - traced})
+    return _pay(
+        state, primary.starts.face, len(primary.points.pixel), {"trace_primary": traced - clock, "shade": time.perf_counter() - traced}
+    )
 
 
 def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> FrameState:
@@ -271,7 +276,7 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
     clock = time.perf_counter()
     pixels = pixels_of_tiles(chosen, state.camera.width, state.camera.height)
 
-    def work(first: int, last: int) -> tuple[int, float]:
+    def work(first: int, last: int) -> tuple[int, float, Tensor | None]:
         points, tracing, at_once = 0, 0.0, max(1, PIXELS_AT_ONCE // (last - first))
         for round_ in range(index, index + count, at_once):
             began = time.perf_counter()
@@ -282,17 +287,18 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
             tracing += time.perf_counter() - began
             _shade_and_add(state, primary, round_ if primary.round is None else primary.round, None)
             points += len(primary.points.pixel)
-        return points, tracing
+        return points, tracing, primary.starts.face
 
     done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // (SLICES_A_THREAD * thread_count()))))
-    traced = sum(seconds for _, seconds in done) / max(1, min(thread_count(), len(done)))
+    traced = sum(seconds for _, seconds, _ in done) / max(1, min(thread_count(), len(done)))
     seconds = {"trace_primary": traced, "shade": max(0.0, time.perf_counter() - clock - traced)}
-    return _pay(state, sum(points for points, _ in done), seconds)
+    starts = torch.cat([faces for *_, faces in done if faces is not None])
+    return _pay(state, starts, sum(points for points, *_ in done), seconds)
 
 
 def _shade_and_add(state: FrameState, primary: PrimaryPoints, index: int | Tensor, memory: RayMemory | None) -> None:
     """Light of the points of pass `index`, or of several passes, added to the sums of their pixels."""
-    plan, settings, points, device = state.plan, state.settings, primary.points, warp_device(state.surface)
+    plan, settings, points, device = state.plan, state.settings, primary.points, warp_device(state.weight)
     horizon = usable_horizons(state.tracer.horizons, settings.skip_error) if settings.skip else None
     light = shade(
         points,
@@ -315,11 +321,15 @@ def _shade_and_add(state: FrameState, primary: PrimaryPoints, index: int | Tenso
         launch(add_surface, len(points.pixel), [point_arrays(points), warp_array(primary.depth)], [warp_array(state.surface)], device)
 
 
-def _pay(state: FrameState, points: int, durations: dict[str, float]) -> FrameState:
-    """Books a step's time, and the search for horizons on its rays."""
+def _pay(state: FrameState, starts: Tensor | None, points: int, durations: dict[str, float]) -> FrameState:
+    """Books a step's time, and the search for horizons on its rays.
+
+    Args:
+        starts: (point,) faces of some of the points.
+    """
     clock = time.perf_counter()
     if state.settings.skip and state.tracer.horizons is not None:
-        state.tracer.horizons.pay(points * state.plan.counts.total)
+        state.tracer.horizons.pay(points * state.plan.counts.total, starts)
     seconds = dict(state.seconds)
     for step, duration in (*durations.items(), ("horizons", time.perf_counter() - clock)):
         seconds[step] = seconds.get(step, 0.0) + duration

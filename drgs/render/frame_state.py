@@ -1,12 +1,14 @@
 """A progressive frame between passes, and the settings it is made with."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.render.environment_table import EnvironmentTable
+from drgs.render.image_tiles import Window, window_of_tiles
 from drgs.render.plan import RenderPlan
 from drgs.render.ray_memory import RayMemory
 from drgs.render.records import GBuffer
@@ -79,19 +81,24 @@ class FrameState:
     """Sum of the passes' own variance estimates: whole luminance, diffuse, specular."""
     visibility: Float[Tensor, "pixel"]
     surface: Float[Tensor, "pixel 15"]
-    """Sums of position, normal, wo, albedo, roughness, metallic, depth."""
+    """Sums of position, normal, wo, albedo, roughness, metallic, depth; of a mesh."""
     tile_passes: Int[Tensor, "tile"]
     """Passes that each tile has had."""
     active: Bool[Tensor, "tile"]
     """Tiles that get more rays."""
     history: History | None
-    """Of the view before a camera's move, until the first pass shows what can be used of it."""
+    """Of the window of the view before a camera's move, until the first pass shows what can be used of it."""
     reprojected: Reprojected | None
-    """What can be used of it."""
+    """What can be used of it, in the window."""
     made: tuple[str, ...]
     """Parts that were computed for this frame; the others were taken over from the frame before (invalidate.py)."""
     seconds: dict[str, float]
     """Of each step, summed over passes."""
+
+    @cached_property
+    def window(self) -> Window:
+        """Around the tiles that may show a surface."""
+        return window_of_tiles(self.seen, self.camera.width, self.camera.height)
 
     @property
     def passes(self) -> int:

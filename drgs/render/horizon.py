@@ -34,7 +34,10 @@ MARGIN = 1e-5
 """Added to the sine, against rounding."""
 
 RAYS_A_FACE = 400
-"""Traced rays that pay for one face: with these, looking costs about an eighth of a pass (49 000 faces: 18 us a face, 350 ns a ray)."""
+"""Traced rays that pay for one face that rays start from: with these, looking costs about an eighth of a pass (49 000 faces: 18 us a face,
+350 ns a ray)."""
+RAYS_A_FACE_AHEAD = 1600
+"""For one that nothing asked for yet: a moving camera should not wait for what it may see later."""
 MIN_FACES = 256
 """Fewer are not worth a launch."""
 TRIAL = 0.05
@@ -212,8 +215,9 @@ def _boxes(corners: Tensor, size: int) -> tuple[Tensor, Tensor]:
 class Horizons:
     """The horizons of a mesh's faces, found a share at a time as rays show that they will be needed. Final.
 
-    Rays pay for them: after each pass as many faces are looked at as make up a fixed share of the pass's own cost. Faces come in
-    a scattered order, and when the first TRIAL of them say that hardly a ray would be let off, the search ends.
+    Rays pay for them: after each pass as many faces are looked at as make up a fixed share of the pass's own cost. The first TRIAL of
+    all faces come in a scattered order, and when they say that hardly a ray would be let off, the search ends; then those that rays
+    start from, then the rest.
     """
 
     sine: Tensor
@@ -231,10 +235,13 @@ class Horizons:
         """Faces looked at so far."""
         self._lift = lift
         self._rays = 0
+        self._known = torch.zeros(count, dtype=torch.bool, device=corners.device)
         self._order = _curve_order(corners.mean(1)) if count else torch.empty(0, dtype=torch.int64, device=corners.device)
         self._corners = corners[self._order].contiguous()
         stride = next(s for s in range(max(1, int(0.618 * count)), count + 2) if math.gcd(s, max(count, 1)) == 1)
-        self._scattered = (torch.arange(count, device=corners.device) * stride % max(count, 1)).int()
+        self._scattered = torch.arange(count, device=corners.device) * stride % max(count, 1)
+        self._place = torch.empty_like(self._order)
+        self._place[self._order] = torch.arange(count, device=corners.device)
         self._boxes: tuple[Tensor, ...] = ()
         self._lanes = corners[:0]
 
@@ -242,19 +249,49 @@ class Horizons:
     def faces(self) -> int:
         return len(self.sine)
 
-    def pay(self, rays: int) -> None:
-        """Look at as many faces as `rays` traced rays pay for."""
+    def pay(self, rays: int, starts: Tensor | None = None) -> None:
+        """Look at as many faces as `rays` traced rays pay for.
+
+        Args:
+            starts: (point,) faces that the rays started from, -1 for none.
+        """
+        if self.found == self.faces or self._hopeless():
+            return
         self._rays += rays
-        faces = self._rays // RAYS_A_FACE
-        if faces >= min(MIN_FACES, self.faces - self.found):
-            self._rays -= faces * RAYS_A_FACE
-            self.find(faces)
+        trial = math.ceil(TRIAL * self.faces) - self.found
+        if trial > 0:
+            which, price = self._ahead(trial), RAYS_A_FACE
+        else:
+            which, price = self._wanted(starts), RAYS_A_FACE
+            if len(which) == 0:
+                which, price = self._ahead(self.faces), RAYS_A_FACE_AHEAD
+        due = which[: self._rays // price]
+        if len(due) >= min(MIN_FACES, len(which)):
+            # What is left over is kept within bounds: no frame shall wait for a burst.
+            self._rays = min(self._rays - price * len(due), RAYS_A_FACE_AHEAD * MIN_FACES)
+            self._look_at(due)
 
     def find(self, faces: int) -> None:
         """Look at the next `faces` faces."""
-        which = self._scattered[self.found : self.found + faces]
+        self._look_at(self._ahead(faces))
+
+    def _ahead(self, faces: int) -> Tensor:
+        """The next places of unknown faces in the scattered order."""
+        return self._scattered[~self._known[self._scattered]][:faces]
+
+    def _wanted(self, starts: Tensor | None) -> Tensor:
+        """Places of the unknown ones among faces."""
+        if starts is None:
+            return self._scattered[:0]
+        asked = torch.zeros_like(self._known)
+        asked[self._place[starts[starts >= 0].long()]] = True
+        return torch.nonzero(asked & ~self._known).squeeze(-1)
+
+    def _look_at(self, which: Tensor) -> None:
+        """Faces at places along the curve."""
         if len(which) == 0 or self._hopeless():
             return
+        which = which.int()
         group, count = int(GROUP), self.faces
         if not self._boxes:
             self._boxes = (*_boxes(self._corners, group), *_boxes(self._corners, group * int(SUPER)))
@@ -271,6 +308,7 @@ class Horizons:
         tangent = tangent[which.long()]
         sine = tangent / torch.sqrt(1 + tangent.square().clamp(max=1e12)) + MARGIN
         self.sine[self._order[which.long()]] = torch.where(tangent < float(STEEPEST), sine, BLOCKED)
+        self._known[which.long()] = True
         self.found += len(which)
 
     def _hopeless(self) -> bool:
@@ -278,8 +316,7 @@ class Horizons:
 
     def spared(self) -> float:
         """Share of cosine-weighted rays from the faces looked at that need no tracing (each face counting alike)."""
-        known = self.sine[self._order[self._scattered[: self.found].long()]]
-        return float((1 - known.square()).clamp(min=0).mean()) if self.found else 0.0
+        return float((1 - self.sine.square()).clamp(min=0).sum()) / self.found if self.found else 0.0  # unknown faces add 0
 
 
 def usable_horizons(horizons: Horizons | None, blocked_share: float = 0.0) -> Tensor | None:

@@ -10,10 +10,11 @@ meet the surface it starts on.
 """
 
 import torch
+from torch import Tensor
 
 from drgs.render.records import ShadingPoints
 from drgs.render.shade import RayStarts
-from drgs.render.trace_rays import trace_rays
+from drgs.render.trace_rays import over_slices, trace_rays
 from drgs.render.tracer import AbstractTracer
 
 NEAR = 0.01
@@ -23,11 +24,27 @@ FACING = 0.2
 """Smallest cosine between a point's normal and that of the triangle it is carried to."""
 
 
+SLICE = 8192
+"""Points that a thread carries together."""
+
+
 def lift_points(points: ShadingPoints, tracer: AbstractTracer) -> RayStarts:
     """Ray starts of shading points; carries no gradient."""
-    position, normal, wo = points.position_world.detach(), points.normal_world.detach(), points.wo_world.detach()
-    face_normals = tracer.face_normals
+    places = [values.detach() for values in (points.position_world, points.normal_world, points.wo_world)]
+    tracer.face_normals  # found once, before threads ask for them  # noqa: B018
+    device = places[0].device
+    parts = over_slices(
+        len(places[0]), device, lambda a, b: _lift(*(values[a:b] for values in places), tracer), SLICE if device.type == "cpu" else None
+    )
+    if len(parts) < 2:
+        return parts[0] if parts else _lift(*places, tracer)
+    faces = torch.cat([part.face for part in parts])
+    return RayStarts(*(torch.cat([getattr(part, name) for part in parts]) for name in ("origin_world", "surface_normal_world")), faces)
 
+
+def _lift(position: Tensor, normal: Tensor, wo: Tensor, tracer: AbstractTracer) -> RayStarts:
+    """lift_points for some of the points, on the calling thread."""
+    face_normals = tracer.face_normals
     start, surface_normal = position + tracer.lift * normal, normal.clone()
     face = torch.full((len(position),), -1, dtype=torch.int32, device=position.device)
     left = torch.arange(len(position), device=position.device)

@@ -1,7 +1,11 @@
-"""The picture of a frame in the making: sums in, Frame out, at any time."""
+"""The picture of a frame in the making: sums in, Frame out, at any time.
+
+All but the last step happens in the window around the tiles that show something; around it the picture is empty.
+"""
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -9,7 +13,7 @@ from torch import Tensor
 from drgs.render.converge import mean_variance, tile_errors
 from drgs.render.denoise import denoise
 from drgs.render.frame_state import FrameState, samples_a_pass
-from drgs.render.image_tiles import tile_of_pixels
+from drgs.render.image_tiles import Window, spread_over_pixels, tile_grid
 from drgs.render.records import Frame, GBuffer, Radiance
 from drgs.render.reproject import History, blend_history, remember
 from drgs.render.tonemap import tonemap
@@ -21,13 +25,19 @@ def resolve_frame(state: FrameState) -> Frame:
     """The picture so far."""
     clock = time.perf_counter()
     settings = state.settings
-    gbuffer = frame_gbuffer(state)
-    radiance = _blended(state, gbuffer)
+    window, part = state.window, window_gbuffer(state)
+    radiance = _blended(state)
     seconds = dict(state.seconds)
-    shown = denoise(radiance, gbuffer, state.camera, settings.denoise)
+    shown = denoise(radiance, part, window.camera(state.camera), settings.denoise)
     seconds["denoise"] = time.perf_counter() - clock
-    linear = shown.diffuse + shown.specular
-    rgba = tonemap(linear, gbuffer.coverage, settings.exposure, _background(state))
+    background = _background(state)
+    linear = window.pad(shown.diffuse + shown.specular)
+    if background is None:
+        rgba = window.pad(tonemap(window.crop(linear), part.coverage, settings.exposure))
+    else:
+        rgba = tonemap(linear, window.pad(part.coverage), settings.exposure, background)
+    gbuffer = _padded(part, window) if state.gbuffer is None else state.gbuffer
+    shown = replace(shown, **{name: window.pad(value) for name, value in vars(shown).items() if isinstance(value, Tensor)})
     seconds["resolve"] = time.perf_counter() - clock - seconds["denoise"]
     metadata = {
         "samples": radiance.samples,
@@ -54,63 +64,84 @@ def _horizons(state: FrameState) -> dict[str, float]:
     return {"faces": horizons.faces, "faces_known": horizons.found, "rays_spared": round(horizons.spared(), 4)}
 
 
-def pixel_passes(state: FrameState) -> Tensor:
-    """(pixel,) int: passes of each pixel's tile."""
-    pixel = torch.arange(state.camera.width * state.camera.height, device=state.weight.device)
-    return state.tile_passes[tile_of_pixels(pixel, state.camera.width)]
+def _part(state: FrameState, name: str) -> Tensor:
+    """(rows, columns, ...) of the window: one of the state's flat sums."""
+    return state.window.crop(getattr(state, name).unflatten(0, (state.camera.height, state.camera.width)))
+
+
+def _passes(state: FrameState) -> Tensor:
+    """(rows, columns) int: passes of each pixel's tile."""
+    return spread_over_pixels(state.tile_passes, state.window)
+
+
+def _variance(state: FrameState, passes: Tensor) -> Tensor:
+    """(rows, columns) variance of the mean luminance."""
+    return mean_variance(_part(state, "luminance"), _part(state, "luminance_squared"), _part(state, "scatter")[..., 0], passes)
 
 
 def frame_errors(state: FrameState) -> Tensor:
-    """(tile,) relative error of each tile (converge.tile_errors)."""
-    passes = pixel_passes(state)
-    variance = mean_variance(state.luminance, state.luminance_squared, state.scatter[:, 0], passes)
-    mean = state.luminance / passes.clamp(min=1)
-    return tile_errors(mean, variance, state.weight > 0, state.camera.width, state.camera.height)
+    """(tile,) relative error of each tile (converge.tile_errors); 0 outside the window."""
+    passes, window = _passes(state), state.window
+    variance, mean = _variance(state, passes), _part(state, "luminance") / passes.clamp(min=1)
+    height, width = mean.shape
+    errors = tile_errors(mean.flatten(), variance.flatten(), (_part(state, "weight") > 0).flatten(), width, height)
+    across, down = tile_grid(width, height)
+    of_all = Window(*tile_grid(window.width, window.height)[::-1], *window.tiles)
+    return of_all.pad(errors.view(down, across)).flatten()
 
 
-def frame_gbuffer(state: FrameState) -> GBuffer:
-    """The rasterised one, or the mean over passes of what rays to the mesh saw."""
+def window_gbuffer(state: FrameState) -> GBuffer:
+    """Of the window: the rasterised one, or the mean over passes of what rays to the mesh saw."""
     if state.gbuffer is not None:
-        return state.gbuffer
-    shape = (state.camera.height, state.camera.width)
-    coverage = (state.weight / pixel_passes(state).clamp(min=1)).reshape(shape)
-    mean = (state.surface / state.weight.clamp(min=1)[:, None]).reshape(*shape, 15)
+        return GBuffer(**{name: state.window.crop(values) for name, values in vars(state.gbuffer).items()})
+    weight = _part(state, "weight")
+    coverage = weight / _passes(state).clamp(min=1)
+    mean = _part(state, "surface") / weight.clamp(min=1)[..., None]
     depth = torch.where(coverage > 0, mean[..., 14], torch.inf)
-    normal, wo = (torch.nn.functional.normalize(mean[..., a : a + 3], dim=-1) for a in (3, 6))
+    normal, wo = (torch.nn.functional.normalize(mean[..., a : a + 3].contiguous(), dim=-1) for a in (3, 6))
     return GBuffer(coverage, depth, mean[..., :3], normal, wo, mean[..., 9:12], mean[..., 12], mean[..., 13])
+
+
+def _padded(part: GBuffer, window: Window) -> GBuffer:
+    """The whole image's G-buffer."""
+    return GBuffer(**{name: window.pad(values, torch.inf if name == "depth" else 0.0) for name, values in vars(part).items()})
 
 
 def frame_history(state: FrameState) -> History | None:
     """What the frame is worth to the next one, seen by another camera; None before the first pass."""
     if state.passes == 0:
         return state.history
-    gbuffer = frame_gbuffer(state)
-    return remember(_blended(state, gbuffer), gbuffer, state.camera, _own_samples(state), state.reprojected)
+    camera = state.window.camera(state.camera)
+    return remember(_blended(state), window_gbuffer(state), camera, _own_samples(state), state.reprojected)
 
 
 def _own_samples(state: FrameState) -> Tensor:
-    total = samples_a_pass(state.settings, state.fixed is None).total
-    return (pixel_passes(state) * total).float().reshape(state.camera.height, state.camera.width)
+    return (_passes(state) * samples_a_pass(state.settings, state.fixed is None).total).float()
 
 
-def _blended(state: FrameState, gbuffer: GBuffer) -> Radiance:
-    """Straight (alpha-normalised) radiance with what history adds; the variance is that of the mean of one pixel's passes."""
-    shape = (state.camera.height, state.camera.width)
-    weight, passes = state.weight.clamp(min=1), pixel_passes(state)
-    variance = mean_variance(state.luminance, state.luminance_squared, state.scatter[:, 0], passes) * (passes.clamp(min=1) / weight) ** 2
-    scatter = state.scatter / (weight * weight)[:, None]
+_blends: WeakKeyDictionary[FrameState, Radiance] = WeakKeyDictionary()
+"""Of states that live: the picture that is shown is the next one's history."""
+
+
+def _blended(state: FrameState) -> Radiance:
+    """Straight (alpha-normalised) radiance of the window, with what history adds; the variance is that of the mean of one pixel's passes."""
+    if state in _blends:
+        return _blends[state]
+    weight, passes = _part(state, "weight").clamp(min=1), _passes(state)
+    scatter = _part(state, "scatter")[..., 1:] / (weight * weight)[..., None]
     radiance = Radiance(
-        (state.diffuse / weight[:, None]).reshape(*shape, 3),
-        (state.specular / weight[:, None]).reshape(*shape, 3),
-        variance.reshape(shape),
-        (state.visibility / weight).reshape(shape),
+        _part(state, "diffuse") / weight[..., None],
+        _part(state, "specular") / weight[..., None],
+        _variance(state, passes) * (passes.clamp(min=1) / weight) ** 2,
+        _part(state, "visibility") / weight,
         state.passes * samples_a_pass(state.settings, state.fixed is None).total,
-        scatter[:, 1].reshape(shape),
-        scatter[:, 2].reshape(shape),
+        scatter[..., 0],
+        scatter[..., 1],
     )
-    if state.reprojected is None:
-        return radiance
-    return blend_history(radiance, state.reprojected, gbuffer, _own_samples(state))
+    if state.reprojected is not None:
+        radiance = blend_history(radiance, state.reprojected, window_gbuffer(state), _own_samples(state))
+    _blends[state] = radiance
+    return radiance
 
 
 def _background(state: FrameState) -> Tensor | None:

@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from drgs.render import horizon as horizon_module
-from drgs.render.horizon import BLOCKED, Horizons, find_horizons, usable_horizons
+from drgs.render.horizon import BLOCKED, RAYS_A_FACE, RAYS_A_FACE_AHEAD, TRIAL, Horizons, find_horizons, usable_horizons
 from drgs.render.trace_rays import build_tracer
 from drgs.scene.mesh import TriangleMesh
 from drgs.warp_torch import warp_array
@@ -104,12 +104,22 @@ def test_horizons_are_found_as_rays_pay_for_them() -> None:
     horizons = Horizons(sphere_mesh(3), 1e-5)
     horizons.pay(1000)
     assert horizons.found == 0 and usable_horizons(horizons) is None
-    horizons.pay(400 * horizons.faces // 2)
+    horizons.pay(RAYS_A_FACE_AHEAD * horizons.faces // 2)  # the trial
+    horizons.pay(RAYS_A_FACE_AHEAD * horizons.faces // 2)
     assert 0 < horizons.found < horizons.faces
     known = horizons.sine < BLOCKED
     assert int(known.sum()) == horizons.found
-    horizons.pay(400 * horizons.faces)
+    horizons.pay(RAYS_A_FACE_AHEAD * horizons.faces)
     assert horizons.found == horizons.faces and bool((horizons.sine < BLOCKED).all())
+
+
+def test_faces_that_rays_start_from_come_first() -> None:
+    horizons = Horizons(sphere_mesh(4), 1e-5)
+    horizons.find(math.ceil(TRIAL * horizons.faces))
+    starts = torch.tensor([7, -1, 300, 7, *range(1000, 2000)], dtype=torch.int32)
+    horizons.pay(RAYS_A_FACE * 2000, starts)
+    assert bool((horizons.sine[starts[starts >= 0].long()] < BLOCKED).all())
+    assert horizons.found < horizons.faces / 2
 
 
 def test_the_search_ends_where_hardly_a_ray_would_be_spared() -> None:

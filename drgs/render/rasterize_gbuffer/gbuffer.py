@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from drgs.render.image_tiles import TILE, window_of_tiles
 from drgs.render.rasterize_gbuffer.rasterize import RasterSettings, rasterize
 from drgs.render.records import GBuffer
 from drgs.scene.camera import Camera, pixel_rays_world
@@ -32,7 +33,8 @@ def facing_normals(normals: Tensor, centers: Tensor, camera: Camera) -> Tensor:
 
 def face_camera(normals: Tensor, wo: Tensor) -> Tensor:
     """(..., 3) unit normals of blended (..., 3), bent towards wo as little as makes their cosine LEAST_FACING; differentiable."""
-    unit = torch.nn.functional.normalize(normals, dim=-1)
+    # Blended maps lie plane by plane, and torch's norm of such vectors takes forty times as long.
+    unit = torch.nn.functional.normalize(normals.contiguous(), dim=-1)
     lacking = (LEAST_FACING - (unit * wo).sum(-1, keepdim=True)).clamp(min=0)
     return torch.nn.functional.normalize(unit + lacking * wo, dim=-1)
 
@@ -47,20 +49,34 @@ def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSet
     normals = facing_normals(torch.nn.functional.normalize(crosses, dim=-1, eps=1e-20), surfels.centers, camera)
     features = torch.cat([normals, materials.albedo, materials.roughness[:, None], materials.metallic[:, None]], -1)
     maps = rasterize(surfels.centers, surfels.tangents, surfels.opacities, features, camera, settings)
-    covered = maps.coverage >= MIN_COVERAGE
-    inverse = torch.where(covered, 1 / maps.coverage.clamp(min=MIN_COVERAGE), torch.zeros_like(maps.coverage))
-    normalised = (maps.features * inverse).permute(1, 2, 0)
-    depth = torch.where(covered, maps.depth_sum * inverse + maps.depth_origin, torch.full_like(inverse, torch.inf))
-    origin, directions = pixel_rays_world(camera)
+    # What lies around the tiles that show something is empty, and most of many pictures.
+    window = window_of_tiles(_tiles_with_any(maps.coverage.detach() >= MIN_COVERAGE), camera.width, camera.height)
+    coverage = window.crop(maps.coverage)
+    covered = coverage >= MIN_COVERAGE
+    inverse = torch.where(covered, 1 / coverage.clamp(min=MIN_COVERAGE), torch.zeros_like(coverage))
+    normalised = (maps.features[:, window.rows, window.columns] * inverse).permute(1, 2, 0)
+    depth = torch.where(covered, window.crop(maps.depth_sum) * inverse + maps.depth_origin, torch.full_like(inverse, torch.inf))
+    origin, all_directions = pixel_rays_world(camera)
+    directions = window.crop(all_directions)
     along_axis = directions @ camera.camera_from_world[2, :3]
     position = origin + directions * (torch.where(covered, depth, torch.zeros_like(depth)) / along_axis)[..., None]
     return GBuffer(
         coverage=maps.coverage,
-        depth=depth,
-        position_world=position,
-        normal_world=face_camera(normalised[..., :3], -directions) * covered[..., None],
-        wo_world=-directions,
-        albedo=normalised[..., 3:6].clamp(0, 1),
-        roughness=normalised[..., 6].clamp(0, 1),
-        metallic=normalised[..., 7].clamp(0, 1),
+        depth=window.pad(depth, torch.inf),
+        position_world=window.pad(position),
+        normal_world=window.pad(face_camera(normalised[..., :3], -directions) * covered[..., None]),
+        wo_world=-all_directions,
+        albedo=window.pad(normalised[..., 3:6].clamp(0, 1)),
+        roughness=window.pad(normalised[..., 6].clamp(0, 1)),
+        metallic=window.pad(normalised[..., 7].clamp(0, 1)),
     )
+
+
+def _tiles_with_any(mask: Tensor) -> Tensor:
+    """(tile,) bool: whether a tile of the image (height, width) has a True; the first if none has."""
+    height, width = mask.shape
+    padded = torch.nn.functional.pad(mask, (0, -width % TILE, 0, -height % TILE))
+    tiles = padded.unflatten(0, (-1, TILE)).unflatten(2, (-1, TILE)).any(3).any(1).flatten()
+    if not bool(tiles.any()):
+        tiles[0] = True
+    return tiles
