@@ -13,12 +13,11 @@ import fast_simplification
 import igl
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from drgs.deform.drive_mesh import vertex_gradients
 from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate, polar_rotation
 
 SLIVER = 1e-9
@@ -35,9 +34,9 @@ class ArapSettings:
     """Of the control mesh; a mesh with fewer faces is its own."""
     coarse_faces: int = 1_500
     """Of the mesh on which drags are found."""
-    steps: int = 4
+    steps: int = 3
     """From rest to the targets, on the coarse mesh."""
-    coarse_iterations: int = 12
+    coarse_iterations: int = 8
     """Of each step; the last takes twice as many."""
     iterations: int = 2
     """On the control mesh, from where the coarse one leads."""
@@ -71,6 +70,11 @@ class ArapHandles:
         self._device = points.device
         self._weights = build_weights(self._control.rest.float(), points.detach().cpu(), gmls)
 
+    @property
+    def control_faces(self) -> int:
+        """How many faces the control mesh has."""
+        return len(self._control.corners)
+
     def drag(self, targets: Tensor) -> tuple[Tensor, Tensor]:
         """Positions (point, 3) and gradients (point, 3, 3) of the points when the handles are at targets (handle, 3).
 
@@ -87,11 +91,13 @@ class ArapHandles:
         pose, turns = coarse.rest @ turn.T + shift, turn.expand(len(coarse.held), 3, 3)
         for step in range(1, settings.steps + 1):
             iterations = settings.coarse_iterations * (2 if step == settings.steps else 1)
-            pose, turns = coarse.solve(begin + (goal - begin) * (step / settings.steps), turns, pose, iterations)
+            pose = coarse.solve(begin + (goal - begin) * (step / settings.steps), turns, pose, iterations)
+            gradients = coarse.gradients(pose)
+            turns = polar_rotation(gradients[coarse.held])
         if self._refine is not None:
-            pose, gradients = interpolate(self._refine, pose.float(), vertex_gradients(coarse.rest, pose, coarse.corners).float())
-            pose, turns = control.solve(goal, polar_rotation(gradients[control.held].double()), pose.double(), settings.iterations)
-        gradients = vertex_gradients(control.rest, pose, control.corners)
+            pose, gradients = interpolate(self._refine, pose.float(), gradients.float())
+            pose = control.solve(goal, polar_rotation(gradients[control.held].double()), pose.double(), settings.iterations)
+            gradients = control.gradients(pose)
         position, gradient = interpolate(self._weights, pose.float(), gradients.float())
         return position.to(self._device), gradient.to(self._device)
 
@@ -109,11 +115,18 @@ class _Level:
         self._beside = self.rest[self.held] - self._mean(handles)
         loose = _without_handle(len(where), corners, held)
         self._pinned = where[loose]
+        # F of a vertex is a sum over its faces, as in drive_mesh; what of it does not change is kept, since every drag needs it often.
+        area, frames = _face_frames(where, corners)
+        self._inverse_frames = np.linalg.inv(frames)
+        spread = coo_matrix(
+            (np.repeat(area, 3), (corners.reshape(-1), np.repeat(np.arange(len(corners)), 3))), shape=(len(where), len(corners))
+        )
+        self._vertex_from_faces = (diags(1 / np.maximum(np.asarray(spread.sum(1))[:, 0], 1e-300)) @ spread).tocsr()
         self._data, self._lock = igl.ARAPData(), threading.Lock()
         igl.arap_precomputation(where, corners.astype(np.int64), 3, np.concatenate([held, loose]).astype(np.int32), self._data)
 
-    def solve(self, targets: Tensor, turns: Tensor, start: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-        """Pose (vertex, 3) and rotations (held, 3, 3) of the held vertices, from a pose nearby, with handles at targets (handle, 3)."""
+    def solve(self, targets: Tensor, turns: Tensor, start: Tensor, iterations: int) -> Tensor:
+        """Pose (vertex, 3) from one nearby, with handles at targets (handle, 3) and what held vertices lie beside them turned (held, 3, 3)."""
         goal = self._mean(targets) + (turns @ self._beside[..., None])[..., 0]
         with self._lock:
             self._data.max_iter = iterations
@@ -121,7 +134,12 @@ class _Level:
         moved = torch.from_numpy(np.ascontiguousarray(pose))
         if not bool(torch.isfinite(moved).all()):
             raise ValueError("these handles cannot be solved for: the mesh is degenerate")
-        return moved, polar_rotation(vertex_gradients(self.rest, moved, self.corners)[self.held])
+        return moved
+
+    def gradients(self, pose: Tensor) -> Tensor:
+        """(vertex, 3, 3) deformation gradients of a pose (vertex, 3): the means over their faces by area."""
+        _, frames = _face_frames(pose.numpy(), self.corners.numpy())
+        return torch.from_numpy((self._vertex_from_faces @ (frames @ self._inverse_frames).reshape(-1, 9)).reshape(-1, 3, 3))
 
     def _mean(self, values: Tensor) -> Tensor:
         """(held, 3) means of (handle, 3)."""
@@ -136,6 +154,14 @@ def _rigid_fit(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
     # What a point or a line leaves open stays as it is: the identity, by a little.
     turn = polar_rotation((spread + 1e-6 * (spread.norm() + 1e-30) * torch.eye(3, dtype=spread.dtype))[None])[0]
     return turn, goal - turn @ middle
+
+
+def _face_frames(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Twice the areas (face,), and (face, 3, 3) with columns e1, e2 and the unit normal times the square root of that."""
+    a, b, c = (points[corners[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    size = np.linalg.norm(normal, axis=1)
+    return size, np.stack([b - a, c - a, normal / np.sqrt(np.maximum(size, 1e-300))[:, None]], -1)
 
 
 def _control_mesh(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:

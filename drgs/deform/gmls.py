@@ -78,6 +78,7 @@ def gather_motion(
     # outputs
     position: wp.array[wp.vec3],
     gradient: wp.array[wp.mat33],
+    volume: wp.array[float],
 ):
     i = first + wp.tid()
     total = Motion()
@@ -85,7 +86,9 @@ def gather_motion(
         total += psi[i, k] * motion[neighbours[i, k]]
     matrix = wp.mat33(total[3], total[4], total[5], total[6], total[7], total[8], total[9], total[10], total[11])
     position[i] = base[i] + wp.vec3(total[0], total[1], total[2]) + matrix * lever[i]
-    gradient[i] = matrix + diagonal * wp.identity(n=3, dtype=float)
+    whole = matrix + diagonal * wp.identity(n=3, dtype=float)
+    gradient[i] = whole
+    volume[i] = wp.determinant(whole)
 
 
 @wp.kernel
@@ -172,21 +175,22 @@ def build_weights(
 def interpolate(weights: Weights, moved: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
     """Positions (point, 3) and deformation gradients (point, 3, 3) from those of the particles, (particle, 3) and (particle, 3, 3)."""
     if weights.variant != "taylor":
-        return _gather(weights, weights.psi, moved, gradients, torch.zeros_like(weights.points), 0.0)
+        return _gather(weights, weights.psi, moved, gradients, torch.zeros_like(weights.points), 0.0)[:2]
     identity = torch.eye(3, device=moved.device)
     excess = gradients - identity
     local = (weights.particles.double() - weights.origin).float()
     shift = (moved - weights.particles) - 0.5 * (excess @ local[..., None])[..., 0]
-    position, gradient = _gather(weights, weights.psi, shift, excess, weights.points, 1.0)
+    position, gradient, volume = _gather(weights, weights.psi, shift, excess, weights.points, 1.0)
     # Possibly the weights of both signs turned a point inside out; then use those of one sign, then the nearest particle's rotation.
-    folded = torch.linalg.det(gradient) <= 0
+    folded, rigid = volume <= 0, weights.rigid
     if bool(folded.any()):
-        again, matrix = _gather(_subset(weights, folded), weights.shepard[folded], shift, excess, weights.points[folded], 1.0)
+        again, matrix, volume = _gather(_subset(weights, folded), weights.shepard[folded], shift, excess, weights.points[folded], 1.0)
         # Shepard's weights leave another residual, which `lever` does not know.
         base = _residual(weights, folded)
         position[folded] = again + 0.5 * ((matrix - identity) @ base[..., None])[..., 0]
         gradient[folded] = matrix
-    rigid = weights.rigid | (torch.linalg.det(gradient) <= 0)
+        rigid = rigid.clone()
+        rigid[folded] |= volume <= 0
     if bool(rigid.any()):
         nearest = weights.neighbours[rigid, 0].long()
         rotation = polar_rotation(gradients[nearest])
@@ -204,7 +208,8 @@ def polar_rotation(gradient: Tensor) -> Tensor:
     return ((u * flip[:, None]) @ vt).to(gradient.dtype)
 
 
-def _gather(weights: Weights, psi: Tensor, shift: Tensor, matrix: Tensor, base: Tensor, diagonal: float) -> tuple[Tensor, Tensor]:
+def _gather(weights: Weights, psi: Tensor, shift: Tensor, matrix: Tensor, base: Tensor, diagonal: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions (point, 3), gradients (point, 3, 3) and their determinants (point,)."""
     motion = torch.cat([shift, matrix.reshape(-1, 9)], 1).float().contiguous()
     position = torch.empty_like(base)
     gradient = torch.empty(len(base), 3, 3, device=base.device)
@@ -212,8 +217,10 @@ def _gather(weights: Weights, psi: Tensor, shift: Tensor, matrix: Tensor, base: 
         wp.from_torch(motion, dtype=Motion), warp_array(weights.neighbours), warp_array(psi), warp_array(weights.lever, wp.vec3),
         warp_array(base, wp.vec3), diagonal,
     ]  # fmt: skip
-    launch(gather_motion, len(base), inputs, [warp_array(position, wp.vec3), warp_array(gradient, wp.mat33)], warp_device(base), 1)
-    return position, gradient
+    volume = torch.empty(len(base), device=base.device)
+    outputs = [warp_array(position, wp.vec3), warp_array(gradient, wp.mat33), warp_array(volume)]
+    launch(gather_motion, len(base), inputs, outputs, warp_device(base), 1)
+    return position, gradient, volume
 
 
 def _subset(weights: Weights, chosen: Tensor) -> Weights:

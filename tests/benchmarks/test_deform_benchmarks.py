@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from benchmarks import carry, simulate
+from benchmarks import arap, carry, simulate
 
 
 def test_the_simulation_benchmark_prints_one_document_with_its_time(capsys):
@@ -15,6 +15,12 @@ def test_the_carrying_benchmark_prints_one_document_with_its_time(capsys):
     carry.main(["--surfels", "500", "--particles", "216", "--repeats", "1", "--json"])
     result = json.loads(capsys.readouterr().out)
     assert result["surfels"] == 500 and result["ms"] > 0
+
+
+def test_the_dragging_benchmark_prints_one_document_with_its_rate(capsys):
+    arap.main(["--faces", "1200", "--surfels", "100", "--updates", "2", "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert result["faces"] == pytest.approx(1200, rel=0.1) and result["updates_per_second"] > 0 and result["unconverged"][0] < 0.1
 
 
 def test_the_error_tables_show_the_paper_behind_ours(capsys):

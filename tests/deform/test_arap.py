@@ -5,6 +5,7 @@ import torch
 import trimesh
 
 from drgs.deform.arap import ArapHandles, ArapSettings
+from drgs.deform.drive_mesh import vertex_gradients
 from drgs.maths.frames import rotation_from_quat_wxyz
 
 
@@ -85,3 +86,11 @@ def test_parts_without_a_handle_stay_and_wrong_handles_are_refused():
         ArapHandles(vertices, faces, torch.tensor([10**6]), vertices)
     with pytest.raises(ValueError, match="finite"):
         grip.drag(torch.full((len(ends[1]), 3), torch.nan))
+
+
+def test_the_gradients_of_a_pose_are_those_of_a_driven_mesh():
+    vertices, faces, ends = bar()
+    grip = ArapHandles(vertices, faces, ends[0], vertices[:1])
+    level = grip._control
+    pose = level.rest + 0.2 * torch.sin(2 * level.rest[:, [1, 2, 0]])
+    assert torch.allclose(level.gradients(pose), vertex_gradients(level.rest, pose, level.corners), atol=1e-10)
