@@ -9,7 +9,6 @@ Source: Veach 1995 (balance heuristic). Twin: drgs/reference/shade.py.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,7 +16,6 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drgs.maths.brdf import MIN_ROUGHNESS
 from drgs.render.brdf_warp import PI, alpha_of, specular_brdf
 from drgs.render.environment_table import EnvironmentLight, lookup_radiance, table_place
 from drgs.render.horizon import BLOCKED
@@ -34,7 +32,7 @@ from drgs.render.sample_rays import (
     sampled_direction,
     split_at,
 )
-from drgs.render.trace_indirect import far_along, mesh_arrays, scatter_hits, trace_indirect
+from drgs.render.trace_indirect import far_along, mesh_arrays, ray_source, scatter_kernel, trace_indirect
 from drgs.render.trace_rays import over_slices
 from drgs.render.tracer import AbstractTracer
 from drgs.render.tracer_warp import query_any
@@ -71,12 +69,6 @@ class PointLight:
     """Of the luminance of this one estimate, from the scatter of its samples within each strategy: whole, diffuse, specular."""
     visibility: Float[Tensor, "point"]
     """Open share of the cosine-weighted sky, 0..1."""
-
-
-def _source_of_start_rays() -> str:
-    folder = Path(__file__).parent
-    vectors = (folder / "rasterize_gbuffer" / "tile_vector.h").read_text()
-    return f"constexpr float MIN_ROUGHNESS = {MIN_ROUGHNESS}f;\n" + vectors + (folder / "start_rays.h").read_text()
 
 
 @wp.kernel
@@ -131,7 +123,7 @@ def start_rays(
     radiance[i] = seen
 
 
-@wp.func_native(_source_of_start_rays())
+@wp.func_native(ray_source("start_rays.h"))
 def start_sixteen_rays(
     base: int, ray_count: int, first: int,
     points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3), horizon: wp.array(dtype=float),
@@ -284,7 +276,13 @@ def shade(
         warp_array(result.variance, wp.vec3),
         warp_array(result.visibility),
     ]
-    for kernel in (start_rays_simd if device.type == "cpu" else start_rays, note_directions, sum_samples, scatter_hits, query_any):
+    for kernel in (
+        start_rays_simd if device.type == "cpu" else start_rays,
+        note_directions,
+        sum_samples,
+        scatter_kernel(device),
+        query_any,
+    ):
         load_kernel(kernel, warp_dev)
 
     def batch(first: int, last: int) -> None:

@@ -7,12 +7,14 @@ bounces are left, ended by Russian roulette from the second hit onwards. Nothing
 The back of a triangle sends nothing.
 """
 
+from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from drgs.maths.brdf import MIN_ROUGHNESS
 from drgs.render.brdf_warp import PI, alpha_of, cosine_direction, ggx_direction, ggx_pdf, specular_brdf
 from drgs.render.environment_table import EnvironmentLight, environment_direction, lookup_pdf, lookup_radiance, table_place
 from drgs.render.random_warp import hash_combine, shuffle_index, sobol_2d
@@ -206,6 +208,56 @@ def scatter_hits(
                 next_throughput[i] = reflected / (own * survival)
 
 
+def ray_source(name: str) -> str:
+    """The native function body in one of this folder's files, with what it needs before it."""
+    folder = Path(__file__).parent
+    parts = [folder / "rasterize_gbuffer" / "tile_vector.h", folder / "ray_vector.h", folder / name]
+    return f"constexpr float MIN_ROUGHNESS = {MIN_ROUGHNESS}f;\n" + "".join(part.read_text() for part in parts)
+
+
+@wp.func_native(ray_source("scatter_hits.h"))
+def scatter_sixteen_hits(
+    base: int, path_count: int,
+    path_ray: wp.array(dtype=wp.int64), face: wp.array(dtype=int), barycentric: wp.array(dtype=wp.vec2), ray_direction: wp.array(dtype=wp.vec3),
+    throughput: wp.array(dtype=wp.vec3), first_point: int, depth: int,
+    points: PointArrays, light: EnvironmentLight, mesh: MeshArrays, samples: SampleSet,
+    origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), contribution: wp.array(dtype=wp.vec3),
+    next_throughput: wp.array(dtype=wp.vec3),
+): ...  # fmt: skip
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def scatter_hits_simd(
+    path_ray: wp.array[wp.int64],
+    face: wp.array[int],
+    barycentric: wp.array[wp.vec2],
+    ray_direction: wp.array[wp.vec3],
+    throughput: wp.array[wp.vec3],
+    first_point: int,
+    depth: int,
+    path_count: int,
+    points: PointArrays,
+    light: EnvironmentLight,
+    mesh: MeshArrays,
+    samples: SampleSet,
+    # outputs
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    contribution: wp.array[wp.vec3],
+    next_throughput: wp.array[wp.vec3],
+):
+    """scatter_hits for sixteen paths a launch index, on the CPU."""
+    scatter_sixteen_hits(
+        16 * wp.tid(), path_count, path_ray, face, barycentric, ray_direction, throughput, first_point, depth, points, light, mesh, samples,
+        origin, direction, contribution, next_throughput,
+    )  # fmt: skip
+
+
+def scatter_kernel(device: torch.device) -> Any:
+    """The one that trace_indirect launches there."""
+    return scatter_hits_simd if device.type == "cpu" else scatter_hits
+
+
 @wp.kernel
 def add_contributions(
     path_ray: wp.array[wp.int64],
@@ -257,8 +309,8 @@ def trace_indirect(
         origin, direction, contribution = (torch.empty(2 * paths, 3, device=device) for _ in range(3))
         next_throughput = torch.empty(paths, 3, device=device)
         wp.launch(
-            scatter_hits,
-            dim=paths,
+            scatter_kernel(device),
+            dim=-(-paths // 16) if device.type == "cpu" else paths,
             inputs=[
                 warp_array(path_ray), warp_array(face), warp_array(barycentric, wp.vec2), warp_array(arriving, wp.vec3),
                 warp_array(throughput, wp.vec3), first_point, depth, paths, points, light, mesh, samples,

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+import trimesh
 import warp as wp
 
 from drgs.maths.brdf import evaluate_brdf
@@ -12,11 +13,12 @@ from drgs.render.environment_table import build_environment_table, environment_l
 from drgs.render.records import ShadingPoints
 from drgs.render.sample_rays import SampleCounts, point_arrays, sample_set
 from drgs.render.shade import PointLight, RayStarts, shade, start_rays, start_rays_simd
+from drgs.render.trace_indirect import mesh_arrays, scatter_hits, scatter_hits_simd
 from drgs.render.trace_rays import build_tracer
 from drgs.scene.environment import Environment, direction_from_uv
 from drgs.scene.mesh import TriangleMesh
 from drgs.warp_torch import warp_array
-from tests.render.closed_form_scenes import constant_sky, on_device, points_seen_at, sphere_mesh, sunny_sky, two_spheres
+from tests.render.closed_form_scenes import constant_sky, mesh_of, on_device, points_seen_at, sphere_mesh, sunny_sky, two_spheres
 
 FAR_AWAY = sphere_mesh(subdivisions=1, radius=1e-3)
 """A mesh that occludes nothing that matters."""
@@ -234,3 +236,59 @@ def test_sixteen_rays_at_once_are_the_rays_one_by_one(by_material: bool, sky: En
     for a, b in zip(plain[2:], vector[2:], strict=True):
         error = (a - b)[live].abs() / (a[live].abs() + 1e-3 * a[live].abs().mean() + 1e-6)
         assert float(error.quantile(0.97)) < 5e-3
+
+
+@pytest.mark.parametrize("depth", [0, 1])
+@pytest.mark.parametrize("sky", [sunny_sky(sun=1e3), constant_sky(0.0)])
+def test_sixteen_paths_at_once_are_the_paths_one_by_one(depth: int, sky: Environment) -> None:
+    """Where paths go on from a hit: the hand-vectorised CPU kernel against the plain one, surfaces seen from behind included."""
+    mesh = crumpled_mesh()
+    paths = 16 * 40 - 5
+    numbers = torch.Generator().manual_seed(4)
+    face = torch.randint(len(mesh.faces), (paths,), generator=numbers, dtype=torch.int32)
+    barycentric = torch.rand(paths, 2, generator=numbers) * 0.5
+    normal = torch.nn.functional.normalize(mesh.vertices[mesh.faces[face.long()].long()].mean(1), dim=-1)
+    arriving = torch.nn.functional.normalize(-normal + 1.2 * torch.randn(paths, 3, generator=numbers), dim=-1)
+    throughput = torch.rand(paths, 3, generator=numbers)
+    counts, points = SampleCounts(7, 3, 5), points_seen_at([0.0, 45.0], roughness=0.3, metallic=0.4, copies=40)
+    path_ray = torch.sort(torch.randint((len(points.pixel) - 3) * counts.total, (paths,), generator=numbers)).values
+    light = environment_light(sky, build_environment_table(sky), rotation_degrees=70.0, intensity=2.0)
+    inputs = [
+        warp_array(path_ray), warp_array(face), warp_array(barycentric, wp.vec2), warp_array(arriving, wp.vec3),
+        warp_array(throughput, wp.vec3), 3, depth, paths, point_arrays(points), light,
+        mesh_arrays(mesh, 1e-4, 2 * torch.rand(len(mesh.faces), generator=numbers)), sample_set(counts, 11, 3, True),
+    ]  # fmt: skip
+    results = []
+    for kernel, dim in ((scatter_hits, paths), (scatter_hits_simd, -(-paths // 16))):
+        out = [torch.full((count, 3), -7.0) for count in (2 * paths, 2 * paths, 2 * paths, paths)]
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[warp_array(t, wp.vec3) for t in out], device="cpu")
+        results.append(out)
+    plain, vector = results
+    same = (plain[1] - vector[1]).norm(dim=-1) < 1e-3
+    assert float(same.float().mean()) > 0.99
+    turned = same & ((plain[1] - 0.57735).abs().amax(-1) > 1e-3)
+    assert 0.2 < float(turned.float().mean()) < 0.95
+    outside = vector[0][turned][:, 0].abs() > 1e14
+    assert 0.1 < float(outside.float().mean()) < 0.9
+    assert float((outside == (plain[0][turned][:, 0].abs() > 1e14)).float().mean()) > 0.995
+    near = plain[0][turned].abs().amax(-1) < 1e14
+    assert float((plain[0] - vector[0])[turned][near & ~outside].abs().max()) < 1e-5
+    for a, b, chosen in ((plain[2], vector[2], same), (plain[3], vector[3], same[paths:])):
+        error = (a - b)[chosen].abs() / (a[chosen].abs() + 1e-3 * a[chosen].abs().mean() + 1e-6)
+        assert float(error.quantile(0.97)) < 5e-3
+    assert (float(plain[2].abs().max()) > 0) == (float(sky.radiance.max()) > 0)
+
+
+def crumpled_mesh() -> TriangleMesh:
+    """A ball with bumps, its materials all different."""
+    shape = trimesh.creation.icosphere(2)
+    numbers = torch.Generator().manual_seed(3)
+    shape.vertices *= (1 + 0.2 * torch.rand(len(shape.vertices), 1, generator=numbers)).numpy()
+    mesh = mesh_of(shape, 0.7, 0.5, 0.0)
+    count = len(mesh.vertices)
+    albedo, roughness, metallic = (
+        torch.rand(count, 3, generator=numbers),
+        torch.rand(count, generator=numbers),
+        torch.rand(count, generator=numbers),
+    )
+    return TriangleMesh(mesh.vertices, mesh.faces, mesh.normals, albedo, roughness, metallic)

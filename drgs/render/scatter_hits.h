@@ -1,0 +1,135 @@
+// scatter_hits for 16 paths at once, CPU only. Body of a Warp native function; trace_indirect.py prepends ray_vector.h and what that needs.
+// The Warp kernel scatter_hits in trace_indirect.py says the same path by path; a test keeps both equal.
+//
+// in   base (first path of the group), path_count, path_ray, face, barycentric, ray_direction, throughput, first_point, depth,
+//      points, light, mesh, samples
+// out  origin, direction, contribution of light rays (paths base .. base + 15) and of BRDF rays (path_count further), next_throughput
+
+// 1. The surfaces that the group's paths met.
+const int count = samples.cosine + samples.ggx + samples.environment;
+const int lanes = min_int(16, path_count - base);
+const float* const positions = (const float*)mesh.vertices.data;
+const float* const normals = (const float*)mesh.normals.data;
+const float* const albedos = (const float*)mesh.albedo.data;
+alignas(64) float corner[3][11][16], given[9][16];
+alignas(64) unsigned pixel_lane[16], index_lane[16], strategy_lane[16];
+for (int lane = 0; lane < 16; ++lane) {
+    const int path = base + min_int(lane, lanes - 1), triangle = face.data[path];
+    for (int c = 0; c < 3; ++c) {
+        const long vertex = mesh.faces.data[3 * (long)triangle + c];
+        for (int k = 0; k < 3; ++k) {
+            corner[c][k][lane] = positions[3 * vertex + k];
+            corner[c][3 + k][lane] = normals[3 * vertex + k];
+            corner[c][6 + k][lane] = albedos[3 * vertex + k];
+        }
+        corner[c][9][lane] = mesh.roughness.data[vertex];
+        corner[c][10][lane] = mesh.metallic.data[vertex];
+    }
+    const float* const weights = (const float*)barycentric.data + 2 * (long)path;
+    given[0][lane] = weights[0];
+    given[1][lane] = weights[1];
+    for (int k = 0; k < 3; ++k) {
+        given[2 + k][lane] = ((const float*)ray_direction.data)[3 * (long)path + k];
+        given[5 + k][lane] = ((const float*)throughput.data)[3 * (long)path + k];
+    }
+    given[8][lane] = mesh.horizon.shape[0] > 0 ? mesh.horizon.data[triangle] : 2.0f;
+    const int ray = (int)path_ray.data[path], point = first_point + ray / count;
+    int split[3];
+    split_at(samples, points, point, split);
+    const int round = samples.round + (points.round.shape[0] > 0 ? points.round.data[point] : 0);
+    strategy_of(split, round, ray % count, strategy_lane[lane], index_lane[lane]);
+    pixel_lane[lane] = (unsigned)points.pixel.data[point];
+}
+const v16 second = load16(given[0]), third = load16(given[1]), one = 1.0f - second - third;
+const auto blend = [&](int k) -> v16 { return one * load16(corner[0][k]) + second * load16(corner[1][k]) + third * load16(corner[2][k]); };
+const auto edge = [&](int c) -> V3 {
+    return {load16(corner[c][0]) - load16(corner[0][0]), load16(corner[c][1]) - load16(corner[0][1]), load16(corner[c][2]) - load16(corner[0][2])};
+};
+const V3 position = {blend(0), blend(1), blend(2)}, n = unit3({blend(3), blend(4), blend(5)}), outward = unit3(cross3(edge(1), edge(2)));
+const v16 albedo[3] = {blend(6), blend(7), blend(8)}, metallic = blend(10), horizon = load16(given[8]);
+const V3 wo = {-load16(given[2]), -load16(given[3]), -load16(given[4])};
+const Lobes lobes = lobes_of(n, wo, blend(9));
+const i16 outside = (lobes.n_dot_v > 0.0f) & (dot3(outward, wo) > 0.0f);
+
+// 2. Numbers, of a stream for each depth.
+const u16 index = *(const u16*)index_lane;
+const u16 stream = hash_combine(hash_combine(u16(samples.seed), *(const u16*)pixel_lane), *(const u16*)strategy_lane);
+const auto numbers = [&](unsigned purpose, v16& u0, v16& u1) {
+    const u16 seed = hash_combine(stream, u16(purpose + 4u * (unsigned)depth));
+    sobol_pair(shuffle_index(index, seed), seed, u0, u1);
+};
+
+// 3. The lobe is chosen by its share of the reflected energy, Fresnel at the viewing angle.
+const v16 c = 1.0f - lobes.n_dot_v, c2 = c * c, fresnel = c2 * c2 * c;
+const v16 largest = max16(albedo[0], max16(albedo[1], albedo[2]));
+const v16 f0 = max16(0.04f * (1.0f - metallic) + largest * metallic, v16(1e-3f));
+const v16 mirrored = f0 + (1.0f - f0) * fresnel;
+const v16 share = min16(max16(mirrored / (mirrored + (1.0f - metallic) * largest), v16(0.1f)), v16(1.0f));
+
+// Throughput times BRDF times cosine of light from d, and the density of the BRDF's own samples there.
+const auto reflect = [&](V3 d, v16 n_dot_l, v16* reflected) -> v16 {
+    v16 pdf, dv, c5;
+    lobe_at(lobes, d, n_dot_l, pdf, dv, c5);
+    for (int k = 0; k < 3; ++k) {
+        const v16 base_reflectance = 0.04f * (1.0f - metallic) + albedo[k] * metallic;
+        const v16 diffuse = albedo[k] * ((1.0f - metallic) * (1.0f / PI));
+        reflected[k] = load16(given[5 + k]) * n_dot_l * (diffuse + dv * (base_reflectance * (1.0f - c5) + c5));
+    }
+    return share * pdf + (1.0f - share) * n_dot_l * (1.0f / PI);
+};
+const auto put = [&](long at, i16 live, V3 d, const v16* light_there, const v16* carried_on) {
+    alignas(64) float out[12][16];
+    alignas(64) int live_lane[16], traced_lane[16];
+    *(i16*)live_lane = live;
+    *(i16*)traced_lane = dot3(outward, d) <= horizon;
+    const V3 start = {position.x + mesh.lift * outward.x, position.y + mesh.lift * outward.y, position.z + mesh.lift * outward.z};
+    store16(out[0], start.x); store16(out[1], start.y); store16(out[2], start.z);
+    store16(out[3], d.x); store16(out[4], d.y); store16(out[5], d.z);
+    for (int k = 0; k < 3; ++k) {
+        store16(out[6 + k], light_there[k]);
+        if (carried_on != nullptr) store16(out[9 + k], carried_on[k]);
+    }
+    for (int lane = 0; lane < lanes; ++lane) {
+        for (int k = 0; k < 3; ++k) {
+            // Rays that are void or meet nothing for certain leave from far outside, away from the mesh.
+            const long place = 3 * (at + lane) + k;
+            const float along = live_lane[lane] != 0 ? out[3 + k][lane] : 0.57735027f;
+            ((float*)direction.data)[place] = along;
+            ((float*)origin.data)[place] = live_lane[lane] != 0 && traced_lane[lane] != 0 ? out[k][lane] : (along < 0.0f ? -1.0e15f : 1.0e15f);
+            ((float*)contribution.data)[place] = live_lane[lane] != 0 ? out[6 + k][lane] : 0.0f;
+            if (carried_on != nullptr) ((float*)next_throughput.data)[place - 3 * (long)path_count] = live_lane[lane] != 0 ? out[9 + k][lane] : 0.0f;
+        }
+    }
+};
+
+// 4. Towards the environment.
+v16 u0, u1, reflected[3], incoming[3];
+numbers(16u, u0, u1);
+V3 d = draw_environment(light, outside, u0, u1);
+v16 n_dot_l = dot3(n, d);
+i16 live = outside & (n_dot_l > 0.0f) & (dot3(outward, d) > 0.0f);
+v16 table_pdf = look_up(light, d, live, incoming);
+v16 density = reflect(d, n_dot_l, reflected) + table_pdf;
+live &= density > 0.0f;
+for (int k = 0; k < 3; ++k) incoming[k] *= reflected[k] / max16(density, v16(1e-37f));
+put(base, live, d, incoming, nullptr);
+
+// 5. Along one of the lobes, and on.
+v16 which, chance;
+numbers(18u, which, chance);
+numbers(17u, u0, u1);
+d = unit3(lobe_direction(lobes, u0, u1, which >= share));
+n_dot_l = dot3(n, d);
+live = outside & (n_dot_l > 0.0f) & (dot3(outward, d) > 0.0f);
+table_pdf = look_up(light, d, live, incoming);
+const v16 own = reflect(d, n_dot_l, reflected);
+live &= own > 0.0f;
+v16 onward[3], survival = v16(1.0f);
+if (depth > 0) {
+    survival = min16(max16(max16(reflected[0], max16(reflected[1], reflected[2])) / max16(own, v16(1e-37f)), v16(0.05f)), v16(1.0f));
+}
+for (int k = 0; k < 3; ++k) {
+    incoming[k] *= reflected[k] / max16(own + table_pdf, v16(1e-37f));
+    onward[k] = select(chance < survival, reflected[k] / max16(own * survival, v16(1e-37f)), v16(0.0f));
+}
+put((long)path_count + base, live, d, incoming, onward);
