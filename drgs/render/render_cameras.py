@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 
 from drgs.exchange.exr import encode_maps
+from drgs.render.denoise_oidn import oidn_filter
 from drgs.render.records import Frame
 from drgs.render.render_frame import RenderSettings, render_frame
 from drgs.render.trace_rays import build_tracer
@@ -29,7 +30,12 @@ def render_cameras(
 
     Returns:
         For each camera its name and the frame's metadata (samples, seconds per step, what was skipped and why).
+
+    Raises:
+        ValueError: the denoiser oidn is asked for and not installed.
     """
+    if settings.denoise == "oidn":
+        oidn_filter()  # complain before the first ray
     out.mkdir(parents=True, exist_ok=True)
     device = scene.mesh.vertices.device
     tracer = build_tracer(scene.mesh)

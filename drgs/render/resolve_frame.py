@@ -12,6 +12,7 @@ from torch import Tensor
 
 from drgs.render.converge import mean_variance, tile_errors
 from drgs.render.denoise import denoise
+from drgs.render.denoise_oidn import denoise_oidn
 from drgs.render.frame_state import FrameState, samples_a_pass
 from drgs.render.image_tiles import Window, spread_over_pixels, tile_grid
 from drgs.render.records import Frame, GBuffer, Radiance
@@ -28,7 +29,10 @@ def resolve_frame(state: FrameState) -> Frame:
     window, part = state.window, window_gbuffer(state)
     radiance = _blended(state)
     seconds = dict(state.seconds)
-    shown = denoise(radiance, part, window.camera(state.camera), settings.denoise)
+    if settings.denoise == "oidn":
+        shown = denoise_oidn(radiance, part)
+    else:
+        shown = denoise(radiance, part, window.camera(state.camera), settings.denoise)
     seconds["denoise"] = time.perf_counter() - clock
     background = _background(state)
     linear = window.pad(shown.diffuse + shown.specular)
