@@ -28,7 +28,19 @@ from websockets.sync.client import ClientConnection, connect
 
 from drgs.scene.edits import Edit
 from server.messages import EditLog, FrameHeader, ServerHello, Settings, server_message, unpack_frame
-from server.rest_records import AssetInfo, AssetList, EnvironmentInfo, EnvironmentList, JobInfo, JobList, SessionInfo, SessionList
+from server.rest_records import (
+    AssetInfo,
+    AssetList,
+    EnvironmentInfo,
+    EnvironmentList,
+    JobFile,
+    JobFileList,
+    JobInfo,
+    JobList,
+    SessionInfo,
+    SessionList,
+)
+from worker.requests import ExportRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 
 Model = TypeVar("Model", bound=BaseModel)
 Preset = Literal["draft", "fast", "full"]
@@ -92,6 +104,31 @@ class Client:
             upload = {"file": (path.stem + ".zip", file, "application/zip")}
             return self._call("POST", "/api/jobs", JobInfo, data=fields, files=upload, headers=headers)
 
+    def submit(
+        self,
+        request: RedecoupleRequest | SimulateRequest | RenderRequest | ExportRequest | dict,
+        idempotency_key: str | None = None,
+    ) -> JobInfo:
+        """Start a job on an asset (worker/requests.py, or the same as plain data)."""
+        headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
+        body = request if isinstance(request, dict) else request.model_dump(mode="json", exclude_none=True)
+        return self._call("POST", "/api/jobs", JobInfo, json=body, headers=headers)
+
+    def job_files(self, job_id: str) -> list[JobFile]:
+        """What a render or an export has made."""
+        return self._call("GET", f"/api/jobs/{job_id}/files", JobFileList).files
+
+    def download_file(self, job_id: str, name: str, out: Path) -> None:
+        """Write one of a job's files to `out`."""
+        self._download(f"/api/jobs/{job_id}/files/{name}", out)
+
+    def job_log(self, job_id: str) -> str:
+        """When each step started and finished, a line each."""
+        return self._bytes(f"/api/jobs/{job_id}/log").decode()
+
+    def delete_job(self, job_id: str) -> None:
+        self._request("DELETE", f"/api/jobs/{job_id}")
+
     def jobs(self, limit: int = 50, offset: int = 0) -> JobList:
         return self._call("GET", "/api/jobs", JobList, params={"limit": limit, "offset": offset})
 
@@ -145,13 +182,7 @@ class Client:
 
     def export(self, asset_id: str, format: Literal["ply", "ply3", "glb", "usd", "env", "zip"], out: Path) -> None:
         """Write the asset to the file `out`, in another program's format."""
-        with self._http.stream("GET", f"/api/assets/{asset_id}/export", params={"format": format}, timeout=600) as response:
-            if response.is_error:
-                response.read()
-                raise _error(response)
-            with out.open("wb") as file:
-                for chunk in response.iter_bytes():
-                    file.write(chunk)
+        self._download(f"/api/assets/{asset_id}/export", out, params={"format": format})
 
     def environments(self) -> list[EnvironmentInfo]:
         return self._call("GET", "/api/environments", EnvironmentList).environments
@@ -184,6 +215,15 @@ class Client:
 
     def _bytes(self, path: str, **options: Any) -> bytes:
         return self._request("GET", path, **options).content
+
+    def _download(self, path: str, out: Path, **options: Any) -> None:
+        with self._http.stream("GET", path, timeout=600, **options) as response:
+            if response.is_error:
+                response.read()
+                raise _error(response)
+            with out.open("wb") as file:
+                for chunk in response.iter_bytes():
+                    file.write(chunk)
 
     def _upload(self, path: str, file: Path, name: str | None, model: type[Model]) -> Model:
         with file.open("rb") as stream:

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from server.rest_records import AssetInfo, JobInfo, SessionInfo
+from drgs.scene.edits import parse_edits
+from server.rest_records import AssetInfo, JobInfo, SessionInfo, SnapshotInfo
 from server.sessions import LiveSession
-from worker.database import AssetRow, JobRow
+from worker.database import AssetRow, JobRow, SnapshotRow
 from worker.queue import JobStatus
 
 
@@ -25,9 +26,10 @@ def job_info(row: JobRow, status: JobStatus) -> JobInfo:
         )
     return JobInfo(
         id=row.id,
-        kind="build",
+        kind=row.kind,  # type: ignore[arg-type]
         name=row.name,
         preset=row.preset,
+        priority=row.priority,
         state=status.state,  # type: ignore[arg-type]
         created_at=_time(row.created_at),
         finished_at=_time(row.finished_at) if row.finished_at is not None else None,
@@ -40,6 +42,8 @@ def job_info(row: JobRow, status: JobStatus) -> JobInfo:
         message=row.message,
         attempts=row.attempts,
         asset_id=row.asset_id if status.state == "done" else None,
+        source_asset=row.parameters.get("asset"),
+        clip=f"clips/{row.id}" if row.kind == "simulate" and status.state == "done" else None,
         error=error if status.state == "failed" else None,
         preview_version=row.preview_version,
     )
@@ -60,7 +64,15 @@ def asset_info(row: AssetRow, folder: Path) -> AssetInfo:
         vertex_count=row.vertex_count,
         face_count=row.face_count,
         has_thumbnail=(folder / "thumb.jpg").is_file(),
+        version=row.version,
+        parent_id=row.parent_id,
+        edits=parse_edits(row.edits),
+        deleted_at=_time(row.deleted_at) if row.deleted_at is not None else None,
     )
+
+
+def snapshot_info(row: SnapshotRow) -> SnapshotInfo:
+    return SnapshotInfo(name=row.name, created_at=_time(row.created_at), revision=row.revision, edits=parse_edits(row.edits))
 
 
 def session_info(session: LiveSession) -> SessionInfo:

@@ -31,6 +31,8 @@ from worker.queue import JobQueue
 
 LIVENESS_SECONDS = 5.0
 """Between two looks for jobs of dead workers."""
+REMOVAL_SECONDS = 600.0
+"""Between two looks for assets whose deletion can no longer be undone."""
 UPLOAD_PATHS = ("/api/jobs", "/api/assets", "/api/environments")
 
 
@@ -72,12 +74,14 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         thread.start()
-        watch = asyncio.create_task(_requeue_dead_workers_jobs(context.queue))
+        chores = [asyncio.create_task(_requeue_dead_workers_jobs(context.queue)), asyncio.create_task(_remove_deleted_assets(context))]
         yield
-        watch.cancel()
-        with suppress(asyncio.CancelledError):
-            await watch
+        for chore in chores:
+            chore.cancel()
+            with suppress(asyncio.CancelledError):
+                await chore
         await asyncio.to_thread(thread.stop)
+        context.sessions.close()
         context.queue.close()
         engine.dispose()
 
@@ -111,6 +115,12 @@ async def _requeue_dead_workers_jobs(queue: JobQueue) -> None:
         moved = await asyncio.to_thread(queue.requeue_dead)
         if moved:
             logging.getLogger(__name__).warning("handed over %d jobs of dead workers", len(moved))
+
+
+async def _remove_deleted_assets(context: ServerContext) -> None:
+    while True:
+        await asyncio.to_thread(routes_assets.remove_deleted_assets, context)
+        await asyncio.sleep(REMOVAL_SECONDS)
 
 
 def _add_small_routes(app: FastAPI, context: ServerContext) -> None:

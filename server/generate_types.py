@@ -37,19 +37,27 @@ _CONSTANTS = (
 
 _REQUESTS: tuple[type[BaseModel], ...] = (
     rest_records.BuildRequest,
+    rest_records.RedecoupleRequest,
+    rest_records.SimulateRequest,
+    rest_records.RenderRequest,
+    rest_records.ExportRequest,
     rest_records.SessionRequest,
     rest_records.EditRequest,
+    rest_records.SaveRequest,
     rest_records.TokenRequest,
 )
 _ANSWERS: tuple[type[BaseModel], ...] = (
     rest_records.JobInfo,
     rest_records.JobList,
+    rest_records.JobFileList,
     rest_records.AssetInfo,
     rest_records.AssetList,
     rest_records.EnvironmentInfo,
     rest_records.EnvironmentList,
     rest_records.SessionInfo,
     rest_records.SessionList,
+    rest_records.SnapshotInfo,
+    rest_records.SnapshotList,
     rest_records.Problem,
 )
 

@@ -33,6 +33,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Row = tuple[Finite, Finite, Finite, Finite]
 Vector = tuple[Finite, Finite, Finite]
 Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
+ClientKey = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class _Message(BaseModel):
@@ -95,16 +96,23 @@ class EditMessage(_Message):
     edit: Edit
     coalesce: Annotated[str, Field(max_length=100)] | None = None
     """Edits of one slider drag share a key: an edit replaces the last one when keys match and they are < 500 ms apart."""
+    key: ClientKey | None = None
+    """Unique in the session, and the same when the client sends this edit again because it lost the connection before the answer: it is
+    then answered as before and not applied twice."""
 
 
 class UndoMessage(_Message):
     type: Literal["undo"]
     id: Number
+    key: ClientKey | None = None
+    """As of an edit."""
 
 
 class RedoMessage(_Message):
     type: Literal["redo"]
     id: Number
+    key: ClientKey | None = None
+    """As of an edit."""
 
 
 class AckMessage(_Message):

@@ -1,4 +1,5 @@
-"""Bodies of the REST interface. `generate_types.py` writes them to TypeScript beside the stream's messages."""
+"""Bodies of the REST interface, but for what jobs are asked for (worker/requests.py). `generate_types.py` writes them to TypeScript
+beside the stream's messages."""
 
 from datetime import datetime
 from typing import Annotated, Literal
@@ -6,6 +7,16 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from drgs.scene.edits import Edit
+from worker.requests import (
+    BuildRequest,
+    ExportRequest,
+    JobKind,
+    RedecoupleRequest,
+    RenderRequest,
+    SimulateRequest,
+)
+
+__all__ = ["BuildRequest", "ExportRequest", "RedecoupleRequest", "RenderRequest", "SimulateRequest"]
 
 JobState = Literal["queued", "running", "stalled", "done", "failed", "cancelled", "unknown"]
 """stalled: its worker died and no other took it over yet. unknown: the queue has never heard of it, which is not done."""
@@ -15,22 +26,14 @@ class _Body(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
 
-class BuildRequest(_Body):
-    """A build of a capture that the server can already see. A zip is uploaded as multipart instead, with the same fields."""
-
-    dataset: Annotated[str, Field(max_length=1000)]
-    """`sample` for the bundled capture, or a folder below a root that was allowed when the server started."""
-    name: Annotated[str, Field(max_length=100)] | None = None
-    """Of the asset; the folder's name when absent."""
-    preset: Literal["draft", "fast", "full"] = "fast"
-    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
-
-
 class JobInfo(_Body):
     id: str
-    kind: Literal["build"]
+    kind: JobKind
     name: str
     preset: str
+    """Empty where the kind has none."""
+    priority: int
+    """Lower runs first."""
     state: JobState
     created_at: datetime
     finished_at: datetime | None
@@ -46,7 +49,11 @@ class JobInfo(_Body):
     attempts: int
     """How often the work was started: 1 unless a worker died or it was retried."""
     asset_id: str | None
-    """Set when done."""
+    """What a build or a re-decoupling made; set when done."""
+    source_asset: str | None
+    """What a job of another kind than `build` works on."""
+    clip: str | None
+    """What a `pose` edit names to show a simulation; set when done."""
     error: str | None
     """A sentence, when failed."""
     preview_version: int
@@ -58,6 +65,17 @@ class JobList(_Body):
     """Newest first."""
     total: int
     workers_alive: int
+
+
+class JobFile(_Body):
+    name: str
+    bytes: int
+    media_type: str
+
+
+class JobFileList(_Body):
+    files: list[JobFile]
+    """By name; complete once the job is done."""
 
 
 class AssetInfo(_Body):
@@ -72,6 +90,14 @@ class AssetInfo(_Body):
     vertex_count: int
     face_count: int
     has_thumbnail: bool
+    version: int
+    """1, or one more than the parent's."""
+    parent_id: str | None
+    """The version that this one was made of."""
+    edits: list[Edit]
+    """What was done to the parent."""
+    deleted_at: datetime | None
+    """Since when it can be brought back, for a while."""
 
 
 class AssetList(_Body):
@@ -114,6 +140,24 @@ class SessionList(_Body):
 
 class EditRequest(_Body):
     edit: Edit
+
+
+class SnapshotInfo(_Body):
+    name: str
+    created_at: datetime
+    revision: int
+    """Of the log when it was taken."""
+    edits: list[Edit]
+
+
+class SnapshotList(_Body):
+    snapshots: list[SnapshotInfo]
+    """Oldest first."""
+
+
+class SaveRequest(_Body):
+    name: Annotated[str, Field(max_length=100)] | None = None
+    """Of the new version; the asset's name when absent."""
 
 
 class TokenRequest(_Body):

@@ -1,5 +1,6 @@
 """REST: assets and environments."""
 
+import json
 import shutil
 import tempfile
 import uuid
@@ -17,10 +18,12 @@ from server.answers import asset_info
 from server.context import ServerContext, context_of
 from server.problems import ProblemError
 from server.rest_records import AssetInfo, AssetList, EnvironmentInfo, EnvironmentList
+from server.sessions import LiveSession
 from server.uploads import receive_upload
-from worker.asset_folder import count_asset_folder, folder_bytes
-from worker.database import AssetRow, SessionEventRow, SessionRow, now
+from worker.database import AssetRow, SessionEventRow, SessionRow, SnapshotRow, now
 from worker.file_tool import FileToolError, run_file_tool
+from worker.register_asset import register_asset
+from worker.save_version import plain_edit
 
 router = APIRouter(prefix="/api", tags=["assets"])
 
@@ -31,12 +34,24 @@ _EXPORT_SUFFIXES = {"ply": ".ply", "ply3": ".ply", "glb": ".glb", "usd": ".usda"
 
 @router.get("/assets")
 def list_assets(
-    context: Context, limit: Annotated[int, Query(ge=1, le=500)] = 50, offset: Annotated[int, Query(ge=0, le=1_000_000)] = 0
+    context: Context,
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    offset: Annotated[int, Query(ge=0, le=1_000_000)] = 0,
+    search: Annotated[str | None, Query(max_length=100)] = None,
+    deleted: bool = False,
 ) -> AssetList:
-    """Newest first."""
+    """Newest first.
+
+    Args:
+        search: part of the name, whatever its case.
+        deleted: those that wait to be removed, instead.
+    """
+    which = select(AssetRow).where(AssetRow.deleted_at.is_not(None) if deleted else AssetRow.deleted_at.is_(None))
+    if search:
+        which = which.where(AssetRow.name.icontains(search, autoescape=True))
     with Session(context.engine) as session:
-        rows = session.scalars(select(AssetRow).order_by(AssetRow.created_at.desc()).limit(limit).offset(offset)).all()
-        total = session.scalar(select(func.count()).select_from(AssetRow)) or 0
+        rows = session.scalars(which.order_by(AssetRow.created_at.desc(), AssetRow.id).limit(limit).offset(offset)).all()
+        total = session.scalar(select(func.count()).select_from(which.subquery())) or 0
     return AssetList(assets=[asset_info(row, context.directory.asset(row.id)) for row in rows], total=total)
 
 
@@ -70,29 +85,39 @@ async def _run_tool(*arguments: str) -> None:
         raise ProblemError(422, sentence) from error
 
 
-def _register(context: ServerContext, asset_id: str, name: str, draft: Path) -> AssetInfo:
-    counts, size = count_asset_folder(draft), folder_bytes(draft)
+def _register(
+    context: ServerContext, asset_id: str, name: str, draft: Path, parent: AssetRow | None = None, edits: list[dict] | None = None
+) -> AssetInfo:
     place = context.directory.asset(asset_id)
     draft.rename(place)
-    row = AssetRow(
-        id=asset_id,
-        name=name,
-        created_at=now(),
-        source="upload",
-        bytes=size,
-        surfel_count=counts.surfels,
-        vertex_count=counts.vertices,
-        face_count=counts.faces,
-    )
-    with Session(context.engine, expire_on_commit=False) as session, session.begin():
-        session.add(row)
+    try:
+        row = register_asset(context.engine, asset_id, name, "session" if parent else "upload", place, parent, edits)
+    except BaseException:
+        shutil.rmtree(place, ignore_errors=True)
+        raise
     return asset_info(row, place)
 
 
-def _read_row(context: ServerContext, asset_id: str) -> AssetRow:
+async def save_version(context: ServerContext, session: LiveSession, name: str | None) -> AssetInfo:
+    """A new asset: the session's own with the edits in force put into it. What was there stays as it is, whatever happens.
+
+    Raises:
+        ProblemError: the edits no longer apply, or the disk is full.
+    """
+    parent = await run_in_threadpool(_read_row, context, session.asset_id)
+    edits = [plain_edit(edit) for edit in session.log.done]
+    with tempfile.TemporaryDirectory(prefix=".version-", dir=context.directory.uploads) as folder:
+        listed, draft = Path(folder) / "edits.json", Path(folder) / "asset"
+        listed.write_text(json.dumps(edits))
+        source, environments = context.directory.asset(parent.id), context.directory.environments
+        await _run_tool("version", str(source), str(draft), str(listed), str(environments), str(parent.version + 1))
+        return await run_in_threadpool(_register, context, uuid.uuid4().hex, name or parent.name, draft, parent, edits)
+
+
+def _read_row(context: ServerContext, asset_id: str, deleted: bool = False) -> AssetRow:
     with Session(context.engine) as session:
         row = session.get(AssetRow, asset_id)
-    if row is None:
+    if row is None or (row.deleted_at is not None and not deleted):
         raise ProblemError(404, f"No asset has the id {asset_id[:64]!r}.")
     return row
 
@@ -149,21 +174,40 @@ async def export_asset(asset_id: str, format: ExportFormat, context: Context) ->
 
 @router.delete("/assets/{asset_id}", status_code=204)
 async def delete_asset(asset_id: str, context: Context) -> None:
-    """Deletes the asset and its sessions."""
+    """Hides the asset and its sessions at once, and removes them after a day; until then `undelete` brings them back."""
     await run_in_threadpool(_read_row, context, asset_id)
     if context.sessions.uses(asset_id):
         raise ProblemError(409, "Somebody is looking at this asset; close the viewer first.")
     context.sessions.forget_asset(asset_id)
+    await run_in_threadpool(_mark_deleted, context, asset_id, now())
 
-    def forget() -> None:
-        sessions = select(SessionRow.id).where(SessionRow.asset_id == asset_id)
-        with Session(context.engine) as session, session.begin():
-            session.execute(delete(SessionEventRow).where(SessionEventRow.session_id.in_(sessions)))
-            session.execute(delete(SessionRow).where(SessionRow.asset_id == asset_id))
-            session.execute(delete(AssetRow).where(AssetRow.id == asset_id))
+
+@router.post("/assets/{asset_id}/undelete")
+def undelete_asset(asset_id: str, context: Context) -> AssetInfo:
+    """Brings a deleted asset back."""
+    _read_row(context, asset_id, deleted=True)
+    _mark_deleted(context, asset_id, None)
+    return read_asset(asset_id, context)
+
+
+def _mark_deleted(context: ServerContext, asset_id: str, at: float | None) -> None:
+    with Session(context.engine) as session, session.begin():
+        session.get_one(AssetRow, asset_id).deleted_at = at
+
+
+def remove_deleted_assets(context: ServerContext) -> int:
+    """Remove for good what was deleted long enough ago, with its sessions. Returns how many."""
+    before = now() - context.settings.limits.undo_delete_seconds
+    with Session(context.engine) as session, session.begin():
+        gone = list(session.scalars(select(AssetRow.id).where(AssetRow.deleted_at < before)))
+        sessions = select(SessionRow.id).where(SessionRow.asset_id.in_(gone))
+        for table in (SessionEventRow, SnapshotRow):
+            session.execute(delete(table).where(table.session_id.in_(sessions)))
+        session.execute(delete(SessionRow).where(SessionRow.asset_id.in_(gone)))
+        session.execute(delete(AssetRow).where(AssetRow.id.in_(gone)))
+    for asset_id in gone:
         shutil.rmtree(context.directory.asset(asset_id), ignore_errors=True)
-
-    await run_in_threadpool(forget)
+    return len(gone)
 
 
 @router.get("/environments", tags=["environments"])

@@ -1,14 +1,17 @@
-"""REST: builds."""
+"""REST: jobs of every kind, and what they made."""
 
+import json
+import mimetypes
+import re
 import shutil
 import uuid
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import ValidationError
-from sqlalchemy import func, select
+from sqlalchemy import delete, func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
@@ -16,21 +19,57 @@ from starlette.concurrency import run_in_threadpool
 from server.answers import job_info, job_infos
 from server.context import ServerContext, context_of
 from server.problems import ProblemError
-from server.rest_records import BuildRequest, JobInfo, JobList
+from server.rest_records import BuildRequest, JobFile, JobFileList, JobInfo, JobList
 from server.uploads import receive_upload
 from server.zip_guard import single_folder, unpack_zip
-from worker.database import JobRow, now
+from worker.database import AssetRow, JobRow, now
 from worker.queue import JobNotInState
+from worker.requests import JOB_REQUESTS, OWN_LIGHT, JobRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 
 router = APIRouter(prefix="/api/jobs", tags=["jobs"])
 
 Context = Annotated[ServerContext, Depends(context_of)]
 IdempotencyKey = Annotated[str | None, Header(max_length=200)]
 
-_BODY = {
+_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,250}")
+_EXAMPLES: dict[str, dict] = {
+    "build": {"kind": "build", "dataset": "sample", "preset": "draft"},
+    "redecouple": {"kind": "redecouple", "asset": "0" * 32, "preset": "full"},
+    "simulate": {"kind": "simulate", "asset": "0" * 32, "scene": {"matter": {"preset": "jelly"}, "duration": 2}},
+    "render": {
+        "kind": "render",
+        "asset": "0" * 32,
+        "turntable": {"frames": 48},
+        "environments": ["studio.exr", "own"],
+        "variants": [{"name": "rough", "edits": [{"op": "material", "select": {"all": True}, "set": {"roughness": 0.8}}]}],
+        "video_fps": 24,
+    },
+    "export": {"kind": "export", "asset": "0" * 32, "formats": ["glb", "ply"]},
+}
+
+
+def _self_contained(schema: dict) -> dict:
+    """A JSON schema with its definitions written out where they are used, since OpenAPI has another place for them."""
+    definitions = schema.pop("$defs", {})
+
+    def written_out(node: Any) -> Any:
+        if isinstance(node, dict):
+            if "$ref" in node:
+                return written_out(definitions[node["$ref"].rsplit("/", 1)[1]])
+            return {key: written_out(value) for key, value in node.items() if key != "discriminator"}
+        return [written_out(value) for value in node] if isinstance(node, list) else node
+
+    return written_out(schema)
+
+
+_BODY: dict[str, Any] = {
     "requestBody": {
+        "required": True,
         "content": {
-            "application/json": {"schema": BuildRequest.model_json_schema(), "example": {"dataset": "sample", "preset": "draft"}},
+            "application/json": {
+                "schema": {"oneOf": [_self_contained(request.model_json_schema()) for request in JOB_REQUESTS.values()]},
+                "examples": {kind: {"value": value} for kind, value in _EXAMPLES.items()},
+            },
             "multipart/form-data": {
                 "schema": {
                     "type": "object",
@@ -43,14 +82,15 @@ _BODY = {
                     },
                 }
             },
-        }
+        },
     }
 }
 
 
 @router.post("", status_code=202, openapi_extra=_BODY)
 async def start_job(request: Request, context: Context, idempotency_key: IdempotencyKey = None) -> JobInfo:
-    """Build an asset from a capture: a zip (multipart), the bundled sample, or a folder below an allowed root."""
+    """Build an asset from a capture (a zip as multipart, the bundled sample, or a folder below an allowed root); re-decouple, simulate,
+    render or export one. Without `kind` it is a build. The same Idempotency-Key gives the same job, whatever else the request says."""
     known = await run_in_threadpool(_job_of_key, context, idempotency_key)
     if known is not None:
         return await run_in_threadpool(_read_job, context, known)
@@ -58,23 +98,11 @@ async def start_job(request: Request, context: Context, idempotency_key: Idempot
         raise ProblemError(429, f"{context.settings.limits.active_jobs} jobs wait or run already; try again when one is over.")
     job_id = uuid.uuid4().hex
     if request.headers.get("content-type", "").startswith("multipart/form-data"):
-        asked, folder = await _receive_capture(request, context, job_id)
+        build, folder = await _receive_capture(request, context, job_id)
+        row = _build_row(job_id, build, folder)
     else:
-        try:
-            asked = BuildRequest.model_validate_json(await request.body())
-        except ValidationError as error:
-            raise _invalid(error) from error
-        folder = await run_in_threadpool(_find_capture, context, asked.dataset)
-    row = JobRow(
-        id=job_id,
-        kind="build",
-        name=asked.name or (folder.name if asked.dataset != "sample" else "Sample"),
-        dataset=str(folder),
-        preset=asked.preset,
-        seed=asked.seed,
-        idempotency_key=idempotency_key,
-        created_at=now(),
-    )
+        row = await run_in_threadpool(_row_of, context, job_id, _parse_request(await request.body()))
+    row.idempotency_key = idempotency_key
     try:
         await run_in_threadpool(context.queue.submit, row)
     except IntegrityError:  # the same key, a moment earlier
@@ -82,6 +110,80 @@ async def start_job(request: Request, context: Context, idempotency_key: Idempot
         known = await run_in_threadpool(_job_of_key, context, idempotency_key)
         job_id = known or job_id
     return await run_in_threadpool(_read_job, context, job_id)
+
+
+def _parse_request(body: bytes) -> JobRequest:
+    try:
+        document = json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise ProblemError(422, f"body: expected a JSON object; {error}") from error
+    kind = document.get("kind", "build") if isinstance(document, dict) else "build"
+    if kind not in JOB_REQUESTS:
+        raise ProblemError(422, f"kind: expected one of {', '.join(JOB_REQUESTS)}; found {str(kind)[:40]!r}")
+    try:
+        return JOB_REQUESTS[kind].model_validate_json(body)
+    except ValidationError as error:
+        raise _invalid(error) from error
+
+
+def _build_row(job_id: str, asked: BuildRequest, folder: Path) -> JobRow:
+    row = _plain_row(job_id, asked, asked.name or (folder.name if asked.dataset != "sample" else "Sample"))
+    row.dataset, row.preset, row.seed = str(folder), asked.preset, asked.seed
+    return row
+
+
+def _plain_row(job_id: str, asked: JobRequest, name: str) -> JobRow:
+    parameters = asked.model_dump(mode="json", exclude_none=True)
+    return JobRow(
+        id=job_id,
+        kind=asked.kind,
+        name=name,
+        dataset="",
+        preset="",
+        seed=0,
+        parameters=parameters,
+        priority=asked.priority,
+        created_at=now(),
+    )
+
+
+def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
+    """The job of a request that was not an upload, with all that it names looked up."""
+    if isinstance(asked, BuildRequest):
+        return _build_row(job_id, asked, _find_capture(context, asked.dataset))
+    with Session(context.engine) as session:
+        asset = session.get(AssetRow, asked.asset)
+        built = session.get(JobRow, asked.asset)
+    if asset is None or asset.deleted_at is not None:
+        raise ProblemError(404, f"No asset has the id {asked.asset[:64]!r}.")
+    row = _plain_row(job_id, asked, asked.name or asset.name)
+    if isinstance(asked, RedecoupleRequest):
+        if built is None:
+            raise ProblemError(409, "Only an asset that was built here can be re-decoupled, since that needs its capture and geometry.")
+        row.dataset, row.preset, row.seed = built.dataset, asked.preset, built.seed
+        built_preset = built.parameters.get("built_preset", built.preset)
+        row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed}
+    elif isinstance(asked, SimulateRequest):
+        from drgs.deform.simulation_scene import parse_simulation_scene
+
+        try:
+            parse_simulation_scene(asked.scene)
+        except ValueError as error:
+            raise ProblemError(422, str(error)) from error
+    elif isinstance(asked, RenderRequest):
+        _check_render(context, asked)
+    return row
+
+
+def _check_render(context: ServerContext, asked: RenderRequest) -> None:
+    for name in asked.environments:
+        if name != OWN_LIGHT and not context.environments.has(name):
+            raise ProblemError(422, f"No environment is called {name!r}; GET /api/environments lists them.")
+    for variant in asked.variants:
+        for edit in variant.edits:
+            context.sessions.check_edit(edit)
+    if asked.clip is not None and not (context.directory.environments / asked.clip / "clip.json").is_file():
+        raise ProblemError(422, f"There is no clip {asked.clip}; a simulate job that is done names its clip.")
 
 
 async def _receive_capture(request: Request, context: ServerContext, job_id: str) -> tuple[BuildRequest, Path]:
@@ -162,6 +264,48 @@ def read_preview(job_id: str, context: Context) -> FileResponse:
     if not path.is_file():
         raise ProblemError(404, "This job has no preview yet.")
     return FileResponse(path, media_type="image/jpeg")
+
+
+@router.get("/{job_id}/log")
+def read_log(job_id: str, context: Context) -> PlainTextResponse:
+    """When each step started and finished, a line each."""
+    path = context.directory.job_log(_read_row(context, job_id).id)
+    return PlainTextResponse(path.read_text() if path.is_file() else "")
+
+
+@router.get("/{job_id}/files")
+def list_files(job_id: str, context: Context) -> JobFileList:
+    """What a render or an export has made so far."""
+    folder = context.directory.job_files(_read_row(context, job_id).id)
+    found = sorted(path for path in folder.iterdir() if path.suffix != ".part") if folder.is_dir() else []
+    found = [path for path in found if not path.name.startswith("draft-")]
+    return JobFileList(files=[JobFile(name=path.name, bytes=path.stat().st_size, media_type=_media_type(path.name)) for path in found])
+
+
+@router.get("/{job_id}/files/{name}")
+def read_file(job_id: str, name: str, context: Context) -> FileResponse:
+    """One of them; ranges are answered."""
+    folder = context.directory.job_files(_read_row(context, job_id).id)
+    if not _FILE_NAME.fullmatch(name) or not (folder / name).is_file():
+        raise ProblemError(404, f"This job has no file {name[:100]!r}.")
+    return FileResponse(folder / name, media_type=_media_type(name), filename=name)
+
+
+def _media_type(name: str) -> str:
+    return mimetypes.guess_type(name)[0] or "application/octet-stream"
+
+
+@router.delete("/{job_id}", status_code=204)
+def delete_job(job_id: str, context: Context) -> None:
+    """Forgets a job that is over, with its files, clip, capture and checkpoint; an asset that it made stays."""
+    row = _read_row(context, job_id)
+    state = context.queue.statuses([job_id])[job_id].state
+    if state not in ("done", "failed", "cancelled", "unknown"):
+        raise ProblemError(409, f"This job is {state}; cancel it first.")
+    with Session(context.engine) as session, session.begin():
+        session.execute(delete(JobRow).where(JobRow.id == row.id))
+    for folder in (context.directory.job(row.id), context.directory.clip(row.id), context.directory.uploads / row.id):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @router.post("/{job_id}/cancel")

@@ -3,21 +3,37 @@
 import asyncio
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Query
+from fastapi import APIRouter, Depends, Header, Query
+from fastapi import Path as PathParameter
 from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from server.answers import session_info
+from drgs.scene.edits import Edit
+from server.answers import session_info, snapshot_info
 from server.context import ServerContext, context_of
+from server.edit_log import EventKind
 from server.encode import encode_jpeg, encode_png
 from server.messages import CameraMessage, EditLog, Settings
 from server.problems import ProblemError
 from server.render_session import Pixels
-from server.rest_records import EditRequest, SessionInfo, SessionList, SessionRequest
+from server.rest_records import (
+    AssetInfo,
+    EditRequest,
+    SaveRequest,
+    SessionInfo,
+    SessionList,
+    SessionRequest,
+    SnapshotInfo,
+    SnapshotList,
+)
+from server.routes_assets import save_version
 
 router = APIRouter(prefix="/api/sessions", tags=["sessions"])
 
 Context = Annotated[ServerContext, Depends(context_of)]
+
+ClientKeyHeader = Annotated[str | None, Header(alias="Idempotency-Key", min_length=1, max_length=64)]
+SnapshotName = Annotated[str, PathParameter(min_length=1, max_length=80, pattern=r"^[^/\\x00-\\x1f]+$")]
 
 MAX_WORK = 4096 * 4096 * 64
 """Pixels times samples of one picture."""
@@ -45,18 +61,55 @@ async def delete_session(session_id: str, context: Context) -> None:
 
 
 @router.post("/{session_id}/edits")
-async def append_edit(session_id: str, body: EditRequest, context: Context) -> EditLog:
-    return await context.sessions.apply(await context.sessions.get(session_id), "edit", body.edit)
+async def append_edit(session_id: str, body: EditRequest, context: Context, key: ClientKeyHeader = None) -> EditLog:
+    """With an Idempotency-Key the same key appends one edit, however often it is sent."""
+    return await _apply(context, session_id, "edit", body.edit, key)
 
 
 @router.post("/{session_id}/undo")
-async def undo(session_id: str, context: Context) -> EditLog:
-    return await context.sessions.apply(await context.sessions.get(session_id), "undo")
+async def undo(session_id: str, context: Context, key: ClientKeyHeader = None) -> EditLog:
+    return await _apply(context, session_id, "undo", None, key)
 
 
 @router.post("/{session_id}/redo")
-async def redo(session_id: str, context: Context) -> EditLog:
-    return await context.sessions.apply(await context.sessions.get(session_id), "redo")
+async def redo(session_id: str, context: Context, key: ClientKeyHeader = None) -> EditLog:
+    return await _apply(context, session_id, "redo", None, key)
+
+
+async def _apply(context: ServerContext, session_id: str, kind: EventKind, edit: Edit | None, key: str | None) -> EditLog:
+    session = await context.sessions.get(session_id)
+    return (await context.sessions.apply(session, kind, edit, key=key)).log
+
+
+@router.get("/{session_id}/snapshots")
+async def list_snapshots(session_id: str, context: Context) -> SnapshotList:
+    """Oldest first."""
+    return SnapshotList(snapshots=[snapshot_info(row) for row in await context.sessions.snapshots(session_id)])
+
+
+@router.put("/{session_id}/snapshots/{name}")
+async def take_snapshot(session_id: str, name: SnapshotName, context: Context) -> SnapshotInfo:
+    """Keeps the edits in force under a name; the same name is overwritten."""
+    return snapshot_info(await context.sessions.take_snapshot(session_id, name))
+
+
+@router.post("/{session_id}/snapshots/{name}/restore")
+async def restore_snapshot(session_id: str, name: SnapshotName, context: Context, key: ClientKeyHeader = None) -> EditLog:
+    """Puts the snapshot's edits in place of those in force, as one step of undo."""
+    session = await context.sessions.get(session_id)
+    return (await context.sessions.restore(session, name, key)).log
+
+
+@router.delete("/{session_id}/snapshots/{name}", status_code=204)
+async def delete_snapshot(session_id: str, name: SnapshotName, context: Context) -> None:
+    await context.sessions.delete_snapshot(session_id, name)
+
+
+@router.post("/{session_id}/save", status_code=201)
+async def save_session(session_id: str, context: Context, body: SaveRequest | None = None) -> AssetInfo:
+    """Makes a new version of the asset with the edits in force put into it; they are listed with it. The session goes on as it is."""
+    session = await context.sessions.get(session_id)
+    return await save_version(context, session, body.name if body else None)
 
 
 class FrameQuery(BaseModel):

@@ -5,17 +5,19 @@ back from its log the next time somebody looks at it.
 """
 
 import asyncio
+import re
 import time
 import uuid
 from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 from sqlalchemy import Engine, delete, select
 from sqlalchemy.orm import Session as DatabaseSession
 
-from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, parse_edits
+from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, PoseEdit, parse_edits
 from server import messages
 from server.edit_log import EditLog, EventKind
 from server.environments import EnvironmentStore
@@ -25,12 +27,27 @@ from server.render_thread import RenderThread
 from server.settings import Limits
 from server.viewer import Posed, Viewer
 from worker.data_directory import DataDirectory
-from worker.database import AssetRow, SessionEventRow, SessionRow, now
+from worker.database import AssetRow, SessionEventRow, SessionRow, SnapshotRow, now
+from worker.save_version import plain_edit
 
 Result = TypeVar("Result")
 
+POSING_THREADS = 4
+"""Sessions whose edits are posed at the same time; each session's own come one after the other."""
+
+_CLIP = re.compile(r"clips/[0-9a-f]{32}")
 COALESCE_SECONDS = 0.5
 """Edits with the same key, closer together than this, are one step of undo."""
+
+
+@dataclass(frozen=True)
+class Applied:
+    """Answer to a change of the log."""
+
+    revision: int
+    """Of the log with this change in it."""
+    log: messages.EditLog
+    """With it; a later one when the change had been applied before and was sent again."""
 
 
 @dataclass(eq=False)
@@ -48,6 +65,8 @@ class LiveSession:
     viewers: set[Viewer] = field(default_factory=set)
     listeners: set[Callable[[messages.EditLog], None]] = field(default_factory=set)
     """Told of every change of the log."""
+    keys: dict[str, int] = field(default_factory=dict)
+    """Revision that each client key was answered with."""
     coalesce: str | None = None
     coalesce_at: float = 0.0
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -75,6 +94,12 @@ class SessionRegistry:
         self._live: dict[str, LiveSession] = {}
         self._loaded: OrderedDict[str, AbstractLoadedAsset] = OrderedDict()
         self._loading = asyncio.Lock()
+        # Loading and posing may take long (a simulation up to a late moment); the render thread goes on with other sessions meanwhile.
+        self._posing = ThreadPoolExecutor(POSING_THREADS, thread_name_prefix="pose")
+
+    def close(self) -> None:
+        """Poses under way are finished, those that wait are not begun."""
+        self._posing.shutdown(wait=False, cancel_futures=True)
 
     async def create(self, asset_id: str) -> LiveSession:
         """
@@ -86,7 +111,7 @@ class SessionRegistry:
     def _create(self, asset_id: str) -> LiveSession:
         with DatabaseSession(self._engine) as database, database.begin():
             asset = database.get(AssetRow, asset_id)
-            if asset is None:
+            if asset is None or asset.deleted_at is not None:
                 raise ProblemError(404, f"No asset has the id {asset_id[:64]!r}.")
             if len(database.scalars(select(SessionRow.id)).all()) >= self._limits.sessions:
                 raise ProblemError(429, f"There are {self._limits.sessions} sessions already; delete one first.")
@@ -112,22 +137,25 @@ class SessionRegistry:
         with DatabaseSession(self._engine) as database:
             row = database.get(SessionRow, session_id)
             asset = database.get(AssetRow, row.asset_id) if row else None
-            if row is None or asset is None:
+            if row is None or asset is None or asset.deleted_at is not None:
                 raise ProblemError(404, f"No session has the id {session_id[:64]!r}.")
             events = database.scalars(
                 select(SessionEventRow).where(SessionEventRow.session_id == session_id).order_by(SessionEventRow.revision)
             ).all()
-            log = EditLog()
+            log, keys = EditLog(), {}
             for event in events:
-                log = log.after(event.kind, parse_edits([event.edit])[0] if event.edit is not None else None)  # type: ignore[arg-type]
-            return LiveSession(row.id, row.asset_id, asset.name, row.created_at, log)
+                log = log.after(event.kind, _change_of(event))  # type: ignore[arg-type]
+                if event.client_key is not None:
+                    keys[event.client_key] = event.revision
+            return LiveSession(row.id, row.asset_id, asset.name, row.created_at, log, keys=keys)
 
     async def all(self) -> list[LiveSession]:
         """Newest first."""
 
         def ids() -> list[str]:
             with DatabaseSession(self._engine) as database:
-                return list(database.scalars(select(SessionRow.id).order_by(SessionRow.created_at.desc()).limit(100)))
+                there = select(SessionRow.id).join(AssetRow, AssetRow.id == SessionRow.asset_id).where(AssetRow.deleted_at.is_(None))
+                return list(database.scalars(there.order_by(SessionRow.created_at.desc()).limit(100)))
 
         return [await self.get(session_id) for session_id in await asyncio.to_thread(ids)]
 
@@ -144,6 +172,7 @@ class SessionRegistry:
         def forget() -> None:
             with DatabaseSession(self._engine) as database, database.begin():
                 database.execute(delete(SessionEventRow).where(SessionEventRow.session_id == session_id))
+                database.execute(delete(SnapshotRow).where(SnapshotRow.session_id == session_id))
                 database.execute(delete(SessionRow).where(SessionRow.id == session_id))
 
         await asyncio.to_thread(forget)
@@ -156,7 +185,7 @@ class SessionRegistry:
         return any(session.asset_id == asset_id and session.viewers for session in self._live.values())
 
     def forget_asset(self, asset_id: str) -> None:
-        """The asset was deleted, and its sessions with it."""
+        """The asset was deleted, and its sessions with it: nobody finds them any more."""
         self._loaded.pop(asset_id, None)
         for session_id in [session.id for session in self._live.values() if session.asset_id == asset_id]:
             del self._live[session_id]
@@ -195,33 +224,48 @@ class SessionRegistry:
 
     async def _call(self, function: Callable[[], Result]) -> Result:
         try:
-            return await asyncio.wrap_future(self._thread.call(function))
+            return await asyncio.get_running_loop().run_in_executor(self._posing, function)
         except ValueError as error:
             raise ProblemError(422, str(error)) from error
 
-    async def apply(self, session: LiveSession, kind: EventKind, edit: Edit | None = None, coalesce: str | None = None) -> messages.EditLog:
+    async def apply(
+        self,
+        session: LiveSession,
+        kind: EventKind,
+        change: Edit | list[Edit] | None = None,
+        coalesce: str | None = None,
+        key: str | None = None,
+    ) -> Applied:
         """One change of the log: posed, then stored, then shown to all viewers.
+
+        Args:
+            change: the edit, or what `restore` brings.
+            key: of the client; a change whose key is known already is not applied again.
 
         Raises:
             ProblemError: a sentence; the log is as before.
         """
-        if edit is not None:
-            self._check(edit)
+        for edit in change if isinstance(change, list) else [change] if change is not None else []:
+            self.check_edit(edit)
         async with session.lock:
+            if key is not None and key in session.keys:
+                return Applied(session.keys[key], session.log.message())
             posed = await self._load(session)
             same_drag = coalesce is not None and coalesce == session.coalesce and time.monotonic() - session.coalesce_at < COALESCE_SECONDS
-            if kind == "edit" and same_drag and session.log.done:
+            if kind == "edit" and same_drag and session.log.can_replace:
                 kind = "replace"
             if kind == "edit" and len(session.log.done) >= self._limits.edits:
                 raise ProblemError(422, f"A session has at most {self._limits.edits} edits in force.")
             try:
-                log = session.log.after(kind, edit)
+                log = session.log.after(kind, change)
             except ValueError as error:
                 raise ProblemError(409, str(error)) from error
             loaded = session.loaded
             assert loaded is not None
             pose = await self._call(lambda: loaded.pose(log.done, posed.pose))
-            await asyncio.to_thread(self._store, session.id, log.revision, kind, edit)
+            await asyncio.to_thread(self._store, session.id, log.revision, kind, change, key)
+            if key is not None:
+                session.keys[key] = log.revision
             session.log, session.posed = log, Posed(log.revision, pose)
             session.coalesce, session.coalesce_at = coalesce, time.monotonic()
         for viewer in session.viewers:
@@ -230,18 +274,101 @@ class SessionRegistry:
         message = log.message()
         for listener in list(session.listeners):
             listener(message)
-        return message
+        return Applied(log.revision, message)
 
-    def _store(self, session_id: str, revision: int, kind: str, edit: Edit | None) -> None:
-        values = edit.model_dump(mode="json", exclude_none=True) if edit is not None else None
+    def _store(self, session_id: str, revision: int, kind: str, change: Edit | list[Edit] | None, key: str | None) -> None:
+        values = [plain_edit(edit) for edit in change] if isinstance(change, list) else plain_edit(change) if change is not None else None
         with DatabaseSession(self._engine) as database, database.begin():
-            database.add(SessionEventRow(session_id=session_id, revision=revision, kind=kind, edit=values))
+            database.add(SessionEventRow(session_id=session_id, revision=revision, kind=kind, edit=values, client_key=key))
 
-    def _check(self, edit: Edit) -> None:
-        """Edits from a network name nothing but what the server keeps."""
+    # ---- snapshots ---------------------------------------------------------------------------------------------------
+
+    async def snapshots(self, session_id: str) -> list[SnapshotRow]:
+        """Oldest first.
+
+        Raises:
+            ProblemError: 404.
+        """
+        await self.get(session_id)
+
+        def read() -> list[SnapshotRow]:
+            with DatabaseSession(self._engine) as database:
+                wanted = select(SnapshotRow).where(SnapshotRow.session_id == session_id).order_by(SnapshotRow.created_at)
+                return list(database.scalars(wanted))
+
+        return await asyncio.to_thread(read)
+
+    async def take_snapshot(self, session_id: str, name: str) -> SnapshotRow:
+        """
+        Raises:
+            ProblemError: 404, or there are too many.
+        """
+        session = await self.get(session_id)
+        taken = await self.snapshots(session_id)
+        if len(taken) >= self._limits.snapshots and name not in {row.name for row in taken}:
+            raise ProblemError(422, f"A session has at most {self._limits.snapshots} snapshots; delete one first.")
+        log = session.log
+        row = SnapshotRow(
+            session_id=session_id,
+            name=name,
+            created_at=now(),
+            revision=log.revision,
+            edits=[plain_edit(edit) for edit in log.done],
+        )
+
+        def store() -> SnapshotRow:
+            with DatabaseSession(self._engine, expire_on_commit=False) as database, database.begin():
+                return database.merge(row)
+
+        return await asyncio.to_thread(store)
+
+    async def restore(self, session: LiveSession, name: str, key: str | None = None) -> Applied:
+        """Put a snapshot's edits in place of those in force.
+
+        Raises:
+            ProblemError: 404, or its edits no longer apply.
+        """
+        row = await self._snapshot(session.id, name)
+        return await self.apply(session, "restore", parse_edits(row.edits), key=key)
+
+    async def delete_snapshot(self, session_id: str, name: str) -> None:
+        """
+        Raises:
+            ProblemError: 404.
+        """
+        row = await self._snapshot(session_id, name)
+
+        def forget() -> None:
+            with DatabaseSession(self._engine) as database, database.begin():
+                database.delete(row)
+
+        await asyncio.to_thread(forget)
+
+    async def _snapshot(self, session_id: str, name: str) -> SnapshotRow:
+        found = next((row for row in await self.snapshots(session_id) if row.name == name), None)
+        if found is None:
+            raise ProblemError(404, f"This session has no snapshot {name[:80]!r}.")
+        return found
+
+    def check_edit(self, edit: Edit) -> None:
+        """Edits from a network name nothing but what the server keeps.
+
+        Raises:
+            ProblemError: it does.
+        """
         if isinstance(edit, EnvironmentEdit) and edit.file is not None and not self._environments.has(edit.file):
             raise ProblemError(422, f"No environment is called {edit.file[:100]!r}; GET /api/environments lists them.")
         if isinstance(edit, DeformEdit) and edit.vertices is not None:
             raise ProblemError(
                 422, "A deform edit over the network has a `map`; `vertices` names a file and works with `drgs render` only."
             )
+        if isinstance(edit, PoseEdit) and not (
+            _CLIP.fullmatch(edit.clip) and (self._directory.environments / edit.clip / "clip.json").is_file()
+        ):
+            raise ProblemError(422, f"There is no clip {edit.clip[:100]!r}; a simulate job that is done names its clip.")
+
+
+def _change_of(event: SessionEventRow) -> Edit | list[Edit] | None:
+    if isinstance(event.edit, list):
+        return parse_edits(event.edit)
+    return parse_edits([event.edit])[0] if event.edit is not None else None

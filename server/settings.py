@@ -38,6 +38,10 @@ class Limits:
     """That wait or run; more are answered 429."""
     viewers: int = 64
     sessions: int = 1000
+    snapshots: int = 200
+    """Of one session."""
+    undo_delete_seconds: float = 24 * 3600
+    """How long a deleted asset can be brought back."""
     edits: int = 20_000
     """In one session's log."""
     loaded_assets: int = 4

@@ -240,7 +240,8 @@ class Connection:
                 break
             answered = [change.id]
             # A drag sends edits faster than they can be posed: those that the next one replaces anyway are answered with it.
-            while isinstance(change, EditMessage) and change.coalesce is not None and not self._changes.empty():
+            # One with a key is stored under it, so that it is known when it is sent again.
+            while isinstance(change, EditMessage) and change.coalesce is not None and change.key is None and not self._changes.empty():
                 following = self._changes.get_nowait()
                 last = following is None
                 if not isinstance(following, EditMessage) or following.coalesce != change.coalesce:
@@ -249,9 +250,9 @@ class Connection:
                 answered.append(change.id)
             try:
                 if isinstance(change, EditMessage):
-                    state = await self._context.sessions.apply(self._session, "edit", change.edit, change.coalesce)
+                    applied = await self._context.sessions.apply(self._session, "edit", change.edit, change.coalesce, change.key)
                 else:
-                    state = await self._context.sessions.apply(self._session, change.type)
+                    applied = await self._context.sessions.apply(self._session, change.type, key=change.key)
             except ProblemError as problem:
                 for number in answered:
                     self._say(RejectedMessage(id=number, reason=problem.detail))
@@ -261,7 +262,7 @@ class Connection:
                     self._say(RejectedMessage(id=number, reason="The edit could not be stored; is the disk full?"))
             else:
                 for number in answered:
-                    self._say(AcceptedMessage(id=number, revision=state.revision))
+                    self._say(AcceptedMessage(id=number, revision=applied.revision))
         connection.cancel()
 
     async def _pick(self, message: PickMessage) -> None:

@@ -1,11 +1,12 @@
 """The function that turns a capture into an asset, found by name so that jobs and tests can name another.
 
-A builder is called as `builder(request, progress, should_stop)`; it must write the finished asset to `request.out` (atomically),
-keep checkpoints in `OUT.build/` so that a second call goes on, and raise BuildStopped soon after `should_stop()` turns true.
+A builder is called as `builder(request, progress, should_stop)` and gives the name of each of STAGES as it is finished, its result on
+disk: checkpoints in `OUT.build/`, so that a second call goes on behind the last one, and in the end the asset at `request.out`
+(atomically). It raises BuildStopped soon after `should_stop()` turns true.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
@@ -13,6 +14,8 @@ from pathlib import Path
 DEFAULT_BUILDER = "worker.builders:build_with_drgs"
 BUILDER_VARIABLE = "DRGS_BUILDER"
 """Environment variable `module:function`."""
+STAGES = ("read", "fit", "mesh", "materials", "pack")
+"""Those of drgs.build.build_asset.STAGE_SHARES."""
 
 
 class BuildStopped(Exception):
@@ -29,6 +32,8 @@ class BuildRequest:
     seed: int
     device: str
     """auto, cpu or cuda."""
+    materials: str | None = None
+    """Preset of the stage `materials`; None: `preset`."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class BuildProgress:
     preview_jpeg: bytes | None = None
 
 
-Builder = Callable[[BuildRequest, Callable[[BuildProgress], None], Callable[[], bool]], None]
+Builder = Callable[[BuildRequest, Callable[[BuildProgress], None], Callable[[], bool]], Iterator[str]]
 
 
 def find_builder() -> Builder:
@@ -63,16 +68,19 @@ def find_builder() -> Builder:
         raise ValueError(f"{BUILDER_VARIABLE}={name}: expected module:function of a builder; {error}") from error
 
 
-def build_with_drgs(request: BuildRequest, progress: Callable[[BuildProgress], None], should_stop: Callable[[], bool]) -> None:
-    """drgs.build_asset, resumed from its checkpoint where there is one."""
+def build_with_drgs(request: BuildRequest, progress: Callable[[BuildProgress], None], should_stop: Callable[[], bool]) -> Iterator[str]:
+    """drgs.build.build_asset.build_stages, resumed from its checkpoints where there are some."""
     from drgs.build import build_asset as build
 
-    settings = build.BuildSettings(preset=request.preset, seed=request.seed, device=request.device, resume=True)
+    settings = build.BuildSettings(
+        preset=request.preset, seed=request.seed, device=request.device, resume=True, materials=request.materials
+    )
 
     def report(made: build.Progress) -> None:
         progress(BuildProgress(**{entry.name: getattr(made, entry.name) for entry in fields(BuildProgress)}))
 
     try:
-        build.build_asset(request.dataset, request.out, settings, progress=report, should_stop=should_stop)
+        for stage, _ in build.build_stages(request.dataset, request.out, settings, progress=report, should_stop=should_stop):
+            yield stage
     except build.BuildStopped as stopped:
         raise BuildStopped from stopped

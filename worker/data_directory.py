@@ -5,8 +5,8 @@ app.sqlite          assets, jobs, workers, sessions with their edit logs
 jobs.sqlite         the queue's own state (DBOS). Whoever can write it runs code in workers, hence the mode of the folder
 assets/ID/          finished assets
 uploads/ID/         captures as they came, unpacked
-jobs/ID/            a build's working folder: checkpoints, preview
-environments/       NAME.exr and NAME.jpg, its small picture
+jobs/ID/            a job's working folder: checkpoints, preview, log.txt, and in files/ what can be downloaded
+environments/       NAME.exr and NAME.jpg, its small picture; and clips/ID/, since edits name both relative to one folder
 workers/            locks that give each worker of this machine a stable number
 """
 
@@ -62,6 +62,16 @@ class DataDirectory:
 
     def preview(self, job_id: str) -> Path:
         return self.job(job_id) / "preview.jpg"
+
+    def job_files(self, job_id: str) -> Path:
+        return self.job(job_id) / "files"
+
+    def job_log(self, job_id: str) -> Path:
+        return self.job(job_id) / "log.txt"
+
+    def clip(self, job_id: str) -> Path:
+        """What a `pose` edit calls `clips/ID`."""
+        return self.environments / "clips" / job_id
 
 
 def open_data_directory(root: Path) -> DataDirectory:

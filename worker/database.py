@@ -8,7 +8,7 @@ from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import JSON, Engine, ForeignKey, create_engine, event
+from sqlalchemy import JSON, BigInteger, Engine, ForeignKey, UniqueConstraint, create_engine, event
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 from sqlalchemy.pool import ConnectionPoolEntry
@@ -27,11 +27,19 @@ class AssetRow(Base):
     name: Mapped[str]
     created_at: Mapped[float] = mapped_column(index=True)
     source: Mapped[str]
-    """build or upload."""
-    bytes: Mapped[int]
+    """build, upload or session."""
+    bytes: Mapped[int] = mapped_column(BigInteger)
     surfel_count: Mapped[int]
     vertex_count: Mapped[int]
     face_count: Mapped[int]
+    parent_id: Mapped[str | None]
+    """Of the version that this one was made of."""
+    version: Mapped[int] = mapped_column(default=1)
+    """One more than the parent's."""
+    edits: Mapped[list] = mapped_column(JSON, default=list)
+    """What was done to the parent."""
+    deleted_at: Mapped[float | None] = mapped_column(index=True)
+    """Since when it waits for its files to be removed; None: it is there."""
 
 
 class JobRow(Base):
@@ -42,11 +50,16 @@ class JobRow(Base):
     id: Mapped[str] = mapped_column(primary_key=True)
     """Also the id of the DBOS workflow."""
     kind: Mapped[str]
+    """worker.requests.JobKind."""
     name: Mapped[str]
     dataset: Mapped[str]
-    """Folder of the capture."""
+    """Folder of the capture; empty where there is none."""
     preset: Mapped[str]
+    """Empty where there is none."""
     seed: Mapped[int]
+    parameters: Mapped[dict] = mapped_column(JSON, default=dict)
+    """The request as plain data."""
+    priority: Mapped[int] = mapped_column(default=100)
     idempotency_key: Mapped[str | None] = mapped_column(unique=True)
     created_at: Mapped[float] = mapped_column(index=True)
     finished_at: Mapped[float | None]
@@ -84,17 +97,34 @@ class SessionRow(Base):
     created_at: Mapped[float] = mapped_column(index=True)
 
 
+class SnapshotRow(Base):
+    """A named state of a session's edits."""
+
+    __tablename__ = "session_snapshots"
+
+    session_id: Mapped[str] = mapped_column(ForeignKey("sessions.id", ondelete="CASCADE"), primary_key=True)
+    name: Mapped[str] = mapped_column(primary_key=True)
+    created_at: Mapped[float]
+    revision: Mapped[int]
+    """Of the log when it was taken."""
+    edits: Mapped[list] = mapped_column(JSON)
+
+
 class SessionEventRow(Base):
     """One change of a session's edit log. Rows are only ever added; the log is their replay (server/edit_log.py)."""
 
     __tablename__ = "session_events"
+    __table_args__ = (UniqueConstraint("session_id", "client_key", name="one_event_a_key"),)
 
     session_id: Mapped[str] = mapped_column(ForeignKey("sessions.id", ondelete="CASCADE"), primary_key=True)
     revision: Mapped[int] = mapped_column(primary_key=True)
     """1, 2, 3, ..."""
     kind: Mapped[str]
-    """edit, replace (of the last edit, in one slider drag), undo or redo."""
-    edit: Mapped[dict | None] = mapped_column(JSON)
+    """edit, replace (of the last edit, in one slider drag), restore (of a snapshot), undo or redo."""
+    edit: Mapped[dict | list | None] = mapped_column(JSON)
+    """A list for restore."""
+    client_key: Mapped[str | None]
+    """Chosen by the client, the same when it sends the change again; unique in a session."""
 
 
 def open_database(directory: DataDirectory) -> Engine:

@@ -5,6 +5,7 @@ Exit code 2 and one sentence on stderr for wrong input. Commands:
     asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
     environment SOURCE OUT      EXR or Radiance HDR -> EXR
     export ASSET OUT FORMAT     asset folder -> ply, ply3, glb, env (file formats) or zip (the asset itself)
+    version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
 """
 
 import asyncio
@@ -82,6 +83,15 @@ def thumbnail(asset: "Asset") -> bytes:
     return simplejpeg.encode_jpeg(np.ascontiguousarray(pixels), quality=85, colorspace="RGB")
 
 
+def make_version(asset_folder: Path, out: Path, edits: Path, environments: Path, version: int) -> None:
+    from drgs.scene.asset import load_asset, save_asset
+    from drgs.scene.edits import load_edits
+    from worker.save_version import with_edits
+
+    made = with_edits(load_asset(asset_folder), load_edits(edits), environments, version)
+    save_asset(made, out, thumbnail_jpeg=thumbnail(made))
+
+
 def make_environment(source: Path, out: Path) -> None:
     from drgs.exchange.exr import decode_environment, encode_environment
 
@@ -113,9 +123,11 @@ def main(arguments: list[str]) -> int:
                 make_environment(Path(source), Path(out))
             case ["export", asset, out, format]:
                 export(Path(asset), Path(out), format)
+            case ["version", asset, out, edits, environments, version]:
+                make_version(Path(asset), Path(out), Path(edits), Path(environments), int(version))
             case _:
-                raise ValueError(f"expected asset, environment or export with their arguments; found {arguments}")
-    except ValueError as error:
+                raise ValueError(f"expected asset, environment, export or version with their arguments; found {arguments}")
+    except (ValueError, OSError) as error:
         print(str(error).replace("\n", " "), file=sys.stderr)
         return 2
     return 0

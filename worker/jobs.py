@@ -1,33 +1,49 @@
-"""The durable workflow of a build. Imported by workers only (the API enqueues by name).
+"""The durable workflow of every job. Imported by workers only (the API enqueues by name).
 
-prepare -> build -> register, each a DBOS step: after a crash the finished ones are not run again, and the build itself goes on from
-its own checkpoint. Cancelling is polled inside the build, since DBOS does not interrupt a running step.
+A job's kind gives its steps (worker/job_run.py), each a DBOS step: after a crash the finished ones are not run again, and the one that
+was interrupted goes on from its own checkpoint. Cancelling is polled inside steps, since DBOS does not interrupt a running one.
 """
 
 import contextlib
 import os
-import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
+import psutil
 from dbos import DBOS
 from dbos import error as dbos_error
 from sqlalchemy import Engine, update
 from sqlalchemy.orm import Session
 
-from worker.asset_folder import count_asset_folder, folder_bytes
-from worker.builders import Builder, BuildProgress, BuildRequest, BuildStopped
+from worker.builders import Builder, BuildProgress, BuildStopped
 from worker.data_directory import DataDirectory, try_lock_file
-from worker.database import AssetRow, JobRow, now
-from worker.queue import BUILD_WORKFLOW
+from worker.database import JobRow, now
+from worker.job_build import BuildRun, RedecoupleRun
+from worker.job_export import ExportRun
+from worker.job_render import RenderRun
+from worker.job_run import AbstractJobRun, JobContext
+from worker.job_simulate import SimulateRun
+from worker.queue import JOB_WORKFLOW
+from worker.requests import JobLimits
 
 PROGRESS_SECONDS = 0.5
 """Between two writes of progress."""
 STOP_POLL_SECONDS = 0.25
-"""Between two looks at the cancel flag."""
+"""Between two looks at the cancel flag and at limits."""
+ASSET_KINDS = ("build", "redecouple")
+"""Their job's id is their asset's."""
+
+_RUNS: dict[str, Callable[[JobContext], AbstractJobRun]] = {
+    "build": BuildRun,
+    "redecouple": RedecoupleRun,
+    "simulate": SimulateRun,
+    "render": RenderRun,
+    "export": ExportRun,
+}
 
 
 class WorkerStopping(BaseException):
@@ -62,62 +78,64 @@ def _worker() -> WorkerContext:
     return _context
 
 
-@DBOS.workflow(name=BUILD_WORKFLOW, max_recovery_attempts=3)
-def build_asset_job(job_id: str, dataset: str, preset: str, seed: int) -> str:
-    """Returns the id of the asset."""
-    prepare(job_id, dataset)
-    build(job_id, dataset, preset, seed)
-    return register(job_id)
-
-
-@DBOS.step()
-def prepare(job_id: str, dataset: str) -> None:
-    """Check that the capture is where it was when the job was made, and make the working folder."""
+@DBOS.workflow(name=JOB_WORKFLOW, max_recovery_attempts=3)
+def run_job(job_id: str) -> None:
+    """A job's row never changes in what its steps depend on, so every execution of it has the same ones."""
     with _failures_recorded(job_id):
-        if not Path(dataset).is_dir():
-            raise ValueError(f"The capture {Path(dataset).name} is gone; it was removed after the job was made.")
-        _worker().directory.job(job_id).mkdir(mode=0o700, exist_ok=True)
+        job = _job_context(job_id)
+        run = _RUNS[_read_job(job_id).kind](job)
+    for step in run.steps:
+        DBOS.run_step({"name": step}, _run_step, job, run, step)
+    DBOS.run_step({"name": "finish"}, _finish, job_id)
 
 
-@DBOS.step()
-def build(job_id: str, dataset: str, preset: str, seed: int) -> None:
-    """The long part. A second run in the same folder waits until the first has let go of it."""
-    worker = _worker()
-    folder = worker.directory.job(job_id)
-    should_stop = _stop_flag(job_id)
-    with _failures_recorded(job_id), _only_run(folder, should_stop):
-        _update_job(job_id, worker_id=worker.worker_id, attempts=JobRow.attempts + 1, error=None)
-        request = BuildRequest(Path(dataset), folder / "asset", preset, seed, worker.device)
-        if not request.out.exists():
-            worker.builder(request, _progress_writer(job_id), should_stop)
+def _run_step(job: JobContext, run: AbstractJobRun, step: str) -> None:
+    """A second run in the same folder waits until the first has let go of it."""
+    with _failures_recorded(job.job_id):
+        job.folder.mkdir(mode=0o700, exist_ok=True)
+        with _only_run(job.folder, job.should_stop):
+            _log(job, f"{step}: started by {_worker().worker_id}")
+            _update_job(job.job_id, worker_id=_worker().worker_id, error=None)
+            run.run(step)
+            _log(job, f"{step}: finished")
 
 
-@DBOS.step()
-def register(job_id: str) -> str:
-    """Move the asset to its place and list it; does nothing that was already done."""
-    with _failures_recorded(job_id):
-        directory = _worker().directory
-        built, place = directory.job(job_id) / "asset", directory.asset(job_id)
-        if built.exists() and not place.exists():
-            built.rename(place)
-        counts = count_asset_folder(place)
-        with Session(_worker().engine) as session, session.begin():
-            job = session.get_one(JobRow, job_id)
-            session.merge(
-                AssetRow(
-                    id=job_id,
-                    name=job.name,
-                    created_at=now(),
-                    source="build",
-                    bytes=folder_bytes(place),
-                    surfel_count=counts.surfels,
-                    vertex_count=counts.vertices,
-                    face_count=counts.faces,
-                )
-            )
-            job.asset_id, job.finished_at, job.fraction, job.stage, job.eta_seconds, job.message = job_id, now(), 1.0, "done", None, ""
-        shutil.rmtree(directory.job(job_id) / "asset.build", ignore_errors=True)
-        return job_id
+def _finish(job_id: str) -> None:
+    asset_id = job_id if _read_job(job_id).kind in ASSET_KINDS else None
+    _update_job(job_id, asset_id=asset_id, finished_at=now(), fraction=1.0, stage="done", eta_seconds=None, message="")
+
+
+def _read_job(job_id: str) -> JobRow:
+    with Session(_worker().engine) as session:
+        row = session.get(JobRow, job_id)
+    if row is None:
+        raise ValueError("This job was deleted before it began.")
+    return row
+
+
+def _job_context(job_id: str) -> JobContext:
+    """Also counts the attempt."""
+    worker, row = _worker(), _read_job(job_id)
+    _update_job(job_id, attempts=JobRow.attempts + 1)
+    parameters = {"preset": row.preset, "seed": row.seed} | row.parameters
+    limits = JobLimits.model_validate(parameters.get("limits", {}))
+    return JobContext(
+        job_id=job_id,
+        name=row.name,
+        parameters=parameters,
+        dataset=Path(row.dataset) if row.dataset else None,
+        directory=worker.directory,
+        engine=worker.engine,
+        builder=worker.builder,
+        device=worker.device,
+        progress=_progress_writer(job_id),
+        should_stop=_stop_flag(job_id, limits),
+    )
+
+
+def _log(job: JobContext, line: str) -> None:
+    with job.directory.job_log(job.job_id).open("a") as file:
+        file.write(f"{datetime.now(UTC).isoformat(timespec='milliseconds')} {line}\n")
 
 
 @contextlib.contextmanager
@@ -142,9 +160,10 @@ def _sentence(error: Exception) -> str:
     return text if isinstance(error, ValueError) else f"{type(error).__name__}: {text}"
 
 
-def _stop_flag(job_id: str) -> Callable[[], bool]:
+def _stop_flag(job_id: str, limits: JobLimits) -> Callable[[], bool]:
     """A cheap `should_stop`: asks the database at most four times a second."""
-    checked_at, stop = 0.0, False
+    started, checked_at, stop = time.monotonic(), 0.0, False
+    process = psutil.Process()
 
     def should_stop() -> bool:
         nonlocal checked_at, stop
@@ -155,6 +174,10 @@ def _stop_flag(job_id: str) -> Callable[[], bool]:
             with Session(_worker().engine) as session:
                 row = session.get(JobRow, job_id)
                 stop = row is None or row.cancel_requested
+            if limits.seconds is not None and checked_at - started > limits.seconds:
+                raise ValueError(f"The job took longer than its limit of {limits.seconds:g} s.")
+            if limits.memory_bytes is not None and process.memory_info().rss > limits.memory_bytes:
+                raise ValueError(f"The job needs more memory than its limit of {limits.memory_bytes / 2**30:.1f} GiB.")
         return stop
 
     return should_stop

@@ -19,8 +19,8 @@ from worker.data_directory import DataDirectory, lock_file
 from worker.database import JobRow, WorkerRow, now
 
 QUEUE_NAME = "builds"
-BUILD_WORKFLOW = "build_asset_job"
-JOBS_VERSION = "1"
+JOB_WORKFLOW = "run_job"
+JOBS_VERSION = "2"
 """Raise it when a workflow's steps change, so that a worker of another version leaves older jobs alone. DBOS would otherwise hash
 the source code, and any edit of it would orphan the jobs that wait."""
 APPLICATION_NAME = "drgs"
@@ -67,24 +67,23 @@ class JobQueue:
     def close(self) -> None:
         self._client.destroy()
 
-    def submit(self, row: JobRow, priority: int = 1) -> None:
+    def submit(self, row: JobRow) -> None:
         """Store the job and enqueue it; a job that was stored but not enqueued reads `unknown`, never done."""
-        arguments = (row.id, row.dataset, row.preset, row.seed)
-        with Session(self._engine) as session, session.begin():
+        with Session(self._engine, expire_on_commit=False) as session, session.begin():
             session.add(row)
-        self._enqueue(arguments, priority)
+        self._enqueue(row)
 
-    def _enqueue(self, arguments: tuple[str, str, str, int], priority: int = 1) -> None:
+    def _enqueue(self, row: JobRow) -> None:
         self._client.enqueue(
             {
-                "workflow_name": BUILD_WORKFLOW,
+                "workflow_name": JOB_WORKFLOW,
                 "queue_name": QUEUE_NAME,
-                "workflow_id": arguments[0],
+                "workflow_id": row.id,
                 "app_version": JOBS_VERSION,
-                "priority": priority,
+                "priority": row.priority,
                 "application_name": APPLICATION_NAME,
             },
-            *arguments,
+            row.id,
         )
 
     def statuses(self, job_ids: Iterable[str]) -> dict[str, JobStatus]:
@@ -128,12 +127,11 @@ class JobQueue:
         state = self.statuses([job_id])[job_id].state
         if state not in ("failed", "cancelled", "unknown"):
             raise JobNotInState(f"This job is {state}; only a failed or cancelled job can be retried.")
-        with Session(self._engine) as session, session.begin():
+        with Session(self._engine, expire_on_commit=False) as session, session.begin():
             row = session.get_one(JobRow, job_id)
             row.cancel_requested, row.error, row.finished_at, row.message = False, None, None, ""
-            arguments = (row.id, row.dataset, row.preset, row.seed)
         if state == "unknown":
-            self._enqueue(arguments)
+            self._enqueue(row)
         else:
             self._client.rewind_workflow(job_id, queue_name=QUEUE_NAME)
 

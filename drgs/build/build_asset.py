@@ -63,6 +63,8 @@ class BuildSettings:
     """auto, cpu or cuda."""
     seed: int = 0
     resume: bool = False
+    materials: str | None = None
+    """Preset of the stage `materials` alone: None is `preset`. It is how material and light are separated anew on kept geometry."""
 
 
 @dataclass(frozen=True)
@@ -202,8 +204,9 @@ def build_stages(
 
     Who stops between two stages and calls again with `resume` repeats none but the reading of the capture.
     """
-    if settings.preset not in PRESETS:
-        raise ValueError(f"preset {settings.preset!r} is unknown; expected one of {', '.join(PRESETS)}")
+    for name in (settings.preset, settings.materials or settings.preset):
+        if name not in PRESETS:
+            raise ValueError(f"preset {name!r} is unknown; expected one of {', '.join(PRESETS)}")
     if settings.binding != "particles":
         raise ValueError(f"binding {settings.binding!r} is not available in this version; use --binding particles")
     preset = PRESETS[settings.preset]
@@ -248,7 +251,9 @@ def build_stages(
         raise BuildStopped
 
     started = time.monotonic()
-    material_settings = replace(preset.materials, seed=settings.seed)
+    material_settings = replace(PRESETS[settings.materials or settings.preset].materials, seed=settings.seed)
+    if settings.materials is not None:
+        identity |= {"materials": settings.materials}
     materials = _stage_two(
         views, gaussians, fit, mesh, points.bounds_radius, material_settings, work, identity, settings.resume, reporter, stop_now
     )
@@ -270,6 +275,7 @@ def build_stages(
             "source": views.source,
             "dataset": dataset.name,
             "preset": settings.preset,
+            "materials": settings.materials or settings.preset,
             "seed": settings.seed,
             "device": str(device),
             "torch": torch.__version__,

@@ -26,6 +26,7 @@ BOUNDS = Bounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 class Painter(AbstractRenderer):
     def __init__(self, pass_seconds: float = 0.0) -> None:
         self.pass_seconds = pass_seconds
+        self.pose_seconds = 0.0
         self.loads = 0
         self.begun: list[tuple[int, int]] = []
         self.threads: set[str] = set()
@@ -44,6 +45,7 @@ class PaintedAsset(AbstractLoadedAsset):
     def pose(self, edits: Sequence[Edit], previous: AbstractPose | None) -> "PaintedPose":
         if any(isinstance(edit, DeformEdit) for edit in edits):
             raise ValueError("This asset is made of stone.")
+        time.sleep(self.painter.pose_seconds)
         return PaintedPose(self.painter, len(edits))
 
 

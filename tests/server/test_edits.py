@@ -2,6 +2,8 @@
 
 import asyncio
 import random
+import threading
+import time
 
 import pytest
 from conftest import Service
@@ -122,7 +124,80 @@ def test_concurrent_edits_get_one_order(service: Service) -> None:
     async def crowd() -> list[int]:
         session = await sessions.get(session_id)
         answers = await asyncio.gather(*(sessions.apply(session, "edit", edit) for edit in EDITS))
-        assert [len(answer.edits) for answer in answers] == [answer.revision for answer in answers]
+        assert [len(answer.log.edits) for answer in answers] == [answer.revision for answer in answers]
         return [answer.revision for answer in answers]
 
     assert sorted(service.client.portal.call(crowd)) == list(range(1, 11))
+
+
+def roughnesses(answer: dict) -> list[float]:
+    return [edit["set"]["roughness"] for edit in answer["edits"]]
+
+
+def test_a_change_sent_again_under_its_key_is_applied_once(service: Service) -> None:
+    url = f"/api/sessions/{service.open_session()}"
+
+    def send(call: str, key: str, body: dict | None = None) -> dict:
+        response = service.client.post(f"{url}/{call}", json=body, headers={"Idempotency-Key": key})
+        assert response.status_code == 200, response.text
+        return response.json()
+
+    for _ in range(3):
+        assert send("edits", "first", {"edit": material(0.1)})["revision"] == 1
+    assert len(send("edits", "second", {"edit": material(0.2)})["edits"]) == 2
+    for _ in range(2):
+        assert send("undo", "third")["revision"] == 3
+    service.context.sessions._live.clear()  # keys are known after a crash, too
+    assert send("edits", "first", {"edit": material(0.1)})["revision"] == 3
+    assert roughnesses(service.client.get(url).json()) == [0.1]
+
+
+def test_a_snapshot_is_restored_as_one_step_of_undo_and_survives_a_crash(service: Service) -> None:
+    url = f"/api/sessions/{service.open_session()}"
+    for value in (0.1, 0.2):
+        service.client.post(f"{url}/edits", json={"edit": material(value)})
+    taken = service.client.put(f"{url}/snapshots/two rough").json()
+    assert (taken["name"], taken["revision"], roughnesses(taken)) == ("two rough", 2, [0.1, 0.2])
+    service.client.post(f"{url}/edits", json={"edit": material(0.3)})
+    service.context.sessions._live.clear()
+    restored = service.client.post(f"{url}/snapshots/two rough/restore").json()
+    assert (restored["revision"], restored["edits"]) == (4, taken["edits"])
+    service.client.post(f"{url}/edits", json={"edit": material(0.4)})
+    service.context.sessions._live.clear()
+    assert service.client.post(f"{url}/undo").json()["edits"] == taken["edits"]
+    assert roughnesses(service.client.post(f"{url}/undo").json()) == [0.1, 0.2, 0.3]
+    assert service.client.post(f"{url}/redo").json()["edits"] == taken["edits"]
+    assert [found["name"] for found in service.client.get(f"{url}/snapshots").json()["snapshots"]] == ["two rough"]
+    assert service.client.delete(f"{url}/snapshots/two rough").status_code == 204
+    missing = service.client.post(f"{url}/snapshots/two rough/restore")
+    assert missing.status_code == 404 and "no snapshot" in missing.json()["detail"]
+
+
+def test_many_edits_undone_and_redone_end_as_their_replay_does(service: Service) -> None:
+    session_id, sessions, chooser = service.open_session(), service.context.sessions, random.Random(7)
+
+    async def soak() -> None:
+        session = await sessions.get(session_id)
+        for _ in range(600):
+            kind = chooser.choices(["edit", "undo", "redo"], [6, 3, 1])[0]
+            usable = {"undo": session.log.entries, "redo": session.log.undone}.get(kind, True)
+            await sessions.apply(session, kind if usable else "edit", None if usable and kind != "edit" else chooser.choice(EDITS))  # type: ignore[arg-type]
+        assert session.log.revision == 600
+        assert sessions._replay(session_id).log == session.log
+
+    service.client.portal.call(soak)
+
+
+def test_a_long_pose_of_one_session_does_not_hold_up_the_pictures_of_another(service: Service) -> None:
+    slow = service.open_session()
+    quick = service.client.post("/api/sessions", json={"asset": "a" * 32}).json()["id"]
+    service.client.get(f"/api/sessions/{quick}/frame.png?width=16&height=16&spp=4")
+    service.painter.pose_seconds = 3.0
+    poser = threading.Thread(target=lambda: service.client.post(f"/api/sessions/{slow}/edits", json={"edit": material(0.2)}))
+    poser.start()
+    time.sleep(0.1)
+    start = time.monotonic()
+    assert service.client.get(f"/api/sessions/{quick}/frame.png?width=16&height=16&spp=4").status_code == 200
+    assert time.monotonic() - start < 2.0 and poser.is_alive()
+    poser.join()
+    assert service.client.get(f"/api/sessions/{slow}").json()["revision"] == 1

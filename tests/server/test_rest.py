@@ -9,8 +9,11 @@ import numpy as np
 import OpenEXR
 import pytest
 from conftest import Service
+from sqlalchemy.orm import Session
 
+from server.routes_assets import remove_deleted_assets
 from worker.asset_folder import count_asset_folder
+from worker.database import AssetRow, now
 
 
 def zipped(entries: dict[str, bytes]) -> bytes:
@@ -99,12 +102,37 @@ def test_an_asset_is_listed_read_and_deleted(service: Service) -> None:
     assert response.content == b"glTF" and response.headers["content-type"] == "model/gltf-binary"
     assert service.client.get(f"/api/assets/{asset}/mesh.glb", headers={"Range": "bytes=1-2"}).content == b"lT"
     is_problem(service.client.get(f"/api/assets/{asset}/thumb.jpg"), 404)
+
+
+def test_a_deleted_asset_can_be_brought_back_until_it_is_removed_for_good(service: Service) -> None:
+    asset = service.add_asset()
     session = service.client.post("/api/sessions", json={"asset": asset}).json()["id"]
-    assert service.client.delete(f"/api/assets/{asset}").status_code == 204
-    is_problem(service.client.get(f"/api/assets/{asset}"), 404)
-    is_problem(service.client.get(f"/api/sessions/{session}"), 404)
+    for _ in range(2):
+        assert service.client.delete(f"/api/assets/{asset}").status_code == 204
+        is_problem(service.client.get(f"/api/assets/{asset}"), 404)
+        is_problem(service.client.get(f"/api/sessions/{session}"), 404)
+        is_problem(service.client.post("/api/sessions", json={"asset": asset}), 404)
+        assert service.client.get("/api/assets").json()["total"] == 0
+        assert service.client.get("/api/assets?deleted=true").json()["assets"][0]["id"] == asset
+        assert remove_deleted_assets(service.context) == 0
+        assert service.client.post(f"/api/assets/{asset}/undelete").json()["deleted_at"] is None
+        assert service.client.get(f"/api/sessions/{session}").json()["asset"] == asset
+    service.client.delete(f"/api/assets/{asset}")
+    with Session(service.context.engine) as database, database.begin():
+        database.get_one(AssetRow, asset).deleted_at = now() - service.settings.limits.undo_delete_seconds - 1
+    assert remove_deleted_assets(service.context) == 1
     assert not service.context.directory.asset(asset).exists()
-    is_problem(service.client.post("/api/sessions", json={"asset": asset}), 404)
+    is_problem(service.client.post(f"/api/assets/{asset}/undelete"), 404)
+
+
+def test_assets_are_found_by_part_of_their_name(service: Service) -> None:
+    for number, name in enumerate(("Blue 100%", "blue mug", "Red_mug")):
+        service.add_asset(f"{number}" * 32, name)
+    found = {
+        query: [asset["name"] for asset in service.client.get("/api/assets", params={"search": query}).json()["assets"]]
+        for query in ("BLUE", "%", "_", "x")
+    }
+    assert found == {"BLUE": ["blue mug", "Blue 100%"], "%": ["Blue 100%"], "_": ["Red_mug"], "x": []}
 
 
 def exr(height: int, width: int) -> bytes:

@@ -42,13 +42,20 @@ class Bench:
         self.workers.append(worker)
         return worker
 
-    def submit(self, **plan: object) -> str:
+    def submit(self, priority: int = 100, limits: dict | None = None, **plan: object) -> str:
         job_id = uuid.uuid4().hex
         capture = self.directory.uploads / job_id
         capture.mkdir()
         (capture / "plan.json").write_text(json.dumps({"iterations": 3, "seconds": 0.02, **plan}))
-        self.queue.submit(JobRow(id=job_id, kind="build", name="tiny", dataset=str(capture), preset="draft", seed=0, created_at=now()))
+        row = JobRow(id=job_id, kind="build", name="tiny", dataset=str(capture), preset="draft", seed=0, created_at=now())
+        row.priority, row.parameters = priority, {"limits": limits or {}}
+        self.queue.submit(row)
         return job_id
+
+    def stages_run(self, job_id: str) -> list[tuple[str, str]]:
+        """(stage, begins or ends), in order, without the fit."""
+        lines = (self.directory.job(job_id) / "stages.txt").read_text().splitlines()
+        return [(line.split()[1], line.split()[2]) for line in lines]
 
     def state(self, job_id: str) -> str:
         return self.queue.statuses([job_id])[job_id].state
@@ -99,7 +106,9 @@ def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:
     assert (row.asset_id, row.fraction, row.attempts, row.error) == (job, 1.0, 1, None)
     assert row.preview_version == 3 and bench.directory.preview(job).read_bytes() == b"\xff\xd8tiny"
     assert (bench.directory.asset(job) / "asset.json").exists()
-    assert not (bench.directory.job(job) / "asset.build").exists()
+    assert {path.name for path in (bench.directory.job(job) / "asset.build").iterdir()} == {"stage1.safetensors", "mesh.safetensors"}
+    log = bench.directory.job_log(job).read_text()
+    assert [line.split()[1] for line in log.splitlines()[::2]] == ["read:", "fit:", "mesh:", "materials:", "pack:", "register:"]
 
 
 def test_a_job_survives_kill_9_of_its_worker_and_goes_on_from_the_checkpoint(bench: Bench) -> None:
@@ -116,6 +125,45 @@ def test_a_job_survives_kill_9_of_its_worker_and_goes_on_from_the_checkpoint(ben
     repeated = len(ran) - len({iteration for _, iteration in ran})
     assert sorted({iteration for _, iteration in ran}) == list(range(30)) and repeated <= 1
     assert bench.row(job).attempts == 2
+
+
+@pytest.mark.parametrize("killed_in", [("read", "mesh"), ("materials", "pack")])
+def test_kill_9_in_any_stage_repeats_no_finished_one_and_gives_the_same_asset(bench: Bench, killed_in: tuple[str, str]) -> None:
+    job = bench.submit(iterations=2, seconds=0.0, stage_seconds=0.1)
+    notes = bench.directory.job(job) / "stages.txt"
+    for stage in killed_in:
+        worker = bench.start_worker()
+        bench.wait(lambda begins=f"{worker.pid} {stage} begins": notes.exists() and begins in notes.read_text())
+        worker.kill()
+        worker.wait()
+    bench.start_worker()
+    bench.wait_for(job, "done")
+    begun = [name for name, what in bench.stages_run(job) if what == "begins"]
+    assert begun.count("read") == 3, begun  # every process reads the capture; nothing else that was finished is done again
+    for name in ("mesh", "materials", "pack"):
+        assert begun.count(name) == 1 + (name in killed_in), begun
+    assert [iteration for _, iteration in bench.iterations_run(job)] == [0, 1]
+    assert json.loads((bench.directory.asset(job) / "asset.json").read_text())["counts"]["faces"] == 20
+    steps = [line.split(" ", 1)[1] for line in bench.directory.job_log(job).read_text().splitlines()]
+    for name in ("read", "fit", "mesh", "materials", "pack", "register"):
+        assert sum(step.startswith(f"{name}: started") for step in steps) == 1 + (name in killed_in), steps
+        assert sum(step.startswith(f"{name}: finished") for step in steps) == 1, steps
+
+
+def test_a_job_beyond_its_limits_ends_with_a_sentence_and_keeps_its_checkpoint(bench: Bench) -> None:
+    job = bench.submit(iterations=200, seconds=0.05, limits={"seconds": 0.5})
+    bench.start_worker()
+    bench.wait_for(job, "failed")
+    assert bench.row(job).error == "The job took longer than its limit of 0.5 s."
+    assert (bench.directory.job(job) / "asset.build" / "checkpoint.json").exists()
+
+
+def test_jobs_of_lower_number_run_first(bench: Bench) -> None:
+    later, sooner = bench.submit(priority=200), bench.submit(priority=1)
+    bench.start_worker()
+    bench.wait_for(later, "done")
+    first, second = bench.row(sooner), bench.row(later)
+    assert first.finished_at is not None and second.finished_at is not None and first.finished_at < second.finished_at
 
 
 def test_a_job_goes_on_after_its_worker_was_asked_to_end(bench: Bench) -> None:

@@ -70,6 +70,14 @@ export interface AssetInfo {
   vertex_count: number;
   face_count: number;
   has_thumbnail: boolean;
+  /** 1, or one more than the parent's. */
+  version: number;
+  /** The version that this one was made of. */
+  parent_id: string | null;
+  /** What was done to the parent. */
+  edits: Edit[];
+  /** Since when it can be brought back, for a while. */
+  deleted_at: string | null;
 }
 
 export interface AssetList {
@@ -91,10 +99,14 @@ export interface Box {
 
 /** A build of a capture that the server can already see. A zip is uploaded as multipart instead, with the same fields. */
 export interface BuildRequest {
+  /** Shown in lists. */
+  name?: string | null;
+  /** Lower runs first; jobs of one priority run in the order in which they came. */
+  priority?: number;
+  limits?: JobLimits;
+  kind?: "build";
   /** `sample` for the bundled capture, or a folder below a root that was allowed when the server started. */
   dataset: string;
-  /** Of the asset; the folder's name when absent. */
-  name?: string | null;
   preset?: "draft" | "fast" | "full";
   seed?: number;
 }
@@ -151,6 +163,11 @@ export interface EditMessage {
   edit: Edit;
   /** Edits of one slider drag share a key: an edit replaces the last one when keys match and they are < 500 ms apart. */
   coalesce?: string | null;
+  /**
+   * Unique in the session, and the same when the client sends this edit again because it lost the connection before the answer: it is
+   * then answered as before and not applied twice.
+   */
+  key?: string | null;
 }
 
 export interface EditRequest {
@@ -183,6 +200,18 @@ export interface ErrorMessage {
   fatal: boolean;
 }
 
+/** Files for other programs, kept with the job until it is deleted. */
+export interface ExportRequest {
+  /** Shown in lists. */
+  name?: string | null;
+  /** Lower runs first; jobs of one priority run in the order in which they came. */
+  priority?: number;
+  limits?: JobLimits;
+  kind: "export";
+  asset: string;
+  formats: ("ply" | "ply3" | "glb" | "usd" | "env" | "zip")[];
+}
+
 /** A part of the surface that is held: some vertices by number, or those around a picked point. */
 export interface Grip {
   vertices?: number[] | null;
@@ -205,11 +234,25 @@ export interface Handles {
   pin?: Grip[];
 }
 
+export interface JobFile {
+  name: string;
+  bytes: number;
+  media_type: string;
+}
+
+export interface JobFileList {
+  /** By name; complete once the job is done. */
+  files: JobFile[];
+}
+
 export interface JobInfo {
   id: string;
-  kind: "build";
+  kind: "build" | "redecouple" | "simulate" | "render" | "export";
   name: string;
+  /** Empty where the kind has none. */
   preset: string;
+  /** Lower runs first. */
+  priority: number;
   state: "queued" | "running" | "stalled" | "done" | "failed" | "cancelled" | "unknown";
   created_at: string;
   finished_at: string | null;
@@ -224,12 +267,24 @@ export interface JobInfo {
   message: string;
   /** How often the work was started: 1 unless a worker died or it was retried. */
   attempts: number;
-  /** Set when done. */
+  /** What a build or a re-decoupling made; set when done. */
   asset_id: string | null;
+  /** What a job of another kind than `build` works on. */
+  source_asset: string | null;
+  /** What a `pose` edit names to show a simulation; set when done. */
+  clip: string | null;
   /** A sentence, when failed. */
   error: string | null;
   /** Rises with each new preview picture; 0 while there is none. Use it to get round the browser's cache. */
   preview_version: number;
+}
+
+/** A job that goes beyond ends as failed, its checkpoint kept. */
+export interface JobLimits {
+  /** Of work since it was last started; waiting does not count. */
+  seconds?: number | null;
+  /** Resident, of the worker's process. */
+  memory_bytes?: number | null;
 }
 
 export interface JobList {
@@ -297,15 +352,71 @@ export interface Problem {
   detail: string;
 }
 
+/** Separate material and light of a built asset again, on its geometry, with the effort of another preset: a new asset. */
+export interface RedecoupleRequest {
+  /** Shown in lists. */
+  name?: string | null;
+  /** Lower runs first; jobs of one priority run in the order in which they came. */
+  priority?: number;
+  limits?: JobLimits;
+  kind: "redecouple";
+  asset: string;
+  preset?: "draft" | "fast" | "full";
+}
+
 export interface RedoMessage {
   type: "redo";
   id: number;
+  /** As of an edit. */
+  key?: string | null;
 }
 
 export interface RejectedMessage {
   type: "rejected";
   id: number;
   reason: string;
+}
+
+export interface RenderCamera {
+  /** Of the picture. */
+  name: string;
+  /** OpenGL camera-to-world, rows. */
+  world_from_camera: [[number, number, number, number], [number, number, number, number], [number, number, number, number], [number, number, number, number]];
+  fov_y_degrees?: number;
+}
+
+/** Pictures of every variant under every environment from every camera, named variant-environment-camera.png. */
+export interface RenderRequest {
+  /** Shown in lists. */
+  name?: string | null;
+  /** Lower runs first; jobs of one priority run in the order in which they came. */
+  priority?: number;
+  limits?: JobLimits;
+  kind: "render";
+  asset: string;
+  cameras?: RenderCamera[];
+  /** Instead of cameras; with neither, one picture from the start view. */
+  turntable?: Turntable | null;
+  /** Stored environments, `own` for the asset's; none: the light that the variants' edits say. */
+  environments?: string[];
+  /** None: the asset as it is. */
+  variants?: RenderVariant[];
+  /** Of a simulate job: camera k shows its moment k / video_fps (or / 24). */
+  clip?: string | null;
+  width?: number;
+  height?: number;
+  spp?: number;
+  bounces?: number;
+  denoise?: boolean;
+  background?: "environment" | "transparent";
+  /** Also join the pictures of each variant and environment, in the order of the cameras, to an MP4 (H.264). */
+  video_fps?: number | null;
+}
+
+/** The asset under some edits; environment edits in it are kept where the request's environments do not replace them. */
+export interface RenderVariant {
+  name: string;
+  edits?: Edit[];
 }
 
 /** How a glTF rig, turned to z up and world units, is laid over the object at rest, and how the object follows it. */
@@ -317,6 +428,11 @@ export interface RigBinding {
   method?: "closest" | "mls";
   rest?: number | null;
   loop?: boolean;
+}
+
+export interface SaveRequest {
+  /** Of the new version; the asset's name when absent. */
+  name?: string | null;
 }
 
 /** Exactly one field is set. */
@@ -397,6 +513,32 @@ export interface SimulateEdit {
   time: number;
 }
 
+/** Move an asset's matter; the clip is played by `pose` edits that name it, and by batch renders. */
+export interface SimulateRequest {
+  /** Shown in lists. */
+  name?: string | null;
+  /** Lower runs first; jobs of one priority run in the order in which they came. */
+  priority?: number;
+  limits?: JobLimits;
+  kind: "simulate";
+  asset: string;
+  /** As in `drgs simulate --scene`; empty: a jelly under its own weight. */
+  scene?: Record<string, unknown>;
+}
+
+export interface SnapshotInfo {
+  name: string;
+  created_at: string;
+  /** Of the log when it was taken. */
+  revision: number;
+  edits: Edit[];
+}
+
+export interface SnapshotList {
+  /** Oldest first. */
+  snapshots: SnapshotInfo[];
+}
+
 export interface Sphere {
   center: [number, number, number];
   radius: number;
@@ -441,6 +583,13 @@ export interface TokenRequest {
   token: string;
 }
 
+/** Cameras round the object, all of it in sight. */
+export interface Turntable {
+  frames?: number;
+  elevation_degrees?: number;
+  turns?: number;
+}
+
 export interface TwistMap {
   type: "twist";
   rate: number;
@@ -449,6 +598,8 @@ export interface TwistMap {
 export interface UndoMessage {
   type: "undo";
   id: number;
+  /** As of an edit. */
+  key?: string | null;
 }
 
 /** A hidden page gets no frames. */

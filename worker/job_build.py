@@ -1,0 +1,82 @@
+"""Builds and re-decouplings: the builder's stages, each a durable step, then the asset's move to its place."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from worker.builders import STAGES, BuildRequest
+from worker.job_run import AbstractJobRun, JobContext
+from worker.register_asset import register_asset
+
+KEPT_CHECKPOINTS = ("stage1.safetensors", "mesh.safetensors")
+"""Of a finished build: what a re-decoupling starts from."""
+
+
+class BuildRun(AbstractJobRun):
+    """Final. One generator runs through the stages, so that a build that nothing disturbs reads its capture once."""
+
+    steps: tuple[str, ...] = (*STAGES, "register")
+
+    def __init__(self, job: JobContext) -> None:
+        self._job = job
+        self._stages: Iterator[str] | None = None
+
+    def run(self, step: str) -> None:
+        job = self._job
+        if step == "register":
+            self._register()
+            return
+        request = self._request()
+        if request.out.exists():
+            return  # packed; the crash came before the step was recorded
+        if self._stages is None:
+            if not request.dataset.is_dir():
+                raise ValueError(f"The capture {request.dataset.name} is gone; it was removed after the job was made.")
+            self._stages = job.builder(request, job.progress, job.should_stop)
+        if step not in self._stages:  # runs it up to and with this stage; finished ones come from their checkpoints
+            raise ValueError(f"the builder ended before its stage {step!r}")
+
+    def _request(self) -> BuildRequest:
+        job = self._job
+        assert job.dataset is not None
+        return BuildRequest(job.dataset, job.folder / "asset", job.parameters["preset"], job.parameters["seed"], job.device)
+
+    def _register(self) -> None:
+        """Does nothing that was already done."""
+        job = self._job
+        built, place = job.folder / "asset", job.directory.asset(job.job_id)
+        if built.exists() and not place.exists():
+            built.rename(place)
+        register_asset(job.engine, job.job_id, job.name, "build", place)
+        work = Path(f"{built}.build")
+        for path in work.iterdir() if work.is_dir() else ():
+            if path.name not in KEPT_CHECKPOINTS:
+                path.unlink()
+
+
+class RedecoupleRun(BuildRun):
+    """Final. A build that starts from another one's geometry."""
+
+    steps = ("copy", *STAGES, "register")
+
+    def run(self, step: str) -> None:
+        if step == "copy":
+            self._copy()
+        else:
+            super().run(step)
+
+    def _copy(self) -> None:
+        job = self._job
+        source, work = job.directory.job(job.parameters["asset"]) / "asset.build", job.folder / "asset.build"
+        work.mkdir(exist_ok=True)
+        for name in KEPT_CHECKPOINTS:
+            if not (source / name).is_file():
+                raise ValueError("This asset's geometry was not kept by a build on this service; build it here first.")
+            draft = work / f"{name}.part"
+            shutil.copyfile(source / name, draft)
+            draft.rename(work / name)
+
+    def _request(self) -> BuildRequest:
+        job, given = self._job, self._job.parameters
+        assert job.dataset is not None
+        return BuildRequest(job.dataset, job.folder / "asset", given["built_preset"], given["built_seed"], job.device, given["preset"])

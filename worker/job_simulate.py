@@ -1,0 +1,34 @@
+"""Simulations: an asset's matter moves, and the clip is kept where `pose` edits find it."""
+
+from worker.builders import BuildProgress, BuildStopped
+from worker.job_run import AbstractJobRun, JobContext
+from worker.requests import SimulateRequest
+
+
+class SimulateRun(AbstractJobRun):
+    """Final."""
+
+    steps = ("simulate",)
+
+    def __init__(self, job: JobContext) -> None:
+        self._job = job
+        self._asked = SimulateRequest.model_validate(job.parameters)
+
+    def run(self, step: str) -> None:
+        from drgs.deform.simulate import simulate
+        from drgs.deform.simulation_scene import parse_simulation_scene
+        from drgs.scene.asset import load_asset
+        from drgs.warp_torch import device_from_name
+
+        job, out = self._job, self._job.directory.clip(self._job.job_id)
+        if out.exists():
+            return  # written whole; the crash came before the step was recorded
+        asset = load_asset(job.directory.asset(self._asked.asset), device_from_name(job.device))
+
+        def report(done: int, total: int) -> None:
+            job.progress(BuildProgress("simulate", done, total, done / total, message=f"frame {done} of {total}"))
+            if job.should_stop():
+                raise BuildStopped
+
+        out.parent.mkdir(mode=0o700, exist_ok=True)
+        simulate(asset, parse_simulation_scene(self._asked.scene), out, report)
