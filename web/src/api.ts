@@ -1,6 +1,7 @@
 /** The REST calls of the viewer, each once. Every failure is an ApiError whose message is a sentence for the user. */
 
-import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobInfo, JobList, Problem, SessionInfo, SessionList } from './protocol.gen';
+import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobInfo, JobList, Problem, SessionInfo, SessionList, Settings } from './protocol.gen';
+import type { View } from './viewpoint';
 
 export class ApiError extends Error {
   constructor(
@@ -66,7 +67,7 @@ export const assetThumb = (asset: AssetInfo) => `/api/assets/${part(asset.id)}/t
 export const assetMesh = (id: string) => `/api/assets/${part(id)}/mesh.glb`;
 export const assetEnvironment = (id: string) => `/api/assets/${part(id)}/environment.exr`;
 export const assetExport = (id: string, format: ExportFormat) => `/api/assets/${part(id)}/export?format=${format}`;
-export type ExportFormat = 'glb' | 'ply' | 'env';
+export type ExportFormat = 'glb' | 'ply' | 'ply3' | 'usd' | 'env' | 'zip';
 
 export function uploadAsset(file: File, onProgress?: (share: number) => void): Promise<AssetInfo> {
   const form = new FormData();
@@ -87,6 +88,7 @@ export function uploadEnvironment(file: File, onProgress?: (share: number) => vo
 export const listJobs = () => call<JobList>('GET', '/api/jobs');
 export const startBuild = (request: BuildRequest) => call<JobInfo>('POST', '/api/jobs', request);
 export const cancelJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/cancel`);
+export const resumeJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/resume`);
 export const retryJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/retry`);
 export const jobPreview = (job: JobInfo) => `/api/jobs/${part(job.id)}/preview.jpg?v=${job.preview_version}`;
 
@@ -102,3 +104,28 @@ export const listSessions = () => call<SessionList>('GET', '/api/sessions');
 export const openSession = (asset: string) => call<SessionInfo>('POST', '/api/sessions', { asset });
 export const getSession = (id: string) => call<SessionInfo>('GET', `/api/sessions/${part(id)}`);
 export const appendEdit = (session: string, edit: Edit) => call<unknown>('POST', `/api/sessions/${part(session)}/edits`, { edit });
+
+/** Query of `frame.png` for a camera; a background colour is the stream's alone. */
+export function frameQuery(view: View, { width, height }: { width: number; height: number }, settings: Settings, transparent: boolean): string {
+  const query = new URLSearchParams({
+    width: String(width),
+    height: String(height),
+    spp: String(settings.spp_target),
+    bounces: String(settings.bounces),
+    exposure_stops: String(settings.exposure_stops),
+    channel: settings.channel ?? 'final',
+    denoise: String(settings.denoise),
+    background: transparent ? 'transparent' : 'environment',
+    fov_y_degrees: String(view.fov_y_degrees),
+    world_from_camera: view.world_from_camera.flat().join(','),
+  });
+  return query.toString();
+}
+
+export async function stillPicture(session: string, query: string): Promise<Blob> {
+  const response = await fetch(`/api/sessions/${part(session)}/frame.png?${query}`).catch(() => {
+    throw new ApiError(0, UNREACHABLE);
+  });
+  if (!response.ok) throw new ApiError(response.status, sentenceFor(response.status, await response.text()));
+  return response.blob();
+}

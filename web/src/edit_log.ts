@@ -1,14 +1,7 @@
 /** What an ordered list of edits amounts to, as far as the panels and the local picture show it. */
 
-import type { Triple } from './color';
-import type { Edit, EnvironmentEdit } from './protocol.gen';
-
-/** The captured value is replaced by `value` (null: kept), then multiplied by `factor`. */
-export interface MaterialOverride {
-  albedo: { value: Triple | null; factor: Triple };
-  roughness: { value: number | null; factor: number };
-  metallic: { value: number | null; factor: number };
-}
+import { presets } from './presets';
+import type { Edit, EnvironmentEdit, MaterialEdit, MaterialValues, Selection } from './protocol.gen';
 
 export interface Light {
   /** Null: the asset's own environment. */
@@ -16,25 +9,6 @@ export interface Light {
   /** Degrees, counter-clockwise seen from above. */
   rotation: number;
   intensity: number;
-}
-
-/** Edits of parts of the object are left out: only the server shows those. */
-export function wholeObjectMaterial(edits: Edit[]): MaterialOverride {
-  const result: MaterialOverride = { albedo: { value: null, factor: [1, 1, 1] }, roughness: { value: null, factor: 1 }, metallic: { value: null, factor: 1 } };
-  for (const edit of edits) {
-    if (edit.op !== 'material' || !edit.select.all) continue;
-    const { albedo, roughness, metallic } = edit.set;
-    if (edit.mode === 'multiply') {
-      if (albedo) result.albedo.factor = result.albedo.factor.map((factor, i) => factor * albedo[i]!) as Triple;
-      if (roughness != null) result.roughness.factor *= roughness;
-      if (metallic != null) result.metallic.factor *= metallic;
-    } else {
-      if (albedo) result.albedo = { value: albedo, factor: [1, 1, 1] };
-      if (roughness != null) result.roughness = { value: roughness, factor: 1 };
-      if (metallic != null) result.metallic = { value: metallic, factor: 1 };
-    }
-  }
-  return result;
 }
 
 export function lightOf(edits: Edit[]): Light {
@@ -49,16 +23,68 @@ export function environmentEdit(light: Light): EnvironmentEdit {
   return { op: 'environment', file: light.file, rotation: light.rotation, intensity: light.intensity };
 }
 
+export const sameSelection = (a: Selection, b: Selection) => a === b || JSON.stringify(plain(a)) === JSON.stringify(plain(b));
+/** The server leaves out what is null and fills in defaults; key order follows the schema on both sides. */
+const plain = ({ all, sphere, box, region, similar, vertex_weights }: Selection) => ({
+  all: all || undefined,
+  sphere: sphere ? { ...sphere, falloff: sphere.falloff ?? 0 } : undefined,
+  box: box ? { ...box, falloff: box.falloff ?? 0 } : undefined,
+  region: region ?? undefined,
+  similar: similar ? { ...similar, tolerance: similar.tolerance ?? 0.1 } : undefined,
+  vertex_weights: vertex_weights ?? undefined,
+});
+export const sameEdits = (a: Edit[], b: Edit[]) => JSON.stringify(a.map(comparable)) === JSON.stringify(b.map(comparable));
+const comparable = (edit: Edit) => (edit.op === 'material' ? { ...edit, select: plain(edit.select), set: valuesOf(edit.set), mode: edit.mode ?? 'absolute' } : withoutNulls(edit));
+const valuesOf = ({ albedo, roughness, metallic }: MaterialValues) => ({ albedo: albedo ?? undefined, roughness: roughness ?? undefined, metallic: metallic ?? undefined });
+const withoutNulls = (edit: Edit) => Object.fromEntries(Object.entries(edit).filter(([, value]) => value !== null).sort(([a], [b]) => (a < b ? -1 : 1)));
+
+const touches = (edit: Edit, select: Selection, key: keyof MaterialValues): edit is MaterialEdit =>
+  edit.op === 'material' && edit.set[key] != null && sameSelection(edit.select, select);
+
+/** Whether an edit of this very selection sets the value. */
+export const isSet = (edits: Edit[], select: Selection, key: keyof MaterialValues) => edits.some((edit) => touches(edit, select, key));
+
+/** The edits as if this value of this selection had never been touched. */
+export function withoutValue(edits: Edit[], select: Selection, key: keyof MaterialValues): Edit[] {
+  return edits.flatMap((edit): Edit[] => {
+    if (!touches(edit, select, key)) return [edit];
+    const { [key]: _, ...set } = valuesOf(edit.set);
+    return Object.values(set).some((value) => value !== undefined) ? [{ ...edit, set }] : [];
+  });
+}
+
+/** The factor that multiplying edits of this selection give a value: the newest one's, 1 where there is none. */
+export function factorOf<Key extends keyof MaterialValues>(edits: Edit[], select: Selection, key: Key): MaterialValues[Key] | null {
+  const newest = edits.findLast((edit) => touches(edit, select, key) && edit.mode === 'multiply') as MaterialEdit | undefined;
+  return newest?.set[key] ?? null;
+}
+
+/** `edit` in the place of the newest one that `replaces` names, else at the end. */
+export function withReplaced(edits: Edit[], edit: Edit, replaces: (other: Edit) => boolean): Edit[] {
+  const at = edits.findLastIndex(replaces);
+  return at < 0 ? [...edits, edit] : edits.with(at, edit);
+}
+
 const rounded = (value: number) => (Math.round(value * 100) / 100).toString();
+
+const PART_NAMES = { region: 'Region', similar: 'Similar', sphere: 'Sphere', box: 'Box', vertex_weights: 'Painted' } as const;
+
+function partName(select: Selection): string {
+  const kind = (Object.keys(PART_NAMES) as (keyof typeof PART_NAMES)[]).find((name) => select[name] != null);
+  return kind ? `${PART_NAMES[kind]}: ` : '';
+}
+
+const sameValues = (a: MaterialValues, b: MaterialValues) => JSON.stringify(valuesOf(a)) === JSON.stringify(valuesOf(b));
 
 /** One line for the history list. */
 export function describeEdit(edit: Edit): string {
   switch (edit.op) {
     case 'material': {
       const { albedo, roughness, metallic } = edit.set;
-      const parts = [albedo && 'base colour', roughness != null && `roughness ${rounded(roughness)}`, metallic != null && `metallic ${rounded(metallic)}`].filter(Boolean);
-      const times = edit.mode === 'multiply' ? ' ×' : '';
-      return `${edit.select.all ? '' : 'Part: '}${parts.join(', ')}${times}`.replace(/^./, (first) => first.toUpperCase());
+      const known = presets.find((preset) => edit.mode !== 'multiply' && sameValues(preset, edit.set));
+      const parts = [albedo && 'colour', roughness != null && `roughness ${rounded(roughness)}`, metallic != null && `metallic ${rounded(metallic)}`].filter(Boolean);
+      const what = known ? known.name.toLowerCase() : parts.join(', ') + (edit.mode === 'multiply' ? ' ×' : '');
+      return `${partName(edit.select)}${what}`.replace(/^./, (first) => first.toUpperCase());
     }
     case 'environment': {
       const parts = [edit.file ? edit.file.replace(/\.(exr|hdr)$/i, '') : 'Light'];

@@ -21,9 +21,12 @@ import {
   MeshStandardMaterial,
   PerspectiveCamera,
   PMREMGenerator,
+  Raycaster,
   RGBAFormat,
   Scene,
+  SphereGeometry,
   SRGBColorSpace,
+  Triangle,
   Vector2,
   Vector3,
   WebGLRenderer,
@@ -34,16 +37,10 @@ import {
 import { EXRLoader } from 'three/examples/jsm/loaders/EXRLoader.js';
 import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
 import { HDRLoader } from 'three/examples/jsm/loaders/HDRLoader.js';
-import type { Triple } from './color';
-import type { MaterialOverride } from './edit_log';
+import { srgbFromLinear, type Triple } from './color';
+import { nearestVertex, type MaterialMean, type Materials, type RestMesh } from './materials';
 
 const lightFromYUp = new Matrix4().makeRotationX(-Math.PI / 2); // (x, y, z) -> (x, z, -y)
-
-export interface MaterialMean {
-  albedo: Triple;
-  roughness: number;
-  metallic: number;
-}
 
 export class LocalPicture {
   private readonly renderer: WebGLRenderer;
@@ -56,15 +53,12 @@ export class LocalPicture {
   private sky: Texture | null = null;
   private background: 'environment' | 'transparent' | Triple = 'environment';
   private readonly uniforms = {
-    albedoOverride: { value: new Color() },
-    albedoScale: { value: new Color(1, 1, 1) },
-    roughnessMetallicOverride: { value: new Vector2() },
-    roughnessMetallicScale: { value: new Vector2(1, 1) },
-    /** 1 where the override replaces the captured value: albedo, roughness, metallic. */
-    overridden: { value: new Vector3() },
+    /** Strength 0..1 of the selection's colour, and 1 where nothing else is to be drawn. */
+    highlight: { value: 0 },
+    onlyHighlight: { value: 0 },
   };
-  /** True once there is a mesh to draw. */
-  hasMesh = false;
+  private object: Mesh | null = null;
+  private rest: RestMesh | null = null;
 
   /** Throws where the browser has no WebGL 2. */
   constructor(readonly canvas: HTMLCanvasElement) {
@@ -84,26 +78,138 @@ export class LocalPicture {
     this.renderer.setSize(width, height, false);
   }
 
+  /** True once there is a mesh to draw. */
+  get hasMesh(): boolean {
+    return this.object !== null;
+  }
+
+  dropMesh(): void {
+    this.object?.geometry.dispose();
+    this.root.clear();
+    this.object = this.rest = null;
+  }
+
   /**
    * Replace the mesh by an asset's `mesh.glb`, whose buffers hold world units with z up; its node, which turns them for other
-   * programs, is left out. Returns the mean of its vertex materials, which the sliders show while nothing is overridden.
+   * programs, is left out.
    */
-  async loadMesh(url: string): Promise<MaterialMean> {
+  async loadMesh(url: string): Promise<RestMesh> {
     const gltf = await new GLTFLoader().loadAsync(url);
-    this.root.traverse((node) => node instanceof Mesh && (node.geometry as BufferGeometry).dispose());
-    this.root.clear();
-    const means: MaterialMean[] = [];
-    gltf.scene.traverse((node) => {
-      if (!(node instanceof Mesh)) return;
-      const geometry = node.geometry as BufferGeometry;
-      const authored = node.material as MeshStandardMaterial;
-      if (!geometry.getAttribute('normal')) geometry.computeVertexNormals();
-      means.push(completeVertexMaterials(geometry, authored));
-      const mesh = new Mesh(geometry, this.material);
-      this.root.add(mesh);
+    const loaded = gltf.scene.getObjectByProperty('isMesh', true) as Mesh;
+    const geometry = loaded.geometry as BufferGeometry;
+    if (!geometry.getAttribute('normal')) geometry.computeVertexNormals();
+    const count = completeVertexMaterials(geometry, loaded.material as MeshStandardMaterial);
+    geometry.setAttribute('_weight', new BufferAttribute(new Float32Array(count), 1));
+    const copy = (name: string) => (geometry.getAttribute(name).array as Float32Array).slice();
+    // Attributes may share one buffer in the file (colour and albedo do): ours are written to.
+    for (const name of ['position', 'normal', 'color', '_roughness', '_metallic']) geometry.setAttribute(name, new BufferAttribute(copy(name), geometry.getAttribute(name).itemSize));
+    this.dropMesh();
+    this.object = new Mesh(geometry, this.material);
+    this.object.frustumCulled = false; // its shape changes; it is nearly always in sight
+    this.root.add(this.object);
+    this.rest = {
+      positions: copy('position'),
+      normals: copy('normal'),
+      faces: new Uint32Array(geometry.index!.array),
+      materials: { albedo: copy('color'), roughness: copy('_roughness'), metallic: copy('_metallic') },
+    };
+    return this.rest;
+  }
+
+  /** Picture of the present environment, its median made middle grey, as a data address; null where its texels cannot be read. */
+  drawSky(width: number): string | null {
+    const { data, width: columns, height: rows } = (this.sky?.image ?? {}) as { data?: unknown; width: number; height: number };
+    if (!(data instanceof Float32Array)) return null;
+    const height = width / 2;
+    const channels = data.length / (columns * rows);
+    const texel = (x: number, y: number) => channels * (Math.floor(((y + 0.5) * rows) / height) * columns + Math.floor(((x + 0.5) * columns) / width));
+    const flat = document.createElement('canvas');
+    Object.assign(flat, { width, height });
+    const context = flat.getContext('2d')!;
+    const picture = context.createImageData(width, height);
+    const order = Float32Array.from({ length: width * height }, (_, i) => data[texel(i % width, Math.floor(i / width)) + 1]!).sort();
+    const scale = 0.18 / Math.max(1e-6, order[order.length >> 1]!);
+    for (let i = 0; i < width * height; i++) {
+      const from = texel(i % width, height - 1 - Math.floor(i / width)); // loaders store rows from below
+      for (let k = 0; k < 3; k++) {
+        const value = Math.max(0, data[from + k]!) * scale;
+        picture.data[4 * i + k] = 255 * srgbFromLinear(value / (1 + value));
+      }
+      picture.data[4 * i + 3] = 255;
+    }
+    context.putImageData(picture, 0, 0);
+    return flat.toDataURL('image/jpeg');
+  }
+
+  setMaterials({ albedo, roughness, metallic }: Materials): void {
+    this.write('color', albedo);
+    this.write('_roughness', roughness);
+    this.write('_metallic', metallic);
+  }
+
+  setHighlighted(weights: Float32Array): void {
+    this.write('_weight', weights);
+  }
+
+  /** Vertex positions; the captured ones bring the captured normals back. */
+  setShape(positions: Float32Array): void {
+    const { object, rest } = this;
+    if (!object || !rest) return;
+    this.write('position', positions);
+    if (positions === rest.positions) this.write('normal', rest.normals);
+    else object.geometry.computeVertexNormals();
+    object.geometry.boundingSphere = null;
+  }
+
+  private write(name: string, values: Float32Array): void {
+    const attribute = this.object?.geometry.getAttribute(name) as BufferAttribute | undefined;
+    if (!attribute || attribute.array.length !== values.length) return;
+    (attribute.array as Float32Array).set(values);
+    attribute.needsUpdate = true;
+  }
+
+  /** Where the ray through a point of the picture (-1..1, y up) meets the object: at rest, and as posed. */
+  pick(camera: PerspectiveCamera, x: number, y: number): { rest: Triple; posed: Triple; vertex: number } | null {
+    const { object, rest } = this;
+    if (!object || !rest) return null;
+    const ray = new Raycaster();
+    camera.updateMatrixWorld();
+    ray.setFromCamera(new Vector2(x, y), camera);
+    object.matrixWorld.identity(); // the picture's own frame turns with the light; rays are in the world's
+    const [hit] = ray.intersectObject(object, false);
+    if (!hit?.face) return null;
+    const corners = [hit.face.a, hit.face.b, hit.face.c];
+    const positions = object.geometry.getAttribute('position');
+    const posed = corners.map((i) => new Vector3().fromBufferAttribute(positions, i)) as [Vector3, Vector3, Vector3];
+    const share = Triangle.getBarycoord(hit.point, ...posed, new Vector3())!.toArray();
+    const point = [0, 1, 2].map((axis) => corners.reduce((sum, i, k) => sum + share[k]! * rest.positions[3 * i + axis]!, 0)) as Triple;
+    return { rest: point, posed: hit.point.toArray(), vertex: nearestVertex(rest.positions, point) };
+  }
+
+  /** Pictures of a ball of each material under the present light, as data addresses. The canvas must be drawn anew afterwards. */
+  drawBalls(materials: MaterialMean[], side: number): string[] {
+    const scene = new Scene();
+    scene.environment = this.scene.environment;
+    const ball = new Mesh(new SphereGeometry(1, 32, 24));
+    const eye = new PerspectiveCamera(30, 1, 0.1, 10);
+    eye.position.set(0, 0.6, 4);
+    eye.lookAt(0, 0, 0);
+    scene.add(ball);
+    this.resize(side, side, 1);
+    this.renderer.toneMappingExposure = 1;
+    const flat = document.createElement('canvas');
+    flat.width = flat.height = side;
+    const context = flat.getContext('2d')!;
+    const pictures = materials.map(({ albedo, roughness, metallic }) => {
+      ball.material = new MeshStandardMaterial({ color: new Color().setRGB(...albedo), roughness, metalness: metallic });
+      this.renderer.render(scene, eye);
+      context.clearRect(0, 0, side, side);
+      context.drawImage(this.canvas, 0, 0);
+      ball.material.dispose();
+      return flat.toDataURL();
     });
-    this.hasMesh = means.length > 0;
-    return means[0] ?? { albedo: [0.5, 0.5, 0.5], roughness: 0.5, metallic: 0 };
+    ball.geometry.dispose();
+    return pictures;
   }
 
   /** Fetch an EXR or HDR and light the scene with it. */
@@ -112,23 +218,16 @@ export class LocalPicture {
     this.showEnvironment(await loader.setDataType(FloatType).loadAsync(url));
   }
 
-  setMaterial(override: MaterialOverride): void {
-    const { albedo, roughness, metallic } = override;
-    const u = this.uniforms;
-    if (albedo.value) u.albedoOverride.value.setRGB(...albedo.value);
-    u.roughnessMetallicOverride.value.set(roughness.value ?? 0, metallic.value ?? 0);
-    u.overridden.value.set(albedo.value ? 1 : 0, roughness.value === null ? 0 : 1, metallic.value === null ? 0 : 1);
-    u.albedoScale.value.setRGB(...albedo.factor);
-    u.roughnessMetallicScale.value.set(roughness.factor, metallic.factor);
-  }
-
   setBackground(background: 'environment' | 'transparent' | Triple): void {
+    // A colour is shown by the page behind the canvas: tone mapping would alter it here.
     this.background = background;
-    this.applyBackground();
   }
 
   /** Draw what `camera` sees (world, z up). */
-  render(camera: PerspectiveCamera, near: number, far: number, rotationDegrees: number, intensity: number, stops: number): void {
+  render(camera: PerspectiveCamera, near: number, far: number, rotationDegrees: number, intensity: number, stops: number, highlight: number, onlyHighlight: boolean): void {
+    this.uniforms.highlight.value = highlight;
+    this.uniforms.onlyHighlight.value = onlyHighlight ? 1 : 0;
+    this.scene.background = this.background === 'environment' && !onlyHighlight ? this.sky : null;
     const lightFromWorld = new Matrix4().makeRotationZ((-rotationDegrees * Math.PI) / 180).premultiply(lightFromYUp);
     this.root.matrix.copy(lightFromWorld);
     this.root.matrixWorldNeedsUpdate = true;
@@ -162,13 +261,6 @@ export class LocalPicture {
     this.radiance = radiance;
     this.sky = sky;
     this.scene.environment = radiance.texture;
-    this.applyBackground();
-  }
-
-  private applyBackground(): void {
-    if (this.background === 'environment') this.scene.background = this.sky;
-    else this.scene.background = null;
-    // A colour is shown by the page behind the canvas: tone mapping would alter it here.
   }
 
   /** Teach the standard material to take roughness and metallic from vertices, as the asset's mesh holds them. */
@@ -177,45 +269,39 @@ export class LocalPicture {
     this.material.onBeforeCompile = (shader) => {
       Object.assign(shader.uniforms, this.uniforms);
       shader.vertexShader = shader.vertexShader
-        .replace('#include <common>', '#include <common>\nattribute float _roughness;\nattribute float _metallic;\nvarying vec2 vRoughnessMetallic;')
-        .replace('#include <begin_vertex>', '#include <begin_vertex>\nvRoughnessMetallic = vec2(_roughness, _metallic);');
+        .replace('#include <common>', '#include <common>\nattribute float _roughness, _metallic, _weight;\nvarying vec3 vRoughnessMetallicWeight;')
+        .replace('#include <begin_vertex>', '#include <begin_vertex>\nvRoughnessMetallicWeight = vec3(_roughness, _metallic, _weight);');
       shader.fragmentShader = shader.fragmentShader
+        .replace('#include <common>', '#include <common>\nvarying vec3 vRoughnessMetallicWeight;\nuniform float highlight, onlyHighlight;')
+        .replace('#include <roughnessmap_fragment>', 'float roughnessFactor = vRoughnessMetallicWeight.x;')
+        .replace('#include <metalnessmap_fragment>', 'float metalnessFactor = vRoughnessMetallicWeight.y;')
+        // Colours here are sRGB with premultiplied alpha.
         .replace(
-          '#include <common>',
-          `#include <common>
-          varying vec2 vRoughnessMetallic;
-          uniform vec3 albedoOverride, albedoScale, overridden;
-          uniform vec2 roughnessMetallicOverride, roughnessMetallicScale;`,
-        )
-        .replace('#include <color_fragment>', 'diffuseColor.rgb = clamp(mix(vColor.rgb, albedoOverride, overridden.x) * albedoScale, 0.0, 1.0);')
-        .replace(
-          '#include <roughnessmap_fragment>',
-          `vec2 roughnessMetallic = clamp(mix(vRoughnessMetallic, roughnessMetallicOverride, overridden.yz) * roughnessMetallicScale, 0.0, 1.0);
-          float roughnessFactor = roughnessMetallic.x;`,
-        )
-        .replace('#include <metalnessmap_fragment>', 'float metalnessFactor = roughnessMetallic.y;');
+          '#include <dithering_fragment>',
+          `float marked = highlight * vRoughnessMetallicWeight.z;
+          gl_FragColor = mix(gl_FragColor * (1.0 - onlyHighlight), vec4(${HIGHLIGHT}, 1.0), marked);`,
+        );
     };
   }
 }
 
-/** Fill in what a foreign file leaves out, so that one shader serves all; returns the mean over the vertices. */
-function completeVertexMaterials(geometry: BufferGeometry, authored: MeshStandardMaterial): MaterialMean {
+/** Fill in what a foreign file leaves out, so that one shader serves all; returns the number of vertices. */
+function completeVertexMaterials(geometry: BufferGeometry, authored: MeshStandardMaterial): number {
   const count = geometry.getAttribute('position').count;
-  const constant = (value: number) => new BufferAttribute(new Float32Array(count).fill(value), 1);
-  if (!geometry.getAttribute('color')) {
-    const { r, g, b } = authored.color ?? new Color(0.5, 0.5, 0.5);
-    geometry.setAttribute('color', new BufferAttribute(new Float32Array(Array.from({ length: count }, () => [r, g, b]).flat()), 3));
-  }
-  if (!geometry.getAttribute('_roughness')) geometry.setAttribute('_roughness', constant(authored.roughness ?? 0.5));
-  if (!geometry.getAttribute('_metallic')) geometry.setAttribute('_metallic', constant(authored.metalness ?? 0));
-  const mean = (name: string, component: 'getX' | 'getY' | 'getZ') => {
-    const attribute = geometry.getAttribute(name);
-    let sum = 0;
-    for (let i = 0; i < count; i++) sum += attribute[component](i);
-    return sum / Math.max(1, count);
+  const fill = (name: string, values: number[]) => {
+    if (geometry.getAttribute(name)) return;
+    const array = Float32Array.from({ length: count * values.length }, (_, i) => values[i % values.length]!);
+    geometry.setAttribute(name, new BufferAttribute(array, values.length));
   };
-  return { albedo: [mean('color', 'getX'), mean('color', 'getY'), mean('color', 'getZ')], roughness: mean('_roughness', 'getX'), metallic: mean('_metallic', 'getX') };
+  const { r, g, b } = authored.color ?? new Color(0.5, 0.5, 0.5);
+  fill('color', [r, g, b]);
+  fill('_roughness', [authored.roughness ?? 0.5]);
+  fill('_metallic', [authored.metalness ?? 0]);
+  return count;
 }
+
+/** Of selected parts, as GLSL. */
+const HIGHLIGHT = 'vec3(1.0, 0.62, 0.15)';
 
 /** Radiance 1 from everywhere: the light of an asset that was imported without any. */
 function constantEnvironment(): DataTexture {

@@ -2,9 +2,9 @@
 
 import { batch } from '@preact/signals';
 import * as api from './api';
-import { environmentEdit, type Light } from './edit_log';
+import { environmentEdit, sameEdits, sameSelection, withoutValue, withReplaced, type Light } from './edit_log';
 import type { Edit, EditLog, FrameHeader, MaterialValues, PickedMessage, ServerHello, SessionInfo, Settings } from './protocol.gen';
-import { attempt, captured, connection, light, log, notify, pending, session, settings, status } from './state';
+import { attempt, connection, draft, edits, EVERYTHING, flash, light, log, mesh, mode, notify, pending, selection, session, settings, status, tool, undone } from './state';
 import { Stream } from './stream';
 
 /** Edits of one drag go out at most this often; the server makes one undo step of those that share a key. */
@@ -38,7 +38,14 @@ export async function openAsset(id: string): Promise<void> {
     log.value = { revision: info.revision, edits: info.edits, can_undo: info.can_undo, can_redo: info.can_redo };
     pending.value = [];
     status.value = null;
-    captured.value = null;
+    mesh.value = null;
+    draft.value = null;
+    undone.value = [];
+    selection.value = EVERYTHING;
+    tool.value = 'all';
+    rewrite = null;
+    past = [];
+    future = [];
   });
   history.replaceState(null, '', `#asset=${encodeURIComponent(id)}`);
   document.title = `${info.asset_name} · DR-GS`;
@@ -72,6 +79,10 @@ function events(asset: string): ConstructorParameters<typeof Stream>[1] {
     connection: (state) => (connection.value = state),
     hello: (hello) => {
       takeLog(hello.log);
+      if (rewrite) {
+        stream?.forgetOrdered(); // how far it got shows in the log
+        queueMicrotask(continueRewrite);
+      }
       lastHello = hello;
       helloListener?.(hello);
     },
@@ -81,8 +92,10 @@ function events(asset: string): ConstructorParameters<typeof Stream>[1] {
           return takeLog(message.log);
         case 'accepted':
           pending.value = pending.value.map((waiting) => (waiting.id === message.id ? { ...waiting, revision: message.revision } : waiting));
-          return takeLog(log.value);
+          takeLog(log.value);
+          return continueRewrite();
         case 'rejected':
+          rewrite = draft.value = null;
           pending.value = pending.value.filter((waiting) => waiting.id !== message.id);
           return notify(message.reason);
         case 'status':
@@ -131,6 +144,13 @@ async function recoverSession(asset: string): Promise<string | null> {
 
 function takeLog(next: EditLog): void {
   batch(() => {
+    const old = log.value.edits;
+    const kept = next.edits.length;
+    if (next.revision > log.value.revision && rewrite === null) {
+      if (kept < old.length && sameEdits(old.slice(0, kept), next.edits)) undone.value = [...old.slice(kept), ...undone.value];
+      else if (next.can_redo && kept === old.length + 1) undone.value = undone.value.slice(1);
+    }
+    if (!next.can_redo) undone.value = [];
     log.value = next;
     pending.value = pending.value.filter((waiting) => waiting.revision === null || waiting.revision > next.revision);
   });
@@ -157,38 +177,129 @@ function sendFlowing(key: string, edit: Edit): void {
     drag.next = edit;
     return;
   }
-  const flow: Drag = { timer: 0, next: null };
+  const flow: Drag = { timer: 0, next: edit };
   drags.set(key, flow);
   const step = () => {
-    if (flow.next) {
+    if (rewrite) flow.timer = window.setTimeout(step, DRAG_INTERVAL_MS);
+    else if (flow.next) {
       send(flow.next, key);
       flow.next = null;
       flow.timer = window.setTimeout(step, DRAG_INTERVAL_MS);
     } else drags.delete(key);
   };
-  send(edit, key);
-  flow.timer = window.setTimeout(step, DRAG_INTERVAL_MS);
+  step();
 }
 
+/** Set values of the selected part. Multiplying edits, and painted ones, which are long, are sent when the slider is let go. */
 export function editMaterial(set: MaterialValues): void {
-  sendFlowing(`material.${Object.keys(set).join('+')}`, { op: 'material', select: { all: true }, set, mode: 'absolute' });
+  const select = selection.value;
+  const edit: Edit = { op: 'material', select, set, mode: mode.value };
+  const keys = Object.keys(set).join('+');
+  if (mode.value === 'absolute' && !select.vertex_weights) return sendFlowing(`material.${keys}.${flash.value}`, edit);
+  const wanted = Object.keys(set).sort().join();
+  draftEdit(edit, (other) => other.op === 'material' && other.mode === edit.mode && sameSelection(select, other.select) && keysOf(other.set) === wanted);
+}
+
+const keysOf = (set: MaterialValues) => (Object.keys(set) as (keyof MaterialValues)[]).filter((key) => set[key] != null).sort().join();
+
+export function resetMaterial(key: keyof MaterialValues): void {
+  replaceEdits(withoutValue(edits.value, selection.value, key));
 }
 
 export function editLight(change: Partial<Light>): void {
   sendFlowing(`light.${Object.keys(change).join('+')}`, environmentEdit({ ...light.value, ...change }));
 }
 
+/** The asset's own environment again. An edit without a file keeps the one in force, so those that named one must go. */
+export function useCapturedLight(): void {
+  const { rotation, intensity } = light.value;
+  const others = edits.value.filter((edit) => edit.op !== 'environment');
+  replaceEdits(rotation || intensity !== 1 ? [...others, environmentEdit({ file: null, rotation, intensity })] : others);
+}
+
+export const isTwin = (edit: Edit) => (other: Edit) => edit.op === 'deform' && other.op === 'deform' && edit.map != null && edit.map.type === other.map?.type;
+
+/** Another moment of what moves: each says where everything is, whatever came before. */
+export function editTime(edit: Edit): void {
+  sendFlowing(`time.${edit.op}`, edit);
+}
+
+// ---- edits that take an earlier one's place ------------------------------------------------------------------------------
+
+/** Show what `edit` does, in place of the newest one that it replaces; the server hears of it by `commitDraft`. */
+export function draftEdit(edit: Edit, replaces: (other: Edit) => boolean): void {
+  if (rewrite) return;
+  draft.value = withReplaced([...log.value.edits, ...pending.value.map((waiting) => waiting.edit)], edit, replaces);
+}
+
+export function commitDraft(): void {
+  if (draft.value && !rewrite) replaceEdits(draft.value);
+}
+
+interface Rewrite {
+  before: Edit[];
+  after: Edit[];
+  /** Attempts left, should another viewer change the log meanwhile. */
+  attempts: number;
+}
+/** The one under way, and those that undo and redo can step over: the log itself only knows its end. */
+let rewrite: Rewrite | null = null;
+let past: Rewrite[] = [];
+let future: Rewrite[] = [];
+
+/** Make the log hold exactly these edits: undo back to the first that differs, then add the rest. */
+export function replaceEdits(after: Edit[], remember = true): void {
+  if (!stream || rewrite) return;
+  const before = log.value.edits;
+  if (sameEdits(before, after)) {
+    draft.value = null;
+    return;
+  }
+  rewrite = { before, after, attempts: 3 };
+  if (remember) {
+    past = [...past, rewrite];
+    future = [];
+  }
+  draft.value = after;
+  continueRewrite();
+}
+
+function continueRewrite(): void {
+  if (!rewrite || !stream || !stream.idle) return;
+  const { after } = rewrite;
+  const now = log.value.edits;
+  if (sameEdits(now, after) || rewrite.attempts-- === 0) {
+    rewrite = draft.value = null;
+    return;
+  }
+  let same = 0;
+  while (same < now.length && same < after.length && sameEdits([now[same]!], [after[same]!])) same++;
+  for (let steps = now.length - same; steps > 0; steps--) stream.undo();
+  for (const edit of after.slice(same)) stream.sendEdit(edit, null);
+}
+
 export function undo(): void {
-  if (log.value.can_undo || pending.value.length) stream?.undo();
+  const step = past.at(-1);
+  if (step && !rewrite && sameEdits(step.after, log.value.edits)) {
+    past = past.slice(0, -1);
+    future = [...future, step];
+    replaceEdits(step.before, false);
+  } else if (log.value.can_undo || pending.value.length) stream?.undo();
 }
 
 export function redo(): void {
-  if (log.value.can_redo) stream?.redo();
+  const step = future.at(-1);
+  if (step && !rewrite && sameEdits(step.before, log.value.edits)) {
+    future = future.slice(0, -1);
+    past = [...past, step];
+    replaceEdits(step.after, false);
+  } else if (log.value.can_redo) stream?.redo();
 }
 
-/** Back to the log with `count` edits in force, by that many undo steps. */
-export function undoTo(count: number): void {
+/** To the log with `count` edits in force, back or forth among those that are known. */
+export function goTo(count: number): void {
   for (let steps = log.value.edits.length - count; steps > 0; steps--) stream?.undo();
+  for (let steps = count - log.value.edits.length; steps > 0; steps--) stream?.redo();
 }
 
 export function changeSettings(change: Partial<Settings>): void {

@@ -12,19 +12,27 @@ export interface Shortcut {
 
 export type ActionName =
   | 'frame' | 'home' | 'undo' | 'redo' | 'help' | 'escape' | 'local' | 'theme' | 'library' | 'inspector'
-  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'still' | 'before';
+  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'still' | 'before' | 'fly' | 'all' | 'copy' | 'paste' | 'show';
 
 export const shortcuts: Shortcut[] = [
   { group: 'Camera', chords: [], gesture: 'Left drag, one finger', text: 'Orbit' },
   { group: 'Camera', chords: [], gesture: 'Right drag, Shift+middle drag, two fingers', text: 'Pan' },
   { group: 'Camera', chords: [], gesture: 'Wheel, Ctrl+middle drag, pinch', text: 'Zoom' },
-  { group: 'Camera', chords: [], gesture: 'Double-click', text: 'Put the focal point on the surface' },
+  { group: 'Camera', chords: [], gesture: 'Double-click, double tap', text: 'Put the focal point on the surface' },
   { group: 'Camera', chords: ['f'], text: 'Frame the object', action: 'frame' },
   { group: 'Camera', chords: ['shift+f'], text: 'Reset the camera', action: 'home' },
+  { group: 'Camera', chords: ['v'], text: 'Fly, or orbit again', action: 'fly' },
+  { group: 'Camera', chords: [], gesture: 'W A S D, Q E (flying)', text: 'Move; Shift faster, Alt slower' },
   { group: 'Light', chords: [], gesture: 'Alt+drag, Shift+right drag', text: 'Turn the environment' },
   { group: 'Edit', chords: ['mod+z'], text: 'Undo', action: 'undo' },
   { group: 'Edit', chords: ['mod+shift+z', 'mod+y'], text: 'Redo', action: 'redo' },
-  { group: 'Edit', chords: [], gesture: 'Double-click a slider', text: 'Reset that value' },
+  { group: 'Edit', chords: [], gesture: 'Click, with a tool chosen', text: 'Select a part' },
+  { group: 'Edit', chords: ['a'], text: 'Select all', action: 'all' },
+  { group: 'Edit', chords: ['s'], text: 'Show what is selected', action: 'show' },
+  { group: 'Edit', chords: ['mod+c'], text: 'Copy the material', action: 'copy' },
+  { group: 'Edit', chords: ['mod+v'], text: 'Paste the material', action: 'paste' },
+  { group: 'Edit', chords: ['b'], gesture: 'B, held', text: 'See the object as captured', action: 'before' },
+  { group: 'Edit', chords: [], gesture: 'Double-click a slider', text: 'Take that value’s edits back' },
   { group: 'View', chords: ['1'], text: 'Final picture', action: 'channel1' },
   { group: 'View', chords: ['2'], text: 'Albedo', action: 'channel2' },
   { group: 'View', chords: ['3'], text: 'Roughness', action: 'channel3' },
@@ -64,20 +72,37 @@ export function titleFor(action: ActionName, text?: string): string {
   return `${text ?? entry?.text ?? action}${chord ? ` (${chordText(chord)})` : ''}`;
 }
 
-/** Route key presses to `actions`; typing in a field keeps its own keys, except Escape and the undo chords of the page. */
-export function listenForKeys(actions: Partial<Record<ActionName, () => void>>): () => void {
+export type Actions = Partial<Record<ActionName, () => void>>;
+
+/**
+ * Route key presses to `actions`, and the release of a held key to `releases`; typing in a field keeps its own keys, except Escape.
+ * The flying camera has the letters W A S D Q E for itself.
+ */
+export function listenForKeys(actions: Actions, releases: Actions, isFlying: () => boolean): () => void {
   const byChord = new Map(shortcuts.flatMap((entry) => entry.chords.map((chord) => [chord, entry.action] as const)));
   const onKey = (event: KeyboardEvent) => {
     const chord = chordOf(event);
     const target = event.target as HTMLElement;
-    const typing = target.matches('input:not([type=range]):not([type=checkbox]):not([type=radio]):not([type=color]), textarea, select');
+    const typing = target.matches?.('input:not([type=range]):not([type=checkbox]):not([type=radio]):not([type=color]), textarea, select');
     if (typing && chord !== 'escape') return;
+    if (isFlying() && /^(shift\+|alt\+)?[wasdqe]$/.test(chord)) return;
     const action = byChord.get(chord);
     const run = action && actions[action];
-    if (!run) return;
+    if (!run || (action === 'copy' && String(getSelection()))) return;
     event.preventDefault();
-    run();
+    if (!event.repeat || !releases[action]) run();
   };
+  const onRelease = (event: KeyboardEvent) => {
+    const action = byChord.get(event.key.toLowerCase());
+    if (action) releases[action]?.();
+  };
+  const releaseAll = () => Object.values(releases).forEach((release) => release());
   window.addEventListener('keydown', onKey);
-  return () => window.removeEventListener('keydown', onKey);
+  window.addEventListener('keyup', onRelease);
+  window.addEventListener('blur', releaseAll);
+  return () => {
+    window.removeEventListener('keydown', onKey);
+    window.removeEventListener('keyup', onRelease);
+    window.removeEventListener('blur', releaseAll);
+  };
 }

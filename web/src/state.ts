@@ -1,9 +1,10 @@
 /** What the page knows, as signals: one copy each, read by panels and viewport, written only by session.ts, jobs.ts and the panels' own switches. */
 
 import { computed, effect, signal } from '@preact/signals';
-import { lightOf, wholeObjectMaterial } from './edit_log';
-import type { MaterialMean } from './local_picture';
-import type { AssetInfo, Edit, EditLog, EnvironmentInfo, JobInfo, Settings, StatusMessage } from './protocol.gen';
+import { lightOf } from './edit_log';
+import { applyMaterials, meanMaterial, selectVertices, type MaterialMean, type RestMesh } from './materials';
+import { presets, type NamedMaterial } from './presets';
+import type { AssetInfo, Edit, EditLog, EnvironmentInfo, JobInfo, Selection, Settings, StatusMessage } from './protocol.gen';
 import type { Connection } from './stream';
 
 export const assets = signal<AssetInfo[] | null>(null);
@@ -29,12 +30,36 @@ export interface PendingEdit {
   revision: number | null;
 }
 export const pending = signal<PendingEdit[]>([]);
-export const edits = computed<Edit[]>(() => [...log.value.edits, ...pending.value.map((waiting) => waiting.edit)]);
-export const material = computed(() => wholeObjectMaterial(edits.value));
+/** While the log is being changed in its middle, or a slider is dragged whose edit is sent at the end: what it will be. */
+export const draft = signal<Edit[] | null>(null);
+export const edits = computed<Edit[]>(() => draft.value ?? [...log.value.edits, ...pending.value.map((waiting) => waiting.edit)]);
 export const light = computed(() => lightOf(edits.value));
+/** What redo brings back, the next one first; as far as this page saw it undone. */
+export const undone = signal<Edit[]>([]);
 
-/** Mean of the mesh's captured materials; null until the mesh is here. */
-export const captured = signal<MaterialMean | null>(null);
+/** The asset's mesh as captured; null until it is here. */
+export const mesh = signal<RestMesh | null>(null);
+export const materials = computed(() => mesh.value && applyMaterials(mesh.value, edits.value));
+
+// ---- the part that material edits go to ---------------------------------------------------------------------------------
+
+export type Tool = 'all' | 'region' | 'similar' | 'sphere' | 'box' | 'brush';
+export const tool = signal<Tool>('all');
+export const EVERYTHING: Selection = { all: true };
+export const selection = signal<Selection>(EVERYTHING);
+export const mode = signal<'absolute' | 'multiply'>('absolute');
+/** Raised to let the selection flash. */
+export const flash = signal(0);
+/** While true the local picture shows material and shape as captured. */
+export const before = signal(false);
+
+const weights = computed(() => mesh.value && selectVertices(mesh.value, selection.value));
+/** Share of the vertices that is selected. */
+export const selectedShare = computed(() => (weights.value ? weights.value.reduce((sum, weight) => sum + weight, 0) / weights.value.length : 0));
+export const selectionWeights = weights;
+/** Mean of what is selected, with all edits. */
+export const mean = computed<MaterialMean>(() => (materials.value && weights.value && meanMaterial(materials.value, weights.value)) || NEUTRAL);
+const NEUTRAL: MaterialMean = { albedo: [0.5, 0.5, 0.5], roughness: 0.5, metallic: 0 };
 
 export const settings = signal<Required<Settings>>({ exposure_stops: 0, background: 'environment', spp_target: 256, bounces: 1, channel: 'final', denoise: true });
 
@@ -83,4 +108,14 @@ export const libraryOpen = kept<boolean>('libraryOpen', true);
 export const inspectorOpen = kept<boolean>('inspectorOpen', true);
 /** How many pixels the still picture may have. */
 export const resolution = kept<'low' | 'medium' | 'full'>('resolution', 'medium');
+export type Tab = 'material' | 'light' | 'shape' | 'view' | 'out';
+export const tab = kept<Tab>('tab', 'material');
+export const savedMaterials = kept<NamedMaterial[]>('materials', []);
+/** Shown in this order, each with a picture once the viewport has drawn it. */
+export const ballsWanted = computed(() => [...presets, ...savedMaterials.value]);
+export const balls = signal<string[]>([]);
+/** Picture of the asset's own environment; null until it is here. */
+export const capturedLight = signal<string | null>(null);
+export const copiedMaterial = signal<MaterialMean | null>(null);
+export const flying = signal(false);
 export const helpOpen = signal(false);

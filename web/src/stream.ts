@@ -112,6 +112,15 @@ export class Stream {
     return this.order({ type: 'redo', id: this.nextId++ });
   }
 
+  /** Whether the server has answered all edits, undos and redos. */
+  get idle(): boolean {
+    return this.ready && this.outbox.length === 0;
+  }
+
+  forgetOrdered(): void {
+    this.outbox = [];
+  }
+
   /** What lies under a point of the picture, as shares of its width and height. */
   pick(x: number, y: number): Promise<PickedMessage> {
     const id = this.nextId++;

@@ -12,11 +12,25 @@ import * as api from './api';
 import { LocalPicture } from './local_picture';
 import { FLAG_CONVERGED, FLAG_MOVING, MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from './protocol.gen';
 import { editLight, listen, pick, sendCamera } from './session';
-import { captured, edits, light, localPicture, log, material, notify, pending, resolution, session, settings } from './state';
+import { paint, selectAt } from './selecting';
+import { viewNow, type Row, type View } from './viewpoint';
+import { deformPoints, isAnalytic } from './shape';
+import { balls, ballsWanted, before, capturedLight, draft, edits, flash, flying, light, localPicture, log, materials, mesh, notify, pending, resolution, selectionWeights, session, settings, tool } from './state';
 
 CameraControls.install({ THREE: { MOUSE, Vector2, Vector3, Vector4, Quaternion, Matrix4, Spherical, Box3, Sphere, Raycaster } });
 
 const DEGREES_PER_PIXEL = 0.4;
+/** A press that moves less and is let go sooner is a click [pixels, ms]. */
+const CLICK_PIXELS = 4;
+const CLICK_MS = 500;
+const BALL_PIXELS = 72;
+const SKY_PIXELS = 160;
+/** How long a selection shows, in two pulses. */
+const FLASH_MS = 1400;
+/** Of a fly, in object radii a second; shift makes it so many times faster, alt slower. */
+const FLY_SPEED = 0.8;
+const FLY_FACTOR = 4;
+const FLY_CODES = ['KeyW', 'KeyA', 'KeyS', 'KeyD', 'KeyQ', 'KeyE'];
 const MOVING_MS = 120;
 /** Room around a framed object: 1 is none. */
 const MARGIN = 1.06;
@@ -56,6 +70,11 @@ export class Viewport {
   private localMesh = '';
   private localEnvironment = '';
   private turning: { pointer: number; x: number; rotation: number } | null = null;
+  private pressed: { pointer: number; x: number; y: number; at: number } | null = null;
+  private painting: number | null = null;
+  private flashedAt = -Infinity;
+  private readonly stillMotion = matchMedia('(prefers-reduced-motion: reduce)').matches;
+  private readonly flyKeys = new Set<string>();
 
   constructor(
     private readonly stage: HTMLElement,
@@ -67,9 +86,8 @@ export class Viewport {
     this.controls = new CameraControls(this.camera, stage);
     this.controls.mouseButtons.right = CameraControls.ACTION.TRUCK;
     this.controls.touches.two = CameraControls.ACTION.TOUCH_DOLLY_TRUCK;
-    const still = matchMedia('(prefers-reduced-motion: reduce)').matches;
-    this.controls.smoothTime = still ? 0 : 0.12;
-    this.controls.draggingSmoothTime = still ? 0 : 0.04;
+    this.controls.smoothTime = this.stillMotion ? 0 : 0.12;
+    this.controls.draggingSmoothTime = this.stillMotion ? 0 : 0.04;
     try {
       this.local = new LocalPicture(localCanvas);
     } catch {
@@ -78,6 +96,7 @@ export class Viewport {
     }
     listen(this.onHello, this.onFrame);
     this.listenToPointers();
+    this.listenToFlyKeys();
     new ResizeObserver(this.onResize).observe(stage);
     this.followState();
     requestAnimationFrame(this.tick);
@@ -85,16 +104,25 @@ export class Viewport {
 
   /** Show the whole object in the part of the window that no panel covers, from where the camera is. */
   frame(): void {
+    flying.value = false;
     this.showAll(this.camera.position.clone().sub(this.controls.getTarget(new Vector3())), true);
   }
 
   reset(): void {
+    flying.value = false;
     if (this.homeDirection) this.showAll(this.homeDirection, true);
   }
 
   /** The traced picture as PNG; null while there is none. */
   still(): Promise<Blob | null> {
     return this.newestFrame ? new Promise((resolve) => this.tracedCanvas.toBlob(resolve, 'image/png')) : Promise.resolve(null);
+  }
+
+  /** Camera and size of the picture now, as REST and stream take them. */
+  private get pose(): View {
+    const e = this.camera.matrixWorld.elements; // columns
+    const row = (i: number): Row => [e[i]!, e[4 + i]!, e[8 + i]!, e[12 + i]!];
+    return { world_from_camera: [row(0), row(1), row(2), [0, 0, 0, 1]], fov_y_degrees: this.camera.fov, ...this.pictureSize() };
   }
 
   // ---- from the server ---------------------------------------------------------------------------------------------------
@@ -145,6 +173,7 @@ export class Viewport {
       cameraNumber === this.cameraNumber &&
       header.stateRev >= log.value.revision &&
       pending.value.length === 0 &&
+      draft.value === null &&
       (header.frameId > this.staleUpTo || (header.flags & FLAG_CONVERGED) !== 0);
     const enough = header.spp >= Math.min(settings.value.denoise ? SHOW_FROM_SAMPLES.denoised : SHOW_FROM_SAMPLES.raw, header.sppTarget) && !(header.flags & FLAG_MOVING);
     if (this.tracedCanvas.width !== header.width || this.tracedCanvas.height !== header.height) {
@@ -160,9 +189,9 @@ export class Viewport {
 
   // ---- what is shown -----------------------------------------------------------------------------------------------------
 
-  /** Only the final picture has a local stand-in. */
+  /** Only the final picture of a shape that the browser can follow has a local stand-in. */
   private get localShows(): boolean {
-    return localPicture.value && this.local !== null && this.local.hasMesh && settings.value.channel === 'final' && session.value !== null;
+    return localPicture.value && this.local !== null && this.local.hasMesh && settings.value.channel === 'final' && session.value !== null && isAnalytic(edits.value);
   }
 
   private setFresh(fresh: boolean): void {
@@ -178,12 +207,12 @@ export class Viewport {
   }
 
   private followState(): void {
-    let before: unknown[] = [];
+    let last: unknown[] = [];
     effect(() => {
       const now = [edits.value, settings.value.exposure_stops, settings.value.background, settings.value.channel, settings.value.denoise];
-      if (now.some((value, i) => value !== before[i])) {
-        if (now.slice(1).some((value, i) => value !== before[i + 1])) this.staleUpTo = this.newestFrame + 3;
-        before = now;
+      if (now.some((value, i) => value !== last[i])) {
+        if (now.slice(1).some((value, i) => value !== last[i + 1])) this.staleUpTo = this.newestFrame + 3;
+        last = now;
         this.setFresh(false);
       }
     });
@@ -192,8 +221,35 @@ export class Viewport {
       this.updateLayers();
     });
     effect(() => {
-      this.local?.setMaterial(material.value);
+      const rest = mesh.value;
+      const shown = before.value ? rest?.materials : materials.value;
+      if (shown) this.local?.setMaterials(shown);
       this.localDirty = true;
+    });
+    let shape: Float32Array | null = null;
+    effect(() => {
+      const rest = mesh.value?.positions;
+      if (!rest) return;
+      const next = before.value ? rest : deformPoints(rest, edits.value);
+      if (next === shape) return;
+      shape = next;
+      this.local?.setShape(next);
+      this.localDirty = true;
+    });
+    effect(() => {
+      if (selectionWeights.value) this.local?.setHighlighted(selectionWeights.value);
+      if (flash.value > 0) this.flashedAt = performance.now();
+    });
+    effect(() => {
+      this.stage.dataset.before = String(before.value);
+      this.localDirty = true;
+    });
+    effect(() => this.fly(flying.value));
+    effect(() => {
+      if (ballsWanted.value && mesh.value) this.drawBalls();
+    });
+    effect(() => {
+      this.stage.dataset.tool = tool.value;
     });
     effect(() => {
       const { background } = settings.value;
@@ -220,11 +276,11 @@ export class Viewport {
   private async loadMesh(asset: string): Promise<void> {
     this.localMesh = asset;
     if (!this.local) return;
-    this.local.hasMesh = false;
+    this.local.dropMesh();
     this.updateLayers();
     try {
-      const mean = await this.local.loadMesh(api.assetMesh(asset));
-      if (session.value?.asset === asset) captured.value = mean;
+      const rest = await this.local.loadMesh(api.assetMesh(asset));
+      if (session.value?.asset === asset) mesh.value = rest;
       this.updateLayers();
     } catch {
       notify('The mesh for the instant local picture could not be loaded; traced pictures work.', 'info');
@@ -237,10 +293,18 @@ export class Viewport {
     this.localEnvironment = url;
     try {
       await this.local.loadEnvironment(url, /\.hdr$/i.test(file ?? ''));
-      this.localDirty = true;
+      if (file === null) capturedLight.value = this.local.drawSky(SKY_PIXELS);
+      this.drawBalls();
     } catch {
       notify('The light for the instant local picture could not be loaded; traced pictures show the right one.', 'info');
     }
+  }
+
+  /** Thumbnails of materials under the present light. */
+  private drawBalls(): void {
+    if (!this.local) return;
+    balls.value = this.local.drawBalls(ballsWanted.value, BALL_PIXELS);
+    this.resizeLocal();
   }
 
   // ---- every animation frame ---------------------------------------------------------------------------------------------
@@ -249,6 +313,7 @@ export class Viewport {
     requestAnimationFrame(this.tick);
     const elapsed = now - this.lastTick;
     this.lastTick = now;
+    this.flyOn(elapsed / 1000);
     const moved = this.controls.update(elapsed / 1000);
     if (moved && now - this.movedAt < MOVING_MS) this.paceLocal(elapsed);
     if (!session.value) return;
@@ -262,7 +327,15 @@ export class Viewport {
   };
 
   private drawLocal(now: number, moved: boolean): void {
-    if (!this.localShows) return;
+    if (!this.local?.hasMesh) return;
+    const since = now - this.flashedAt;
+    const flashing = since < FLASH_MS;
+    const strength = !flashing ? 0 : this.stillMotion ? 0.5 : 0.85 * Math.sin((2 * Math.PI * since) / FLASH_MS) ** 2;
+    // Over a traced picture only the selection is drawn, on nothing.
+    const overlay = flashing && !(this.localShows && !this.fresh) && !before.value;
+    if (flashing || this.stage.dataset.overlay !== String(overlay)) this.localDirty = true;
+    this.stage.dataset.overlay = String(overlay);
+    if (!this.localShows && !overlay && !before.value) return;
     const sharp = !moved && now - this.movedAt > MOVING_MS;
     if (sharp !== this.localSharp && (this.localDirty || (sharp && !this.fresh))) {
       this.localSharp = sharp;
@@ -273,7 +346,7 @@ export class Viewport {
     const { radius, center } = this.bounds;
     const distance = this.camera.position.distanceTo(center);
     const { rotation, intensity } = light.value;
-    this.local!.render(this.camera, Math.max(0.002 * radius, distance - 1.5 * radius), distance + 1.5 * radius, rotation, intensity, settings.value.exposure_stops);
+    this.local!.render(this.camera, Math.max(0.002 * radius, distance - 1.5 * radius), distance + 1.5 * radius, rotation, intensity, settings.value.exposure_stops, strength, overlay);
     this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
   }
 
@@ -298,13 +371,12 @@ export class Viewport {
   }
 
   private sendPose(): void {
-    const { width, height } = this.pictureSize();
-    if (width < 16 || height < 16) return;
-    const e = this.camera.matrixWorld.elements; // columns
-    const row = (i: number): [number, number, number, number] => [e[i]!, e[4 + i]!, e[8 + i]!, e[12 + i]!];
-    const number = sendCamera({ world_from_camera: [row(0), row(1), row(2), [0, 0, 0, 1]], fov_y_degrees: this.camera.fov, width, height });
+    const { pose } = this;
+    if (pose.width < 16 || pose.height < 16) return;
+    const number = sendCamera(pose);
     if (number === null || number === this.cameraNumber) return;
     this.cameraNumber = number;
+    viewNow.value = pose;
     this.setFresh(false);
   }
 
@@ -332,7 +404,10 @@ export class Viewport {
       'pointerdown',
       (event) => {
         const turns = (event.button === 0 && event.altKey) || (event.button === 2 && event.shiftKey);
-        controls.enabled = !turns;
+        this.pressed = event.button === 0 && event.isPrimary ? { pointer: event.pointerId, x: event.clientX, y: event.clientY, at: event.timeStamp } : null;
+        if (event.button === 0 && tool.value === 'brush' && !turns && this.paintAt(event)) this.painting = event.pointerId;
+        controls.enabled = !turns && this.painting === null;
+        if (this.painting !== null) stage.setPointerCapture(event.pointerId);
         controls.mouseButtons.middle = event.shiftKey ? ACTION.TRUCK : event.ctrlKey ? ACTION.DOLLY : ACTION.ROTATE;
         if (!turns) return;
         this.turning = { pointer: event.pointerId, x: event.clientX, rotation: light.value.rotation };
@@ -343,22 +418,33 @@ export class Viewport {
     );
     stage.addEventListener('pointermove', (event) => {
       const { turning } = this;
+      if (event.pointerId === this.painting) this.paintAt(event);
       if (!turning || event.pointerId !== turning.pointer) return;
       const degrees = turning.rotation + (event.clientX - turning.x) * DEGREES_PER_PIXEL;
       editLight({ rotation: Math.round((((degrees % 360) + 360) % 360) * 10) / 10 });
     });
     const release = () => {
-      this.turning = null;
+      this.turning = this.painting = this.pressed = null;
       controls.enabled = true;
     };
-    stage.addEventListener('pointerup', release);
+    stage.addEventListener('pointerup', (event) => {
+      const { pressed } = this;
+      const isClick = pressed?.pointer === event.pointerId && Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) < CLICK_PIXELS && event.timeStamp - pressed.at < CLICK_MS;
+      if (isClick && !event.altKey && tool.value !== 'all' && tool.value !== 'brush') this.selectAt(event);
+      release();
+    });
     stage.addEventListener('pointercancel', release);
     stage.addEventListener('contextmenu', (event) => event.preventDefault());
     stage.addEventListener('dblclick', (event) => {
-      const box = stage.getBoundingClientRect();
-      void pick((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height)?.then((picked) => {
-        if (picked.hit && picked.position) void controls.moveTo(...picked.position, true);
-      });
+      this.focusAt(event);
+    });
+    // A second tap soon after the first, near it: what a double-click is to a mouse.
+    let tap = { at: -Infinity, x: 0, y: 0 };
+    stage.addEventListener('pointerup', (event) => {
+      if (event.pointerType !== 'touch' || !event.isPrimary) return;
+      const again = event.timeStamp - tap.at < 300 && Math.hypot(event.clientX - tap.x, event.clientY - tap.y) < 24;
+      tap = { at: again ? -Infinity : event.timeStamp, x: event.clientX, y: event.clientY };
+      if (again) this.focusAt(event);
     });
     // Arrow keys orbit and + - zoom while the picture has the focus: the camera works without a mouse too.
     stage.addEventListener('keydown', (event) => {
@@ -371,11 +457,94 @@ export class Viewport {
         '+': () => void controls.dolly(0.1 * controls.distance, true),
         '-': () => void controls.dolly(-0.1 * controls.distance, true),
       };
-      const move = event.target === stage && !event.ctrlKey && !event.metaKey ? moves[event.key] : undefined;
+      const move = event.target === stage && !flying.value && !event.ctrlKey && !event.metaKey ? moves[event.key] : undefined;
       if (!move) return;
       event.preventDefault();
       move();
     });
+  }
+
+  /** Share of the picture's width and height at a pointer. */
+  private shareAt(event: MouseEvent): [number, number] {
+    const box = this.stage.getBoundingClientRect();
+    return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+  }
+
+  private pickLocally(event: MouseEvent) {
+    if (!isAnalytic(edits.value)) {
+      notify('Parts can be chosen on the shape at rest only: undo the simulation first.', 'info');
+      return null;
+    }
+    const [x, y] = this.shareAt(event);
+    return this.local?.pick(this.camera, 2 * x - 1, 1 - 2 * y) ?? null;
+  }
+
+  private selectAt(event: MouseEvent): void {
+    const hit = this.pickLocally(event);
+    if (hit) selectAt({ point: hit.rest, vertex: hit.vertex });
+  }
+
+  private paintAt(event: PointerEvent): boolean {
+    const hit = this.pickLocally(event);
+    if (hit) paint(hit.rest, event.shiftKey);
+    return hit !== null;
+  }
+
+  /** Put the focal point on the surface under the pointer; the server knows surfaces that the local mesh does not. */
+  private focusAt(event: MouseEvent): void {
+    if (flying.value) return;
+    void pick(...this.shareAt(event))?.then((picked) => {
+      if (picked.hit && picked.position) void this.controls.moveTo(...picked.position, true);
+    });
+  }
+
+  // ---- flying ------------------------------------------------------------------------------------------------------------
+
+  private fly(on: boolean): void {
+    const { controls, camera } = this;
+    this.flyKeys.clear();
+    this.stage.dataset.flying = String(on);
+    if (on === (controls.maxDistance < 1e-3 * this.bounds.radius)) return;
+    const eye = camera.position.clone();
+    const forward = camera.getWorldDirection(new Vector3());
+    // Orbiting at no distance turns the head; dragging the picture then is the other way round.
+    const distance = on ? 1e-4 * this.bounds.radius : Math.max(0.3 * this.bounds.radius, this.bounds.center.clone().sub(eye).dot(forward));
+    controls.minDistance = on ? distance : 0.05 * this.bounds.radius;
+    controls.maxDistance = on ? distance : 60 * this.bounds.radius;
+    controls.azimuthRotateSpeed = controls.polarRotateSpeed = on ? -0.3 : 1;
+    const { ACTION } = CameraControls;
+    controls.mouseButtons.wheel = on ? ACTION.NONE : ACTION.DOLLY;
+    const target = eye.clone().addScaledVector(forward, distance);
+    void controls.setFocalOffset(0, 0, 0, false);
+    void controls.setLookAt(eye.x, eye.y, eye.z, target.x, target.y, target.z, false);
+  }
+
+  private flyOn(seconds: number): void {
+    const has = (code: string) => (this.flyKeys.has(code) ? 1 : 0);
+    const faster = has('ShiftLeft') || has('ShiftRight') ? FLY_FACTOR : has('AltLeft') || has('AltRight') ? 1 / FLY_FACTOR : 1;
+    const step = FLY_SPEED * faster * this.bounds.radius * Math.min(seconds, 0.1);
+    const along = has('KeyW') - has('KeyS');
+    const across = has('KeyD') - has('KeyA');
+    const up = has('KeyE') - has('KeyQ');
+    if (!flying.value || !(along || across || up)) return;
+    const move = this.camera.getWorldDirection(new Vector3()).multiplyScalar(along * step);
+    move.addScaledVector(new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0), across * step);
+    move.addScaledVector(this.camera.up, up * step);
+    const target = this.controls.getTarget(new Vector3()).add(move);
+    void this.controls.moveTo(target.x, target.y, target.z, true);
+  }
+
+  private listenToFlyKeys(): void {
+    // Physical keys, so that W A S D lie together on every keyboard.
+    window.addEventListener('keydown', (event) => {
+      const typing = event.target instanceof HTMLElement && event.target.matches('input, textarea, select');
+      if (flying.value && !typing && !event.ctrlKey && !event.metaKey && (FLY_CODES.includes(event.code) || /^(Shift|Alt)/.test(event.code))) {
+        this.flyKeys.add(event.code);
+        event.preventDefault();
+      }
+    });
+    window.addEventListener('keyup', (event) => this.flyKeys.delete(event.code));
+    window.addEventListener('blur', () => this.flyKeys.clear());
   }
 }
 

@@ -2,14 +2,17 @@
 
 import { useEffect, useRef, useState } from 'preact/hooks';
 import { redo, undo, changeSettings } from '../session';
-import { listenForKeys, titleFor } from '../shortcuts';
-import { assets, dismiss, helpOpen, inspectorOpen, libraryOpen, localPicture, log, notices, notify, session, theme } from '../state';
+import { selectAll } from '../selecting';
+import { listenForKeys, titleFor, type Actions } from '../shortcuts';
+import { assets, before, dismiss, flash, flying, helpOpen, inspectorOpen, libraryOpen, localPicture, log, notices, notify, session, theme } from '../state';
 import type { Viewport } from '../viewport';
+import { download } from './ExportPanel';
 import { Help } from './Help';
 import { Hud } from './Hud';
 import { Icon } from './icons';
 import { Inspector } from './Inspector';
 import { Library, takeFiles } from './Library';
+import { copyMaterial, pasteMaterial } from './MaterialPanel';
 
 export function App() {
   const stage = useRef<HTMLDivElement>(null);
@@ -20,11 +23,7 @@ export function App() {
   const saveStill = async () => {
     const picture = await viewport.current?.still();
     if (!picture) return notify('There is no traced picture to save yet.');
-    const link = document.createElement('a');
-    link.href = URL.createObjectURL(picture);
-    link.download = `${session.value?.assetName ?? 'picture'}.png`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+    download(picture, `${session.value?.assetName ?? 'picture'}.png`);
   };
 
   useEffect(() => {
@@ -34,16 +33,22 @@ export function App() {
       if (!gone) viewport.current = new Viewport(stage.current!, traced.current!, local.current!);
     });
     const channel = (name: 'final' | 'albedo' | 'roughness' | 'metallic' | 'normal' | 'depth') => () => changeSettings({ channel: name });
-    const silence = listenForKeys({
+    const actions: Actions = {
       frame: () => viewport.current?.frame(),
       home: () => viewport.current?.reset(),
       undo,
       redo,
       help: () => (helpOpen.value = !helpOpen.value),
       escape: () => {
-        helpOpen.value = false;
+        helpOpen.value = flying.value = false;
         (document.activeElement as HTMLElement | null)?.blur();
       },
+      fly: () => session.value && (flying.value = !flying.value),
+      all: selectAll,
+      show: () => flash.value++,
+      copy: copyMaterial,
+      paste: pasteMaterial,
+      before: () => (before.value = true),
       local: () => (localPicture.value = !localPicture.value),
       theme: () => (theme.value = theme.value === 'dark' ? 'light' : 'dark'),
       library: () => (libraryOpen.value = !libraryOpen.value),
@@ -55,7 +60,8 @@ export function App() {
       channel5: channel('normal'),
       channel6: channel('depth'),
       still: () => void saveStill(),
-    });
+    };
+    const silence = listenForKeys(actions, { before: () => (before.value = false) }, () => flying.value);
     return () => {
       gone = true;
       silence();
@@ -75,7 +81,7 @@ export function App() {
       {!session.value && <Welcome />}
       <TopBar onFrame={() => viewport.current?.frame()} />
       <Library />
-      <Inspector onStill={() => void saveStill()} />
+      <Inspector />
       <Hud />
       <Notices />
       <DropZone />

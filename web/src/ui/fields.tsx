@@ -21,26 +21,32 @@ export interface SliderProps {
   max: number;
   step: number;
   unit?: string;
+  /** `value` is a power of ten; the number field shows that power's value. */
+  logarithmic?: boolean;
   /** Not set by the user yet: shown dimmed. */
   unset?: boolean;
   onChange(value: number): void;
+  /** The slider was let go, or a number typed. */
+  onCommit?: () => void;
   /** Absent: there is nothing to go back to. */
   onReset?: () => void;
 }
 
 const clamp = (value: number, low: number, high: number) => Math.min(high, Math.max(low, value));
 
-export function Slider({ label, value, min, max, step, unit, unset, onChange, onReset }: SliderProps) {
+export function Slider({ label, value, min, max, step, unit, logarithmic, unset, onChange, onCommit, onReset }: SliderProps) {
   const [dragged, setDragged] = useState<number | null>(null);
   const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
   const shown = dragged ?? value;
   const id = `slider-${label.toLowerCase().replace(/\W+/g, '-')}`;
   const set = (text: string) => {
-    const number = Number(text);
-    if (text.trim() !== '' && Number.isFinite(number)) onChange(clamp(number, min, max));
+    const number = logarithmic ? Math.log10(Number(text)) : Number(text);
+    if (text.trim() === '' || !Number.isFinite(number)) return;
+    onChange(clamp(number, min, max));
+    onCommit?.();
   };
   return (
-    <div class={`field${unset ? ' unset' : ''}`}>
+    <div class={`field${unset ? ' unset' : ''}`} title={unset ? `${label}: as captured` : undefined}>
       <label for={id}>{label}</label>
       <input
         id={id}
@@ -54,11 +60,22 @@ export function Slider({ label, value, min, max, step, unit, unset, onChange, on
           setDragged(event.currentTarget.valueAsNumber);
           onChange(event.currentTarget.valueAsNumber);
         }}
-        onChange={() => setDragged(null)}
+        onChange={() => {
+          setDragged(null);
+          onCommit?.();
+        }}
         onDblClick={onReset}
       />
       <span class="number">
-        <input type="number" aria-label={`${label}, exact value`} min={min} max={max} step={step} value={shown.toFixed(digits)} onChange={(event) => set(event.currentTarget.value)} />
+        <input
+          type="number"
+          aria-label={`${label}, exact value`}
+          min={logarithmic ? 10 ** min : min}
+          max={logarithmic ? 10 ** max : max}
+          step={logarithmic ? 'any' : step}
+          value={logarithmic ? Number((10 ** shown).toPrecision(2)) : shown.toFixed(digits)}
+          onChange={(event) => set(event.currentTarget.value)}
+        />
         {unit && <span class="unit">{unit}</span>}
       </span>
       <ResetButton label={label} onReset={onReset} />
@@ -79,11 +96,12 @@ interface ColorProps {
   value: Triple;
   unset?: boolean;
   onChange(value: Triple): void;
+  onCommit?: () => void;
   onReset?: () => void;
 }
 
 /** A colour as sRGB (picker and hex) and as the linear numbers that the renderer uses. */
-export function ColorField({ label, value, unset, onChange, onReset }: ColorProps) {
+export function ColorField({ label, value, unset, onChange, onCommit, onReset }: ColorProps) {
   const [wrongHex, setWrongHex] = useState(false);
   const hex = hexFromLinear(value);
   const takeHex = (text: string) => {
@@ -91,12 +109,16 @@ export function ColorField({ label, value, unset, onChange, onReset }: ColorProp
     setWrongHex(linear === null);
     if (linear) onChange(linear);
   };
+  const typeHex = (text: string) => {
+    takeHex(text);
+    onCommit?.();
+  };
   return (
     <div class={`color-field${unset ? ' unset' : ''}`}>
       <div class="field">
         <label for="color-picker">{label}</label>
-        <input id="color-picker" type="color" value={hex} onInput={(event) => takeHex(event.currentTarget.value)} />
-        <input class="hex" type="text" aria-label={`${label}, sRGB hex`} aria-invalid={wrongHex} spellcheck={false} maxLength={7} value={hex} onChange={(event) => takeHex(event.currentTarget.value)} />
+        <input id="color-picker" type="color" value={hex} onInput={(event) => takeHex(event.currentTarget.value)} onChange={onCommit} />
+        <input class="hex" type="text" aria-label={`${label}, sRGB hex`} aria-invalid={wrongHex} spellcheck={false} maxLength={7} value={hex} onChange={(event) => typeHex(event.currentTarget.value)} />
         <ResetButton label={label} onReset={onReset} />
       </div>
       <div class="field linear">
@@ -112,7 +134,9 @@ export function ColorField({ label, value, unset, onChange, onReset }: ColorProp
             value={value[i]!.toFixed(3)}
             onChange={(event) => {
               const number = event.currentTarget.valueAsNumber;
-              if (Number.isFinite(number)) onChange(value.map((old, k) => (k === i ? clamp(number, 0, 1) : old)) as Triple);
+              if (!Number.isFinite(number)) return;
+              onChange(value.map((old, k) => (k === i ? clamp(number, 0, 1) : old)) as Triple);
+              onCommit?.();
             }}
           />
         ))}
@@ -123,17 +147,20 @@ export function ColorField({ label, value, unset, onChange, onReset }: ColorProp
 
 interface ChoiceProps<T extends string> {
   label: string;
-  value: T;
+  /** Null: none of them. */
+  value: T | null;
   options: { value: T; text: string; title?: string }[];
+  /** Show no label: what stands above says it already. */
+  bare?: boolean;
   onChange(value: T): void;
 }
 
 /** One of a few, as joined buttons (radio buttons to a screen reader and the arrow keys). */
-export function Choice<T extends string>({ label, value, options, onChange }: ChoiceProps<T>) {
+export function Choice<T extends string>({ label, value, options, bare, onChange }: ChoiceProps<T>) {
   const name = `choice-${label.toLowerCase().replace(/\W+/g, '-')}`;
   return (
     <fieldset class="choice">
-      <legend>{label}</legend>
+      <legend class={bare ? 'visually-hidden' : undefined}>{label}</legend>
       <div class="choice-row">
         {options.map((option) => (
           <label title={option.title}>

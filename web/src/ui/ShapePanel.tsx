@@ -1,0 +1,76 @@
+/** Twist, bend, stretch, a lattice of eight corners, and matter that falls. */
+
+import { computed } from '@preact/signals';
+import type { Edit } from '../protocol.gen';
+import { boundsOf, latticeOf, readLattice, type AnalyticMap, type Lattice } from '../shape';
+import { commitDraft, draftEdit, isTwin, replaceEdits } from '../session';
+import { edits, mesh } from '../state';
+import { Section, Slider } from './fields';
+import { Simulation } from './Simulation';
+
+const bounds = computed(() => boundsOf(mesh.value?.positions ?? new Float32Array(3)));
+
+type Kind = AnalyticMap['type'];
+const newest = <K extends Kind>(type: K): Extract<AnalyticMap, { type: K }> | null => {
+  const edit = edits.value.findLast((other) => other.op === 'deform' && other.map?.type === type);
+  return edit?.op === 'deform' ? (edit.map as Extract<AnalyticMap, { type: K }>) : null;
+};
+
+function deform(map: AnalyticMap): void {
+  const edit: Edit = { op: 'deform', map };
+  draftEdit(edit, isTwin(edit));
+}
+
+const without = (type: Kind) => () => replaceEdits(edits.value.filter((edit) => !(edit.op === 'deform' && edit.map?.type === type)));
+
+export function ShapePanel() {
+  return (
+    <>
+      <Maps />
+      <Corners />
+      <Simulation height={bounds.value.maximum[2] - bounds.value.minimum[2]} foot={bounds.value.minimum[2]} />
+    </>
+  );
+}
+
+const degrees = 180 / Math.PI;
+
+function Maps() {
+  const { minimum, maximum } = bounds.value;
+  const height = Math.max(1e-6, maximum[2] - minimum[2]);
+  // A bend whose centre of curvature lies inside the object is refused by the server.
+  const reach = Math.max(Math.abs(minimum[0]), Math.abs(maximum[0]), 1e-6);
+  const bendLimit = Math.floor(Math.min(180, (0.95 * height * degrees) / reach));
+  const twist = newest('twist');
+  const bend = newest('bend');
+  const stretch = newest('stretch');
+  return (
+    <Section title="Deform">
+      <Slider label="Twist" unit="°" value={(twist?.rate ?? 0) * height * degrees} min={-360} max={360} step={1} unset={!twist} onChange={(value) => deform({ type: 'twist', rate: value / degrees / height })} onCommit={commitDraft} onReset={twist ? without('twist') : undefined} />
+      <Slider label="Bend" unit="°" value={(bend?.curvature ?? 0) * height * degrees} min={-bendLimit} max={bendLimit} step={1} unset={!bend} onChange={(value) => deform({ type: 'bend', curvature: value / degrees / height })} onCommit={commitDraft} onReset={bend ? without('bend') : undefined} />
+      <Slider label="Stretch" unit="×" value={stretch?.factor ?? 1} min={0.3} max={3} step={0.01} unset={!stretch} onChange={(factor) => deform({ type: 'stretch', factor })} onCommit={commitDraft} onReset={stretch ? without('stretch') : undefined} />
+      <p class="hint">Angles are from foot to top. The traced picture follows when you let go.</p>
+    </Section>
+  );
+}
+
+function Corners() {
+  const map = newest('lattice');
+  const lattice = map ? readLattice(map) : { top: 1, foot: 1, leanX: 0, leanY: 0 };
+  const slider = (label: string, key: keyof Lattice, min: number, max: number, unit: string) => (
+    <Slider label={label} unit={unit} value={lattice[key]} min={min} max={max} step={0.01} unset={!map} onChange={(value) => deform(latticeOf({ ...lattice, [key]: value }, map ?? bounds.value))} onCommit={commitDraft} onReset={map ? () => resetCorner(key) : undefined} />
+  );
+  const resetCorner = (key: keyof Lattice) => {
+    deform(latticeOf({ ...lattice, [key]: key === 'top' || key === 'foot' ? 1 : 0 }, map!));
+    commitDraft();
+  };
+  return (
+    <Section title="Lattice" open={false}>
+      {slider('Top', 'top', 0.1, 3, '×')}
+      {slider('Foot', 'foot', 0.1, 3, '×')}
+      {slider('Lean X', 'leanX', -1, 1, '')}
+      {slider('Lean Y', 'leanY', -1, 1, '')}
+      <p class="hint">Widths of top and foot, and how far the top leans, in heights of the object.</p>
+    </Section>
+  );
+}

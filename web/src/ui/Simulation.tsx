@@ -1,0 +1,102 @@
+/** The object as matter: what it is made of, how it falls, and a timeline to play it. Frames are computed as they are first shown. */
+
+import { computed, effect, signal } from '@preact/signals';
+import type { Edit, SimulateEdit } from '../protocol.gen';
+import { editTime, replaceEdits } from '../session';
+import { draft, edits, pending, session } from '../state';
+import { Choice, Section, Slider, Switch } from './fields';
+
+const PRESETS = ['jelly', 'rubber', 'clay', 'sand', 'snow', 'honey'] as const;
+const preset = signal<(typeof PRESETS)[number]>('jelly');
+/** log10 of Young's modulus [kPa]; null: the preset's, which follows the object's size. */
+const stiffness = signal<number | null>(null);
+const floor = signal(true);
+/** Above the floor, in heights of the object. */
+const drop = signal(0.5);
+const seconds = signal(1.5);
+const fine = signal(false);
+const playing = signal(false);
+const loop = signal(true);
+const speed = signal('1');
+/** Particles of a quick and a fine simulation. */
+const PARTICLES = { quick: 4000, fine: 20_000 };
+const FPS = 24;
+
+const running = computed(() => (edits.value.findLast((edit) => edit.op === 'simulate') as SimulateEdit | undefined) ?? null);
+const durationOf = (edit: SimulateEdit) => Number(edit.scene.duration ?? 2);
+
+function start(height: number, foot: number): void {
+  const matter = stiffness.value === null ? { preset: preset.value } : { preset: preset.value, young_modulus: 1000 * 10 ** stiffness.value };
+  const ground = floor.value ? { height: foot - drop.value * height, friction: 0.5 } : null;
+  const scene = { matter, floor: ground, duration: seconds.value, fps: FPS, particles: fine.value ? PARTICLES.fine : PARTICLES.quick };
+  const others = edits.value.filter((edit) => edit.op !== 'simulate');
+  replaceEdits([...others, { op: 'simulate', scene, time: 0 }]);
+  playing.value = true;
+}
+
+function stop(): void {
+  playing.value = false;
+  replaceEdits(edits.value.filter((edit) => edit.op !== 'simulate'));
+}
+
+/** Next frame of the film once the server has taken the last one: it plays as fast as it is computed, never faster than life. */
+effect(() => {
+  if (!playing.value || !session.value) return;
+  let before = performance.now();
+  const timer = setInterval(() => {
+    const edit = running.value;
+    if (!edit || draft.value || pending.value.length > 0) return;
+    const now = performance.now();
+    const step = Math.min((now - before) / 1000, 2 / FPS) * Number(speed.value);
+    before = now;
+    const length = durationOf(edit);
+    if (edit.time + step > length && !loop.value) playing.value = false;
+    seek(edit, playing.value ? (edit.time + step) % length : length);
+  }, 1000 / FPS);
+  return () => clearInterval(timer);
+});
+
+function seek(edit: SimulateEdit, time: number): void {
+  const next: Edit = { ...edit, time: Math.round(time * 1000) / 1000 };
+  editTime(next);
+}
+
+export function Simulation({ height, foot }: { height: number; foot: number }) {
+  const edit = running.value;
+  return (
+    <Section title="Simulation">
+      <Choice bare label="Matter" value={preset.value} options={PRESETS.map((name) => ({ value: name, text: name[0]!.toUpperCase() + name.slice(1) }))} onChange={(next) => (preset.value = next)} />
+      <Slider
+        label="Stiffness"
+        unit="kPa"
+        logarithmic
+        value={stiffness.value ?? 2}
+        min={0}
+        max={4}
+        step={0.1}
+        unset={stiffness.value === null}
+        onChange={(value) => (stiffness.value = value)}
+        onReset={stiffness.value === null ? undefined : () => (stiffness.value = null)}
+      />
+      <Switch label="Ground" value={floor.value} onChange={(value) => (floor.value = value)} />
+      {floor.value && <Slider label="Drop from" unit="×" value={drop.value} min={0} max={2} step={0.05} onChange={(value) => (drop.value = value)} />}
+      <Slider label="Length" unit="s" value={seconds.value} min={0.25} max={5} step={0.25} onChange={(value) => (seconds.value = value)} />
+      <Switch label="Fine (slow)" value={fine.value} onChange={(value) => (fine.value = value)} />
+      <div class="buttons">
+        <button class="primary" onClick={() => start(height, foot)}>
+          {edit ? 'Start again' : 'Let it go'}
+        </button>
+        {edit && <button onClick={stop}>Remove</button>}
+      </div>
+      {edit && (
+        <div class="timeline">
+          <button onClick={() => (playing.value = !playing.value)}>{playing.value ? 'Pause' : 'Play'}</button>
+          <Slider label="Time" unit="s" value={edit.time} min={0} max={durationOf(edit)} step={0.01} onChange={(value) => { playing.value = false; seek(edit, value); }} />
+          <Choice label="Speed" value={speed.value} options={['0.25', '0.5', '1'].map((value) => ({ value, text: `${value}×` }))} onChange={(value) => (speed.value = value)} />
+          <Switch label="Loop" value={loop.value} onChange={(value) => (loop.value = value)} />
+        </div>
+      )}
+      <p class="hint">A moment is computed when it is first shown, so the first round is slow.</p>
+    </Section>
+  );
+}
