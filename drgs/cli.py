@@ -210,7 +210,10 @@ def simulate(
 
     setting = SimulationScene() if scene is None else parse_simulation_scene(scene.read_bytes())
     with frame_progress("Simulating", None) as advance:
-        _, report = run_simulation(_open_asset(asset, device), setting, out, lambda done, total: advance(f"{done} of {total}"))
+        folder = Path() if scene is None else scene.parent
+        _, report = run_simulation(
+            _open_asset(asset, device), setting, out, lambda done, total: advance(f"{done} of {total}"), lambda name: folder / name
+        )
     _print_document({"out": str(out)} | vars(report), as_json)
 
 

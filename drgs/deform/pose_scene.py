@@ -23,7 +23,7 @@ from drgs.deform.hold_handles import HeldObject
 from drgs.deform.maps import check_map, evaluate_map
 from drgs.deform.rig_clip import bind_rig
 from drgs.deform.simulate import Simulation
-from drgs.deform.simulation_scene import parse_simulation_scene
+from drgs.deform.simulation_scene import mesh_files, parse_simulation_scene
 from drgs.deform.vertex_sequence import vertices_at
 from drgs.scene.asset import Asset
 from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, SimulateEdit, split_rig_clip
@@ -218,7 +218,8 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files) -> ClipF
         scene = parse_simulation_scene(edit.scene)
         if edit.time == 0:
             return rest
-        frame = _remembered(asset, ("simulation", scene.model_dump_json()), lambda: Simulation(asset, scene)).at(edit.time)
+        key = ("simulation", scene.model_dump_json(), _stamps(edit, files))
+        frame = _remembered(asset, key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True))).at(edit.time)
     elif (rig := split_rig_clip(edit.clip)) is not None:
         key = ("rig", files.stamp(rig[0]), edit.model_dump_json(exclude={"time"}))
         bound = _remembered(asset, key, lambda: bind_rig(files.path(rig[0]), rig[1], rest, asset.meters_per_unit, edit.rig))
@@ -256,7 +257,14 @@ def _environment(asset: Asset, name: str, files: _Files, environments: Callable[
 
 def _shape_texts(edits: list[ShapeEdit], files: _Files) -> tuple:
     """Differ where shapes may."""
-    return tuple((_text(edit), files.stamp(_file(edit))) for edit in edits)
+    return tuple((_text(edit), _stamps(edit, files)) for edit in edits)
+
+
+def _stamps(edit: ShapeEdit, files: _Files) -> tuple:
+    """Of all files that the edit reads: whoever changes one must be noticed."""
+    if isinstance(edit, SimulateEdit):
+        return tuple(map(files.stamp, mesh_files(parse_simulation_scene(edit.scene))))
+    return (files.stamp(_file(edit)),)
 
 
 def _text_of_grips(edit: DeformEdit) -> str:

@@ -18,6 +18,7 @@ from drgs.deform.carry_gaussians import carry_normals, carry_tangents
 from drgs.deform.clip import ClipFrame, blend_frames, save_clip
 from drgs.deform.fill_particles import FillSettings, Particles, fill_particles
 from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate
+from drgs.deform.measure_solid import distances_from_solid
 from drgs.deform.mpm import (
     Box,
     Condition,
@@ -26,13 +27,14 @@ from drgs.deform.mpm import (
     Model,
     MpmSettings,
     Plane,
+    Solid,
     Sphere,
     State,
     advance,
     make_model,
     rest_state,
 )
-from drgs.deform.simulation_scene import SimulationScene, make_condition, make_material, make_shape
+from drgs.deform.simulation_scene import Files, SimulationScene, make_condition, make_material, make_shape, refuse_files
 from drgs.scene.asset import Asset
 from drgs.scene.gaussians import surfel_tangents
 
@@ -66,8 +68,11 @@ class SimulationReport:
 class Simulation:
     """Frames of one asset in one scene, computed as far as somebody has asked, and kept. Final; safe to use from several threads."""
 
-    def __init__(self, asset: Asset, scene: SimulationScene) -> None:
+    def __init__(self, asset: Asset, scene: SimulationScene, find: Files = refuse_files) -> None:
         """Fill the mesh and bind vertices and surfels; nothing moves yet.
+
+        Args:
+            find: the files that the scene names.
 
         Raises:
             ValueError: one sentence: the mesh encloses nothing, or the scene does not fit the object.
@@ -82,7 +87,7 @@ class Simulation:
         surface = "particles" if scene.variant == "paper" else "tracers"
         filled = fill_particles(local, mesh.faces, FillSettings(scene.particles, surface=surface, seed=scene.seed))
         self.warnings = _warnings(filled)
-        self.model = _make_model(asset, scene, filled, self._center)
+        self.model = _make_model(asset, scene, filled, self._center, find)
         self._settings = MpmSettings(
             courant=scene.courant,
             transfer="pic" if scene.variant == "paper" else "apic",
@@ -162,17 +167,22 @@ class Simulation:
 
 
 def simulate(
-    asset: Asset, scene: SimulationScene, out: Path | None = None, progress: Callable[[int, int], None] | None = None
+    asset: Asset,
+    scene: SimulationScene,
+    out: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    find: Files = refuse_files,
 ) -> tuple[list[ClipFrame], SimulationReport]:
     """Simulate a whole scene, and write it as a clip if `out` says where.
 
     Args:
         progress: told of each finished frame and of how many there will be.
+        find: the files that the scene names.
 
     Raises:
         ValueError: one sentence: the mesh encloses nothing, the scene does not fit, or `out` is taken.
     """
-    simulation = Simulation(asset, scene)
+    simulation = Simulation(asset, scene, find)
 
     def frames() -> Iterator[ClipFrame]:
         for index in range(simulation.frame_count):
@@ -201,7 +211,7 @@ def limit_stretch(gradients: Tensor) -> Tensor:
     return limited
 
 
-def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center: Tensor) -> Model:
+def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center: Tensor, find: Files) -> Model:
     """Everything in world units, about the centre."""
     interior = filled.positions[: filled.interior]
     low, high = filled.positions.amin(0).double().cpu(), filled.positions.amax(0).double().cpu()
@@ -211,9 +221,9 @@ def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center:
     materials: list[Material] = [make_material(scene.matter, size, asset.meters_per_unit)]
     material_of = torch.zeros(len(filled.positions), dtype=torch.int64, device=interior.device)
     for region in scene.regions:
-        held = _inside(_moved(make_shape(region.shape), -center), filled.positions)
+        held = _inside(_moved(make_shape(region.shape, dx, find), -center), filled.positions)
         if not bool(held.any()):
-            raise ValueError(f"the region {region.shape.model_dump(exclude_none=True)} holds no part of the object")
+            raise ValueError(f"the region {str(region.shape.model_dump(exclude_none=True))[:200]} holds no part of the object")
         material_of[held] = len(materials)
         materials.append(make_material(region.matter, size, asset.meters_per_unit))
     gravity = [0.0, 0.0, 0.0]
@@ -223,7 +233,7 @@ def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center:
         room_high = torch.tensor(scene.room.maximum, dtype=torch.float64) - center
     else:
         room_low, room_high = low - ROOM_SIZES * size, high + ROOM_SIZES * size
-    conditions = [replace(c, shape=_moved(c.shape, -center)) for c in map(make_condition, scene.acts)]
+    conditions = [replace(c, shape=_moved(c.shape, -center)) for c in (make_condition(act, dx, find) for act in scene.acts)]
     if scene.floor is not None:
         height = float(low[axis]) if scene.floor.height is None else scene.floor.height - float(center[axis])
         point, normal = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
@@ -244,7 +254,7 @@ def _first_state(model: Model, scene: SimulationScene) -> State:
     return replace(state, affine=turning.expand_as(state.affine).contiguous())
 
 
-def _moved(shape: Plane | Sphere | Box, shift: Tensor) -> Plane | Sphere | Box:
+def _moved(shape: Plane | Sphere | Box | Solid, shift: Tensor) -> Plane | Sphere | Box | Solid:
     def place(point: tuple[float, float, float]) -> tuple[float, float, float]:
         return tuple(p + s for p, s in zip(point, shift.tolist(), strict=True))  # type: ignore[return-value]
 
@@ -252,14 +262,18 @@ def _moved(shape: Plane | Sphere | Box, shift: Tensor) -> Plane | Sphere | Box:
         return Plane(place(shape.point), shape.normal)
     if isinstance(shape, Sphere):
         return Sphere(place(shape.center), shape.radius)
+    if isinstance(shape, Solid):
+        return Solid(place(shape.minimum), shape.spacing, shape.distances)
     return Box(place(shape.minimum), place(shape.maximum))
 
 
-def _inside(shape: Plane | Sphere | Box, points: Tensor) -> Tensor:
+def _inside(shape: Plane | Sphere | Box | Solid, points: Tensor) -> Tensor:
     if isinstance(shape, Plane):
         return (points - points.new_tensor(shape.point)) @ points.new_tensor(shape.normal) <= 0
     if isinstance(shape, Sphere):
         return (points - points.new_tensor(shape.center)).norm(dim=-1) <= shape.radius
+    if isinstance(shape, Solid):
+        return distances_from_solid(shape, points) <= 0
     return ((points >= points.new_tensor(shape.minimum)) & (points <= points.new_tensor(shape.maximum))).all(-1)
 
 

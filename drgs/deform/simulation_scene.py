@@ -5,11 +5,15 @@ per unit convert them. A preset needs no constants: its stiffness follows the ob
 """
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from drgs.deform.mpm.records import Box, Condition, Law, Material, Plane, Sphere
+from drgs.deform.measure_solid import measure_solid, read_collider
+from drgs.deform.mpm.records import Box, Condition, Law, Material, Plane, Solid, Sphere
 from drgs.scene.edits import Triple
 
 EARTH = 9.81
@@ -66,18 +70,37 @@ class BoxShape(_Plain):
     maximum: Triple
 
 
+class MeshShape(_Plain):
+    """A closed triangle mesh: a file, or its arrays. Parts thinner than two cells of the simulation do not hold matter back."""
+
+    file: str | None = None
+    """OBJ or PLY (world units, z up), or an asset's folder. For those who simulate where the files are; not over a network."""
+    vertices: Annotated[list[Triple], Field(min_length=4, max_length=20_000)] | None = None
+    """World units."""
+    faces: Annotated[list[tuple[int, int, int]], Field(min_length=4, max_length=40_000)] | None = None
+    offset: Triple = (0.0, 0.0, 0.0)
+    """Where the mesh's origin comes to lie [world units]."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "MeshShape":
+        if (self.file is None) == (self.vertices is None) or (self.vertices is None) != (self.faces is None):
+            raise ValueError("a mesh is either a file, or vertices and faces")
+        return self
+
+
 class Shape(_Plain):
     """Exactly one field is set."""
 
     plane: PlaneShape | None = None
     sphere: SphereShape | None = None
     box: BoxShape | None = None
+    mesh: MeshShape | None = None
 
     @model_validator(mode="after")
     def _exactly_one(self) -> "Shape":
         given = [name for name in type(self).model_fields if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(f"a shape is exactly one of plane, sphere, box; found {given or 'none'}")
+            raise ValueError(f"a shape is exactly one of plane, sphere, box, mesh; found {given or 'none'}")
         return self
 
 
@@ -191,14 +214,38 @@ _PRESETS: dict[str, dict] = {
 """stiffness and yield in units of rho g L."""
 
 
-def make_condition(act: Act) -> Condition:
-    return Condition(make_shape(act.shape), act.effect, act.friction, act.velocity, act.start, math.inf if act.end is None else act.end)
+Files = Callable[[str], Path]
+"""Finds what a scene calls by name, or refuses with a ValueError."""
 
 
-def make_shape(shape: Shape) -> Plane | Sphere | Box:
+def refuse_files(name: str) -> Path:
+    """For scenes from strangers, and for those that belong to no folder."""
+    raise ValueError(f"the simulation scene names the file {name!r}; here a mesh is given by its vertices and faces")
+
+
+def mesh_files(scene: SimulationScene) -> list[str]:
+    """The files that a scene names."""
+    shapes = [act.shape for act in scene.acts] + [region.shape for region in scene.regions]
+    return [shape.mesh.file for shape in shapes if shape.mesh is not None and shape.mesh.file is not None]
+
+
+def make_condition(act: Act, dx: float, find: Files = refuse_files) -> Condition:
+    """The condition of an act on a grid of spacing dx; `find` opens the files that it names."""
+    shape = make_shape(act.shape, dx, find)
+    return Condition(shape, act.effect, act.friction, act.velocity, act.start, math.inf if act.end is None else act.end)
+
+
+def make_shape(shape: Shape, dx: float, find: Files = refuse_files) -> Plane | Sphere | Box | Solid:
     if shape.plane is not None:
         return Plane(shape.plane.point, shape.plane.normal)
     if shape.sphere is not None:
         return Sphere(shape.sphere.center, shape.sphere.radius)
+    if shape.mesh is not None:
+        mesh = shape.mesh
+        if mesh.file is not None:
+            vertices, faces = read_collider(find(mesh.file))
+        else:
+            vertices, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces)
+        return measure_solid(vertices.double() + torch.tensor(mesh.offset, dtype=torch.float64), faces, dx)
     assert shape.box is not None
     return Box(shape.box.minimum, shape.box.maximum)

@@ -160,8 +160,9 @@ def test_presets_look_alike_at_every_scale():
         ({"matter": {"preset": "lead"}}, "matter.preset"),
         ({"matter": {}}, "preset or a law"),
         ({"duration": 1e9}, "duration"),
-        ({"acts": [{"shape": {}}]}, "exactly one of plane, sphere, box"),
+        ({"acts": [{"shape": {}}]}, "exactly one of plane, sphere, box, mesh"),
         ({"colour": "red"}, "colour"),
+        ({"acts": [{"shape": {"mesh": {"file": "a.obj", "vertices": [[0, 0, 0]] * 4}}}]}, "either a file"),
     ],
 )
 def test_wrong_scenes_are_refused_by_the_name_of_the_field(wrong, sentence):
@@ -174,3 +175,50 @@ def test_stretches_are_limited_for_the_picture_only_where_they_exceed_it():
     assert limit_stretch(tame) is tame
     wild = torch.diag_embed(torch.tensor([[100.0, 1.0, 0.001]]))
     assert torch.allclose(limit_stretch(wild), torch.diag_embed(torch.tensor([[10.0, 1.0, 0.1]])))
+
+
+def step_mesh():
+    """A block whose top is at z = 4.5, where the ball of `ball_asset` begins."""
+    block = trimesh.creation.box(bounds=[(0.5, -2.5, 4.0), (3.5, 0.5, 4.5)])
+    return {"vertices": block.vertices.tolist(), "faces": block.faces.tolist()}
+
+
+def test_a_ball_lands_on_a_mesh_as_on_the_floor(tmp_path):
+    act = {"shape": {"mesh": step_mesh()}, "effect": "separate", "friction": 0.5}
+    floor = Simulation(ball_asset(surfels=False), scene()).at(0.3)
+    on_mesh = Simulation(ball_asset(surfels=False), scene(floor=None, acts=[act])).at(0.3)
+    assert float((floor.vertices - on_mesh.vertices).abs().max()) < 0.01  # of a cell of 0.22
+    block = trimesh.creation.box(bounds=[(0.5, -2.5, 4.0), (3.5, 0.5, 4.5)])
+    block.apply_translation([0, 0, -4])
+    block.export(tmp_path / "block.obj")
+    act["shape"] = {"mesh": {"file": "block.obj", "offset": [0, 0, 4]}}
+    edit = {"op": "simulate", "scene": SMALL | {"floor": None, "acts": [act]}, "time": 0.3}
+    of_file = pose_scene(ball_asset(surfels=False), parse_edits([edit]), base_directory=tmp_path)
+    assert float((of_file.mesh.vertices - on_mesh.vertices).abs().max()) < 1e-4
+
+
+def test_a_changed_collider_is_read_again_and_strangers_name_none(tmp_path):
+    asset = ball_asset(surfels=False)
+    act = {"shape": {"mesh": {"file": "block.obj"}}, "effect": "sticky"}
+    edits = parse_edits([{"op": "simulate", "scene": SMALL | {"floor": None, "acts": [act]}, "time": 0.1}])
+    block = trimesh.creation.box(bounds=[(0.5, -2.5, 4.8), (3.5, 0.5, 6)])
+    block.export(tmp_path / "block.obj")
+    held = pose_scene(asset, edits, base_directory=tmp_path).mesh.vertices
+    block.apply_translation([0, 0, 30])
+    block.export(tmp_path / "block.obj")
+    free = pose_scene(asset, edits, base_directory=tmp_path).mesh.vertices
+    assert float((held - asset.mesh.vertices)[:, 2].max()) > -0.005 and float((free - asset.mesh.vertices)[:, 2].max()) < -0.04
+    act["shape"]["mesh"]["file"] = "../block.obj"
+    edits = parse_edits([{"op": "simulate", "scene": SMALL | {"floor": None, "acts": [act]}, "time": 0.1}])
+    with pytest.raises(ValueError, match="outside the folder"):
+        pose_scene(asset, edits, base_directory=tmp_path / "other", confine=True)
+    with pytest.raises(ValueError, match="by its vertices and faces"):
+        Simulation(asset, scene(acts=[act]))
+
+
+def test_a_region_may_be_a_mesh():
+    top = trimesh.creation.box(bounds=[(1, -2, 5.2), (3, 0, 6)])
+    region = {"shape": {"mesh": {"vertices": top.vertices.tolist(), "faces": top.faces.tolist()}}, "matter": {"preset": "rubber"}}
+    box = {"shape": {"box": {"minimum": [1, -2, 5.2], "maximum": [3, 0, 6]}}, "matter": {"preset": "rubber"}}
+    models = [Simulation(ball_asset(), scene(regions=[one])).model for one in (region, box)]
+    assert torch.equal(models[0].laws, models[1].laws) and int((models[0].laws == 1).sum()) > 0

@@ -199,11 +199,20 @@ def _sort(model: Model, arrays: dict[str, Tensor], order: Tensor, lattice: Latti
     return _Work(arrays, order[blocks.order], blocks, grid, matter, 0.0)
 
 
-def _batch(work: _Work, count: int, dt: float, time: float, model: Model, conditions: Tensor, settings: MpmSettings, flags: Tensor) -> None:
+def _batch(
+    work: _Work,
+    count: int,
+    dt: float,
+    time: float,
+    model: Model,
+    conditions: tuple[Tensor, Tensor],
+    settings: MpmSettings,
+    flags: Tensor,
+) -> None:
     device = warp_device(flags)
     on_cpu = flags.device.type == "cpu"
     affine = 1.0 if settings.transfer == "apic" else 0.0
-    seen, table = warp_array(flags), warp_array(conditions.reshape(-1, conditions.shape[-1]))
+    seen, table, distances = warp_array(flags), *map(warp_array, conditions)
     kept = math.exp(-settings.velocity_damping * dt)
     gravity = wp.vec3(*model.gravity)
     matter, grid, filled, particles = work.matter, work.grid, work.blocks.filled, len(work.order)
@@ -214,7 +223,7 @@ def _batch(work: _Work, count: int, dt: float, time: float, model: Model, condit
             grid.tiles.zero_()
             launch(scatter_particles, particles, [matter, grid, dt, affine, seen], [], device)
         nodes = len(work.blocks.corners) * BLOCK_NODES
-        launch(update_nodes, nodes, [grid, filled, dt, time + step * dt, gravity, table], [], device, 1)
+        launch(update_nodes, nodes, [grid, filled, dt, time + step * dt, gravity, table, distances], [], device, 1)
         launch(gather_particles, particles, [matter, grid, dt, 1 - settings.strain_damping, kept, seen], [], device, 1)
 
 

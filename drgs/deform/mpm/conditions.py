@@ -1,29 +1,32 @@
-"""Boundary conditions on the grid's nodes: planes, spheres and boxes that hold, guide, stop or push (docs: Condition in records.py)."""
+"""Boundary conditions on the grid's nodes: planes, spheres, boxes and solids that hold, guide, stop or push (docs: Condition in records.py)."""
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from drgs.deform.mpm.records import Box, Condition, Plane, Sphere
+from drgs.deform.mpm.records import Box, Condition, Plane, Solid, Sphere
 
 wp.set_module_options({"enable_backward": False})
 
-SHAPES = (Plane, Sphere, Box)
+SHAPES = (Plane, Sphere, Box, Solid)
 EFFECTS = ("sticky", "slip", "separate", "push")
 FAR_FUTURE = 1e30
-WIDTH = 14
-"""Numbers in a condition's row: shape, effect, friction, start, end, point 3, second 3 (normal, radius or half extents), velocity 3."""
+WIDTH = 17
+"""Numbers in a condition's row: shape, effect, friction, start, end, point 3, second 3 (normal, radius, half extents, or spacing and place
+of a solid's distances), velocity 3, nodes of a solid's lattice 3."""
+MOST_DISTANCES = 1 << 24
+"""Of all solids: places up to here are exact in float32."""
 
 
-def pack_conditions(conditions: tuple[Condition, ...], device: torch.device) -> Tensor:
-    """(condition, WIDTH) float32, one row each, as `apply_conditions` reads them.
+def pack_conditions(conditions: tuple[Condition, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """(condition, WIDTH) float32, one row each, and the distances of all solids, as `apply_conditions` reads them.
 
     Raises:
-        ValueError: a shape without size or a normal of length 0.
+        ValueError: a shape without size, a normal of length 0, or more solids than fit.
     """
-    rows = []
+    rows, distances, place = [], [torch.zeros(1, device=device)], 1
     for condition in conditions:
-        shape = condition.shape
+        shape, nodes = condition.shape, (0, 0, 0)
         if isinstance(shape, Plane):
             length = sum(c * c for c in shape.normal) ** 0.5
             if not length > 0:
@@ -33,14 +36,21 @@ def pack_conditions(conditions: tuple[Condition, ...], device: torch.device) -> 
             if not shape.radius > 0:
                 raise ValueError(f"the sphere at {shape.center} has the radius {shape.radius}; expected a positive one")
             point, second = shape.center, (shape.radius, 0.0, 0.0)
+        elif isinstance(shape, Solid):
+            point, second, nodes = shape.minimum, (shape.spacing, float(place), 0.0), tuple(shape.distances.shape)
+            distances.append(shape.distances.to(device, torch.float32).reshape(-1))
+            place += shape.distances.numel()
+            if place > MOST_DISTANCES:
+                raise ValueError(f"all solids together have more than {MOST_DISTANCES} distances: use fewer, or a larger spacing")
         else:
             point = tuple((low + high) / 2 for low, high in zip(shape.minimum, shape.maximum, strict=True))
             second = tuple((high - low) / 2 for low, high in zip(shape.minimum, shape.maximum, strict=True))
             if min(second) <= 0:
                 raise ValueError(f"the box {shape.minimum} to {shape.maximum} is empty")
         kinds = (float(SHAPES.index(type(shape))), float(EFFECTS.index(condition.effect)))
-        rows.append((*kinds, condition.friction, condition.start, min(condition.end, FAR_FUTURE), *point, *second, *condition.velocity))
-    return torch.tensor(rows, dtype=torch.float32, device=device).reshape(-1, WIDTH)
+        window = (condition.start, min(condition.end, FAR_FUTURE))
+        rows.append((*kinds, condition.friction, *window, *point, *second, *condition.velocity, *map(float, nodes)))
+    return torch.tensor(rows, dtype=torch.float32, device=device).reshape(-1, WIDTH), torch.cat(distances)
 
 
 @wp.func
@@ -56,7 +66,40 @@ def nearest_face(q: wp.vec3, half: wp.vec3):
 
 
 @wp.func
-def apply_conditions(position: wp.vec3, velocity: wp.vec3, dt: float, time: float, conditions: wp.array2d(dtype=float)):
+def distance_from_solid(q: wp.vec3, place: int, nx: int, ny: int, nz: int, distances: wp.array(dtype=float)):
+    """Trilinear, at q in cells from the lattice's first node; negative inside, huge beyond the lattice."""
+    x = int(wp.floor(q[0]))
+    y = int(wp.floor(q[1]))
+    z = int(wp.floor(q[2]))
+    if x < 0 or y < 0 or z < 0 or x > nx - 2 or y > ny - 2 or z > nz - 2:
+        return float(1.0e30)
+    fy = q[1] - float(y)
+    fz = q[2] - float(z)
+    low = place + (x * ny + y) * nz + z
+    high = low + ny * nz
+    near = wp.lerp(wp.lerp(distances[low], distances[low + 1], fz), wp.lerp(distances[low + nz], distances[low + nz + 1], fz), fy)
+    far = wp.lerp(wp.lerp(distances[high], distances[high + 1], fz), wp.lerp(distances[high + nz], distances[high + nz + 1], fz), fy)
+    return wp.lerp(near, far, q[0] - float(x))
+
+
+@wp.func
+def normal_of_solid(q: wp.vec3, place: int, nx: int, ny: int, nz: int, distances: wp.array(dtype=float)):
+    """Outward, at a point inside: differences over one cell, centred, so that a curved surface tilts no normal to one side."""
+    x = wp.vec3(0.5, 0.0, 0.0)
+    y = wp.vec3(0.0, 0.5, 0.0)
+    z = wp.vec3(0.0, 0.0, 0.5)
+    slope = wp.vec3(
+        distance_from_solid(q + x, place, nx, ny, nz, distances) - distance_from_solid(q - x, place, nx, ny, nz, distances),
+        distance_from_solid(q + y, place, nx, ny, nz, distances) - distance_from_solid(q - y, place, nx, ny, nz, distances),
+        distance_from_solid(q + z, place, nx, ny, nz, distances) - distance_from_solid(q - z, place, nx, ny, nz, distances),
+    )
+    return wp.normalize(slope)
+
+
+@wp.func
+def apply_conditions(
+    position: wp.vec3, velocity: wp.vec3, dt: float, time: float, conditions: wp.array2d(dtype=float), distances: wp.array(dtype=float)
+):
     """A node's velocity after all conditions, in their order."""
     v = velocity
     for c in range(conditions.shape[0]):
@@ -78,6 +121,15 @@ def apply_conditions(position: wp.vec3, velocity: wp.vec3, dt: float, time: floa
                 distance = wp.length(q)
                 inside = distance <= second[0]
                 n = q / wp.max(distance, 1.0e-20)
+            elif shape == 3:
+                cells = q / second[0]
+                place = int(second[1])
+                nx = int(conditions[c, 14])
+                ny = int(conditions[c, 15])
+                nz = int(conditions[c, 16])
+                inside = distance_from_solid(cells, place, nx, ny, nz, distances) <= 0.0
+                if inside:
+                    n = normal_of_solid(cells, place, nx, ny, nz, distances)
             else:
                 inside = wp.abs(q[0]) <= second[0] and wp.abs(q[1]) <= second[1] and wp.abs(q[2]) <= second[2]
                 n = nearest_face(q, second)

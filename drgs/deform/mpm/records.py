@@ -109,6 +109,17 @@ class Box:
     maximum: Triple
 
 
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A closed surface of triangles, as distances from it on a lattice (drgs/deform/measure_solid.py makes it)."""
+
+    minimum: Triple
+    """Where the lattice's first node lies; beyond the lattice nothing is inside."""
+    spacing: float
+    distances: Tensor
+    """(x, y, z) float32, negative inside."""
+
+
 @dataclass(frozen=True)
 class Condition:
     """Something that acts on the grid's nodes inside a shape, while it lasts.
@@ -117,7 +128,7 @@ class Condition:
     and friction acts on what presses. push: an acceleration, of gravity's kind.
     """
 
-    shape: Plane | Sphere | Box
+    shape: Plane | Sphere | Box | Solid
     effect: Literal["sticky", "slip", "separate", "push"] = "separate"
     friction: float = 0.0
     """Coulomb's coefficient; separate only."""

@@ -163,6 +163,7 @@ def update_nodes(
     time: float,
     gravity: wp.vec3,
     conditions: wp.array2d(dtype=float),
+    distances: wp.array(dtype=float),
 ):
     i = first + wp.tid()
     block = i // BLOCK_SIZE
@@ -187,7 +188,7 @@ def update_nodes(
     ny = corner[1] + y
     nz = corner[2] + z
     position = grid.origin + grid.dx * wp.vec3(float(nx), float(ny), float(nz))
-    v = apply_conditions(position, v, dt, time, conditions)
+    v = apply_conditions(position, v, dt, time, conditions, distances)
     # The room's walls: nothing leaves.
     vx = v[0]
     vy = v[1]
