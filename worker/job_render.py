@@ -207,13 +207,15 @@ def write_video(pictures: list[Path], out: Path, fps: int, should_stop=lambda: F
                 raise BuildStopped
             with Image.open(path) as image:
                 pixels = over_grey(np.asarray(image.convert("RGBA")))
-            yield pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
+            yield np.ascontiguousarray(pixels[: height // 2 * 2, : width // 2 * 2])
+
+    with Image.open(pictures[0]) as first:
+        width, height = first.size
 
     with av.open(str(draft), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "18", "preset": "medium"})
-        stream.pix_fmt = "yuv420p"
+        stream.pix_fmt, stream.width, stream.height = "yuv420p", width // 2 * 2, height // 2 * 2
         for pixels in frames():
-            stream.height, stream.width = pixels.shape[:2]
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         container.mux(stream.encode())
     os.replace(draft, out)

@@ -1,0 +1,179 @@
+"""Renders, simulations, exports and new versions, each run in this process on a small real asset."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from drgs.deform.clip import open_clip
+from drgs.deform.pose_scene import pose_scene
+from drgs.exchange.exr import encode_environment
+from drgs.scene.asset import Asset, load_asset, save_asset
+from drgs.scene.edits import parse_edits
+from drgs.scene.environment import Environment
+from drgs.scene.gaussians import surfel_tangents
+from tests.build.surfel_spheres import surfel_sphere
+from worker.builders import BuildProgress, BuildStopped
+from worker.data_directory import open_data_directory
+from worker.job_build import RedecoupleRun
+from worker.job_export import ExportRun
+from worker.job_render import RenderRun, turntable_view
+from worker.job_run import AbstractJobRun, JobContext
+from worker.job_simulate import SimulateRun
+from worker.save_version import with_edits
+
+ASSET, JOB = "a" * 32, "b" * 32
+SMALL = {"kind": "render", "asset": ASSET, "width": 32, "height": 24, "spp": 4, "denoise": False}
+
+
+def material(**values: object) -> dict:
+    return {"op": "material", "select": {"all": True}, "set": values, "mode": "absolute"}
+
+
+@pytest.fixture(scope="module")
+def cube() -> Asset:
+    from drgs.scene.mesh import TriangleMesh, vertex_normals
+
+    box = trimesh.creation.box((1.0, 1.0, 1.0)).subdivide()
+    vertices = torch.tensor(np.array(box.vertices), dtype=torch.float32)
+    faces = torch.tensor(np.array(box.faces), dtype=torch.int32)
+    grey = torch.full((len(vertices),), 0.5)
+    mesh = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), grey[:, None].repeat(1, 3), grey, torch.zeros_like(grey))
+    return Asset(None, mesh, None, Environment(torch.ones(8, 16, 3)))
+
+
+@pytest.fixture
+def job(tmp_path: Path, cube: Asset) -> Callable[..., JobContext]:
+    directory = open_data_directory(tmp_path / "data")
+    save_asset(cube, directory.asset(ASSET))
+    dark = np.full((8, 16, 3), 0.05, np.float32)
+    (directory.environments / "dark.exr").write_bytes(encode_environment(dark))
+    directory.job(JOB).mkdir()
+
+    def make(parameters: dict, progress: Callable[[BuildProgress], None] = lambda made: None, should_stop=lambda: False) -> JobContext:
+        return JobContext(JOB, "test", parameters, None, directory, None, None, "cpu", progress, should_stop)  # type: ignore[arg-type]
+
+    return make
+
+
+def run(made: AbstractJobRun) -> None:
+    for step in made.steps:
+        made.run(step)
+
+
+def mean(path: Path) -> float:
+    return float(np.asarray(Image.open(path))[..., :3].mean())
+
+
+def test_a_render_makes_every_picture_once_and_a_video_of_each_row(job: Callable[..., JobContext]) -> None:
+    request = SMALL | {
+        "turntable": {"frames": 3},
+        "environments": ["own", "dark.exr"],
+        "variants": [{"name": "grey", "edits": []}, {"name": "black", "edits": [material(albedo=[0, 0, 0])]}],
+        "video_fps": 12,
+    }
+    reports: list[BuildProgress] = []
+    context = job(request, reports.append)
+    run(RenderRun(context))
+    names = {path.name for path in context.files.iterdir()}
+    rows = [f"{variant}-{light}" for variant in ("grey", "black") for light in ("own", "dark")]
+    assert names == {f"{row}-{k:04d}.png" for row in rows for k in range(3)} | {f"{row}.mp4" for row in rows}
+    brightness = {row: mean(context.files / f"{row}-0001.png") for row in rows}
+    assert brightness["grey-own"] > brightness["grey-dark"] and brightness["grey-own"] > brightness["black-own"]
+    with av.open(str(context.files / "grey-own.mp4")) as video:
+        assert [frame.width for frame in video.decode(video=0)] == [32] * 3
+    assert [made.iteration for made in reports] == list(range(1, 13)) and reports[-1].fraction == 1.0
+    assert reports[0].preview_jpeg is not None and reports[0].preview_jpeg.startswith(b"\xff\xd8")
+    before = {path: path.read_bytes() for path in context.files.glob("*.png")}
+    lost = context.files / "black-own-0002.png"
+    lost.unlink()
+    again: list[BuildProgress] = []
+    run(RenderRun(job(request, again.append)))
+    assert [made.message for made in again if made.preview_jpeg is not None] == [lost.name]  # the others were kept
+    assert {path: path.read_bytes() for path in context.files.glob("*.png")} == before
+
+
+def test_a_render_stops_between_slices_and_leaves_no_half_picture(job: Callable[..., JobContext]) -> None:
+    asked = 0
+
+    def should_stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > 2
+
+    context = job(SMALL | {"spp": 64}, should_stop=should_stop)
+    with pytest.raises(BuildStopped):
+        run(RenderRun(context))
+    assert list(context.files.iterdir()) == []
+
+
+@pytest.mark.parametrize(("azimuth", "direction"), [(0.0, [0, -1, 0]), (90.0, [1, 0, 0])])
+def test_a_turntable_looks_at_the_middle_from_all_around(azimuth: float, direction: list[float]) -> None:
+    view = turntable_view([-1, -1, 0], [1, 1, 2], azimuth, 0.0)
+    offset = view[:3, 3] - np.array([0, 0, 1])
+    np.testing.assert_allclose(offset / np.linalg.norm(offset), direction, atol=1e-12)
+    np.testing.assert_allclose(view[:3, 2], direction, atol=1e-12)  # looks down -z
+    np.testing.assert_allclose(view[:3, 1], [0, 0, 1], atol=1e-12)
+    assert np.linalg.det(view) == pytest.approx(1)
+
+
+def test_a_simulation_becomes_a_clip_that_pictures_show(job: Callable[..., JobContext]) -> None:
+    scene = {"particles": 200, "duration": 0.2, "fps": 10, "floor": None, "gravity": 5.0}
+    context = job({"kind": "simulate", "asset": ASSET, "scene": scene})
+    run(SimulateRun(context))
+    clip = open_clip(context.directory.clip(JOB))
+    assert (clip.frame_count, clip.vertices) == (3, 26)
+    stopped = job({"kind": "simulate", "asset": ASSET, "scene": scene | {"seed": 1}}, should_stop=lambda: True)
+    run(SimulateRun(stopped))  # done already: nothing is computed, so nothing stops
+    two_cameras = [
+        {"name": name, "world_from_camera": turntable_view([-0.5] * 3, [0.5] * 3, 0, 0).tolist()} for name in ("first", "second")
+    ]
+    run(RenderRun(job(SMALL | {"clip": f"clips/{JOB}", "cameras": two_cameras, "video_fps": 5})))
+    first, second = (np.asarray(Image.open(context.files / f"asset-light-{name}.png")) for name in ("first", "second"))
+    assert np.abs(first.astype(int) - second).max() > 20  # the second shows it 0.2 s later, fallen
+
+
+def test_an_export_writes_each_format(job: Callable[..., JobContext]) -> None:
+    context = job({"kind": "export", "asset": ASSET, "formats": ["glb"]})
+    run(ExportRun(context))
+    assert [path.name for path in context.files.iterdir()] == ["asset-glb.glb"]
+    assert (context.files / "asset-glb.glb").read_bytes()[:4] == b"glTF"
+    with pytest.raises(ValueError, match="Gaussians"):
+        run(ExportRun(job({"kind": "export", "asset": ASSET, "formats": ["ply"]})))
+    assert len(list(context.files.iterdir())) == 1
+
+
+def test_an_asset_without_its_build_cannot_be_re_decoupled(job: Callable[..., JobContext]) -> None:
+    with pytest.raises(ValueError, match="geometry was not kept"):
+        run(RedecoupleRun(job({"kind": "redecouple", "asset": ASSET, "preset": "full"})))
+
+
+def test_a_version_looks_at_rest_as_its_edits_made_the_asset(tmp_path: Path, cube: Asset) -> None:
+    surfels = surfel_sphere(200)
+    asset = replace(cube, gaussians=surfels)
+    edits = parse_edits(
+        [
+            material(roughness=0.125),
+            {"op": "deform", "map": {"type": "bend", "curvature": 0.5}},
+            {"op": "deform", "map": {"type": "twist", "rate": 0.7}},
+            {"op": "environment", "rotation": 45.0, "intensity": 2.0},
+        ]
+    )
+    version = with_edits(asset, edits, tmp_path, 2)
+    posed = pose_scene(asset, edits)
+    assert torch.equal(version.mesh.vertices, posed.mesh.vertices) and torch.equal(version.mesh.roughness, posed.mesh.roughness)
+    assert torch.equal(version.environment.radiance, 2 * cube.environment.radiance)
+    assert version.gaussians is not None and posed.surfels is not None
+    made, wanted = surfel_tangents(version.gaussians).double(), posed.surfels.tangents.double()
+    torch.testing.assert_close(made @ made.mT, wanted @ wanted.mT, rtol=1e-4, atol=1e-7)
+    sides = torch.linalg.cross(made[..., 0], made[..., 1]) * torch.linalg.cross(wanted[..., 0], wanted[..., 1])
+    assert bool((sides.sum(-1) > 0).all())
+    save_asset(version, tmp_path / "asset")
+    assert load_asset(tmp_path / "asset").provenance["versions"] == json.loads(json.dumps(version.provenance["versions"]))
