@@ -91,7 +91,7 @@ def build(
     dataset: DatasetPath,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Asset folder to write.")],
     preset: Annotated[Preset, typer.Option(help="How much time to spend.")] = Preset.fast,
-    binding: Annotated[BindingKind, typer.Option(help="What carries the Gaussians when the object deforms.")] = BindingKind.particles,
+    binding: Annotated[BindingKind, typer.Option(help="Where Gaussians lie: as fitted, or rebuilt on the faces of the mesh.")] = BindingKind.particles,
     device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
     seed: Annotated[int, typer.Option()] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint that a stopped build left.")] = False,
@@ -106,7 +106,8 @@ def build(
         try:
             asset = build_asset(dataset, out, settings, progress=report, should_stop=interrupt.is_set)
         except BuildStopped:
-            print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value} --resume", file=sys.stderr)
+            bound = "" if binding == BindingKind.particles else f" --binding {binding.value}"
+            print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value}{bound} --resume", file=sys.stderr)
             raise typer.Exit(130) from None
     if json_progress:
         print(json.dumps({"stage": "done", "fraction": 1.0, "asset": str(out), "provenance": asset.provenance}), flush=True)

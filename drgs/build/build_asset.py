@@ -7,8 +7,9 @@ Checkpoints live in OUT.build/ beside the asset; a build that was stopped or kil
 import hashlib
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import TypeVar
 
 import simplejpeg
 import torch
@@ -18,7 +19,7 @@ from drgs.build.bake_materials import bake_materials
 from drgs.build.bind_gaussians import bind_gaussians
 from drgs.build.checkpoint import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.build.densify import DensifySettings, Pull
-from drgs.build.extract_mesh import FAST_MESH, FULL_MESH, DepthMap, MeshSettings, extract_mesh, mesh_report
+from drgs.build.extract_mesh import FAST_MESH, FULL_MESH, DepthMap, MeshSettings, clean_mesh, extract_mesh, mesh_report
 from drgs.build.fit_gaussians import (
     FitReport,
     FitSettings,
@@ -31,13 +32,23 @@ from drgs.build.fit_gaussians import (
     start_fit,
 )
 from drgs.build.fit_materials import MaterialSettings, MaterialState, fit_materials, gaussians_from_materials, start_materials
+from drgs.build.fit_mesh_surfels import (
+    MeshFitSettings,
+    MeshFitState,
+    fit_mesh_surfels,
+    gaussians_from_mesh_fit,
+    start_mesh_fit,
+    surfels_on_faces,
+)
 from drgs.build.initial_points import InitialPoints, initial_points
 from drgs.build.load_views import load_views
+from drgs.build.mesh_surfels import mesh_surfels
 from drgs.build.split_sum import filter_environment
 from drgs.maths.color import srgb_from_linear
 from drgs.render.rasterize_gbuffer import RasterSettings, rasterize
 from drgs.render.sample_rays import SampleCounts
 from drgs.scene.asset import Asset, save_asset
+from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians, surfel_tangents
@@ -59,6 +70,7 @@ class BuildSettings:
     preset: str = "fast"
     """draft, fast or full."""
     binding: str = "particles"
+    """particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face."""
     device: str = "auto"
     """auto, cpu or cuda."""
     seed: int = 0
@@ -92,8 +104,13 @@ class Preset:
     fit: FitSettings
     mesh: MeshSettings
     materials: MaterialSettings
+    mesh_surfels: MeshFitSettings = field(default_factory=MeshFitSettings)
+    """For binding mesh: its fine-tuning. There the mesh has as many faces at most as surfels are allowed (fit.densify.budget)."""
 
 
+BINDINGS = ("particles", "mesh")
+CHECKPOINTS = ("stage1.safetensors", "mesh.safetensors", "stage2.safetensors", "mesh_surfels.safetensors", "stage2_mesh.safetensors")
+"""In the order of the stages, first those of either binding and of particles."""
 PRESETS = {
     "draft": Preset(
         8_000,
@@ -101,6 +118,7 @@ PRESETS = {
         FitSettings(iterations=400, half_size_share=0.6, densify=DensifySettings(budget=12_000)),
         replace(FAST_MESH, resolution=160, face_limit=30_000),
         MaterialSettings(iterations=80, points_a_step=512),
+        MeshFitSettings(iterations=150),
     ),
     "fast": Preset(
         15_000,
@@ -108,6 +126,7 @@ PRESETS = {
         FitSettings(iterations=1400, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
         MaterialSettings(iterations=300),
+        MeshFitSettings(iterations=300),
     ),
     "full": Preset(
         25_000,
@@ -115,10 +134,16 @@ PRESETS = {
         FitSettings(iterations=2500, half_size_share=0.25, densify=DensifySettings(budget=40_000)),
         FULL_MESH,
         MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
+        MeshFitSettings(iterations=500),
     ),
 }
 STAGE_SHARES = {"read": 0.02, "fit": 0.62, "mesh": 0.04, "materials": 0.3, "pack": 0.02}
 """Of the time, for the progress bar."""
+MESH_STAGE_SHARES = {"read": 0.02, "fit": 0.53, "mesh": 0.04, "bind": 0.12, "materials": 0.27, "pack": 0.02}
+"""The same with binding mesh."""
+
+
+Surfels = TypeVar("Surfels", Gaussians, Binding)
 
 
 class BuildStopped(Exception):
@@ -128,8 +153,9 @@ class BuildStopped(Exception):
 class _Reporter:
     """Turns step reports into Progress, with a preview every few seconds and a checkpoint every half minute."""
 
-    def __init__(self, progress: Callable[[Progress], None] | None) -> None:
+    def __init__(self, progress: Callable[[Progress], None] | None, shares: dict[str, float]) -> None:
         self.progress = progress
+        self.shares = shares
         self.started = time.monotonic()
         self.last_preview = self.last_checkpoint = self.last_report = self.started
 
@@ -153,13 +179,13 @@ class _Reporter:
         if preview is not None and now - self.last_preview > PREVIEW_SECONDS:
             jpeg = preview()
             self.last_preview = time.monotonic()
-        names = list(STAGE_SHARES)
-        fraction = sum(STAGE_SHARES[n] for n in names[: names.index(stage)]) + share * STAGE_SHARES[stage]
+        names = list(self.shares)
+        fraction = sum(self.shares[n] for n in names[: names.index(stage)]) + share * self.shares[stage]
         spent = now - self.started
         eta = None
         if report is not None and report.iteration > 10:  # this stage's rate, scaled to what is left of the whole
             eta = report.seconds / report.iteration * (report.iterations - report.iteration)
-            eta += max(0.0, 1 - fraction - (1 - share) * STAGE_SHARES[stage]) * spent / max(fraction, 0.05)
+            eta += max(0.0, 1 - fraction - (1 - share) * self.shares[stage]) * spent / max(fraction, 0.05)
         counts = (report.iteration, report.iterations) if report else (0, 0)
         self.progress(Progress(stage, *counts, fraction, report.psnr if report else None, message, eta, jpeg))
 
@@ -207,13 +233,14 @@ def build_stages(
     for name in (settings.preset, settings.materials or settings.preset):
         if name not in PRESETS:
             raise ValueError(f"preset {name!r} is unknown; expected one of {', '.join(PRESETS)}")
-    if settings.binding != "particles":
-        raise ValueError(f"binding {settings.binding!r} is not available in this version; use --binding particles")
+    if settings.binding not in BINDINGS:
+        raise ValueError(f"binding {settings.binding!r} is unknown; expected one of {', '.join(BINDINGS)}")
     preset = PRESETS[settings.preset]
     device = device_from_name(settings.device)
     work = Path(f"{out}.build")
     seconds: dict[str, float] = {}
-    reporter = _Reporter(progress)
+    on_mesh = settings.binding == "mesh"
+    reporter = _Reporter(progress, MESH_STAGE_SHARES if on_mesh else STAGE_SHARES)
 
     def stop_now() -> bool:
         return should_stop is not None and should_stop()
@@ -229,11 +256,7 @@ def build_stages(
     identity = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
     yield "read", None
     if not settings.resume:
-        for stale in (
-            "stage1.safetensors",
-            "mesh.safetensors",
-            "stage2.safetensors",
-        ):  # else a later --resume would take them for this build's
+        for stale in CHECKPOINTS:  # else a later --resume would take them for this build's
             (work / stale).unlink(missing_ok=True)
 
     started = time.monotonic()
@@ -250,12 +273,37 @@ def build_stages(
     if stop_now():
         raise BuildStopped
 
+    light, binding = fit.parameters, None
+    if on_mesh:
+        started = time.monotonic()
+        identity |= {"binding": "mesh"}
+        mesh = reduced_mesh(mesh, preset.fit.densify.budget, points.bounds_radius)
+        bind_settings = replace(preset.mesh_surfels, seed=settings.seed)
+        bound = _bind_stage(
+            views, gaussians, fit, mesh, points.bounds_radius, bind_settings, work, identity, settings.resume, reporter, stop_now
+        )
+        gaussians, binding = gaussians_from_mesh_fit(bound)
+        seen = seen_surfels(gaussians, views.cameras, points.bounds_radius)
+        gaussians, binding, light = chosen_surfels(gaussians, seen), chosen_surfels(binding, seen), bound.parameters
+        timed("bind", started)
+        yield "bind", None
+
     started = time.monotonic()
     material_settings = replace(PRESETS[settings.materials or settings.preset].materials, seed=settings.seed)
     if settings.materials is not None:
         identity |= {"materials": settings.materials}
     materials = _stage_two(
-        views, gaussians, fit, mesh, points.bounds_radius, material_settings, work, identity, settings.resume, reporter, stop_now
+        views,
+        gaussians,
+        light,
+        mesh,
+        points.bounds_radius,
+        material_settings,
+        work / CHECKPOINTS[4 if on_mesh else 2],
+        identity,
+        settings.resume,
+        reporter,
+        stop_now,
     )
     timed("materials", started)
     yield "materials", None
@@ -268,13 +316,14 @@ def build_stages(
     asset = Asset(
         gaussians=gaussians,
         mesh=baked,
-        binding=bind_gaussians(gaussians.centers, baked),
+        binding=bind_gaussians(gaussians.centers, baked) if binding is None else binding,
         environment=environment,
         cameras=views.cameras,
         provenance={
             "source": views.source,
             "dataset": dataset.name,
             "preset": settings.preset,
+            "binding": settings.binding,
             "materials": settings.materials or settings.preset,
             "seed": settings.seed,
             "device": str(device),
@@ -349,10 +398,42 @@ def _mesh_stage(views, points, fit, mesh_settings, work, identity, resume) -> tu
     return gaussians, mesh
 
 
-def _stage_two(views, gaussians, fit, mesh, radius, material_settings, work, identity, resume, reporter, stop_now) -> MaterialState:
-    """fit_materials with checkpoints in `work`."""
-    path = work / "stage2.safetensors"
-    state = start_materials(gaussians, fit.parameters, mesh, material_settings, radius)
+def _bind_stage(views, gaussians, fit, mesh, radius, bind_settings, work, identity, resume, reporter, stop_now) -> MeshFitState:
+    """mesh_surfels and fit_mesh_surfels with a checkpoint in `work`."""
+    path = work / "mesh_surfels.safetensors"
+    state = start_mesh_fit(*mesh_surfels(gaussians, mesh), mesh, fit.parameters, bind_settings)
+    if resume and path.exists():
+        tensors, facts = read_tensors(path, mesh.vertices.device)
+        _same_build(facts, identity, path)
+        restore_fit(tensors, state.parameters, state.optimizer, state.generator)
+        state.iteration = facts["iteration"]
+
+    def save() -> None:
+        write_tensors(path, fit_tensors(state.parameters, state.optimizer, state.generator), identity | {"iteration": state.iteration})
+
+    def preview() -> bytes:
+        with torch.no_grad():
+            camera = _preview_camera(views.cameras).to(mesh.vertices.device)
+            tables = filter_environment(environment_table(state.parameters))
+            maps = render_stage_one(surfels_on_faces(state), tables, camera, 0.01 * radius, bind_settings.losses.sh_degree)
+            return encode_preview(maps.radiance_linear, maps.coverage)
+
+    def report(r: FitReport, _state: MeshFitState) -> None:
+        reporter.report("bind", r.iteration / r.iterations, f"{r.surfels} surfels on faces", r, preview, save)
+
+    if state.iteration < bind_settings.iterations:
+        fit_mesh_surfels(views, state, bind_settings, radius, report, stop_now)
+        save()
+    if state.iteration < bind_settings.iterations:
+        raise BuildStopped
+    return state
+
+
+def _stage_two(views, gaussians, light, mesh, radius, material_settings, path, identity, resume, reporter, stop_now) -> MaterialState:
+    """fit_materials with its checkpoint at `path`; `light` are the parameters of the fit before."""
+    if "binding" in identity:  # a surfel never leaves its face
+        material_settings = replace(material_settings, rates=replace(material_settings.rates, centers=0.0))
+    state = start_materials(gaussians, light, mesh, material_settings, radius)
     if resume and path.exists():
         tensors, facts = read_tensors(path, mesh.vertices.device)
         _same_build(facts, identity, path)
@@ -388,6 +469,11 @@ def _preview_camera(cameras: tuple[Camera, ...]) -> Camera:
 
 def drop_unseen(gaussians: Gaussians, cameras: tuple[Camera, ...], radius: float, least_weight: float = 0.02) -> Gaussians:
     """Without the surfels that no camera sees with a blending weight above `least_weight`: what hides inside would only cast shadows."""
+    return chosen_surfels(gaussians, seen_surfels(gaussians, cameras, radius, least_weight))
+
+
+def seen_surfels(gaussians: Gaussians, cameras: tuple[Camera, ...], radius: float, least_weight: float = 0.02) -> Tensor:
+    """(surfel,) whether some camera sees the surfel with a blending weight above `least_weight`."""
     weight = torch.zeros(len(gaussians.centers), 1, device=gaussians.centers.device)
     tangents, opacities = surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)
     for camera in cameras:
@@ -397,8 +483,20 @@ def drop_unseen(gaussians: Gaussians, cameras: tuple[Camera, ...], radius: float
             gaussians.centers, tangents, opacities, feature, camera.to(weight.device), RasterSettings(0.01 * radius, depth=False)
         )
         weight = torch.maximum(weight, torch.autograd.grad(maps.features.sum(), feature)[0])
-    kept = weight[:, 0] > least_weight
-    return Gaussians(*(getattr(gaussians, name)[kept] for name in gaussians.__dataclass_fields__))
+    return weight[:, 0] > least_weight
+
+
+def chosen_surfels(record: Surfels, kept: Tensor) -> Surfels:
+    """The entries of a record whose every field is by surfel, where `kept` (surfel,) is True."""
+    return type(record)(*(getattr(record, entry.name)[kept] for entry in fields(record)))
+
+
+def reduced_mesh(mesh: TriangleMesh, face_limit: int, radius: float) -> TriangleMesh:
+    """The mesh with at most `face_limit` faces, grey again where its vertices are new."""
+    if len(mesh.faces) <= face_limit:
+        return mesh
+    settings = MeshSettings(smoothing_passes=0, face_limit=face_limit)
+    return _grey_mesh(*clean_mesh(mesh.vertices, mesh.faces, settings, shortest_edge=1e-5 * radius))
 
 
 def mesh_from_gaussians(gaussians: Gaussians, cameras: tuple[Camera, ...], points: InitialPoints, settings: MeshSettings) -> TriangleMesh:
@@ -411,7 +509,11 @@ def mesh_from_gaussians(gaussians: Gaussians, cameras: tuple[Camera, ...], point
             gaussians.centers, tangents, opacities, empty, camera.to(empty.device), RasterSettings(0.01 * points.bounds_radius)
         )
         maps.append(DepthMap(camera.to(empty.device), drawn.median_depth, drawn.coverage))
-    vertices, faces = extract_mesh(maps, points.bounds_center, points.bounds_radius, settings)
+    return _grey_mesh(*extract_mesh(maps, points.bounds_center, points.bounds_radius, settings))
+
+
+def _grey_mesh(vertices: Tensor, faces: Tensor) -> TriangleMesh:
+    """Shape alone; bake_materials gives it its materials."""
     grey = torch.full((len(vertices),), 0.5, device=vertices.device)
     return TriangleMesh(vertices, faces, vertex_normals(vertices, faces), grey[:, None].repeat(1, 3), grey, torch.zeros_like(grey))
 

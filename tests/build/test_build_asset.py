@@ -8,11 +8,13 @@ import pytest
 import simplejpeg
 import torch
 
+from drgs.build.bind_gaussians import points_from_binding
 from drgs.build.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, drop_unseen, encode_preview
 from drgs.build.densify import DensifySettings
 from drgs.build.extract_mesh import MeshSettings
 from drgs.build.fit_gaussians import FitSettings
 from drgs.build.fit_materials import MaterialSettings
+from drgs.build.fit_mesh_surfels import MeshFitSettings
 from drgs.render.sample_rays import SampleCounts
 from drgs.scene.asset import Asset, load_asset
 from tests.build.surfel_spheres import joined, surfel_sphere
@@ -25,6 +27,7 @@ TINY = Preset(
     fit=FitSettings(iterations=20, densify=DensifySettings(every=5, budget=700)),
     mesh=MeshSettings(resolution=48, face_limit=2000),
     materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
+    mesh_surfels=MeshFitSettings(iterations=6),
 )
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
 
@@ -128,6 +131,35 @@ def test_a_stopped_build_leaves_a_checkpoint_and_resumes_to_the_same_asset(build
     assert load_asset(out).gaussians is not None
 
 
+def test_bound_to_the_mesh_a_build_goes_on_from_the_fit_of_particles_and_resumes_to_the_same_bits(
+    build: Build, capture: Path, tmp_path: Path
+):
+    out = tmp_path / "sphere"
+    shutil.copytree(f"{build.path}.build", f"{out}.build")
+    on_mesh = dataclasses.replace(SETTINGS, binding="mesh", resume=True)
+    progress: list[Progress] = []
+    with pytest.raises(BuildStopped):  # asked after the mesh, then before each step of the fine-tuning
+        build_asset(capture, out, on_mesh, progress.append, iter([False, False, False, True]).__next__)
+    assert "fit" not in {p.stage for p in progress} and (Path(f"{out}.build") / "mesh_surfels.safetensors").is_file()
+    progress.clear()
+    asset = build_asset(capture, out, on_mesh, progress.append)
+    fractions = [p.fraction for p in progress]
+    assert fractions == sorted(fractions) and {"bind", "materials"} <= {p.stage for p in progress}
+    mesh, gaussians, binding = asset.mesh, asset.gaussians, asset.binding
+    assert len(mesh.faces) <= TINY.fit.densify.budget and len(binding.face.unique()) == len(binding.face) == len(gaussians.centers)
+    assert torch.allclose(points_from_binding(binding, mesh.vertices, mesh.faces), gaussians.centers, atol=1e-6)
+    assert asset.provenance["binding"] == "mesh" and build.asset.provenance["binding"] == "particles"
+    # Without a stop, from the same stage 1, to another place.
+    shutil.copytree(f"{build.path}.build", tmp_path / "b.build")
+    through = asset_tensors(build_asset(capture, tmp_path / "b", on_mesh))
+    for name, value in asset_tensors(asset).items():
+        assert torch.equal(through[name], value), name
+    # The particles' checkpoints are as they were.
+    particles = asset_tensors(build_asset(capture, out, dataclasses.replace(SETTINGS, resume=True)))
+    for name, value in asset_tensors(build.asset).items():
+        assert torch.equal(particles[name], value), name
+
+
 def test_stopping_before_anything_is_fitted_can_be_resumed(capture: Path, tmp_path: Path):
     with pytest.raises(BuildStopped):
         build_asset(capture, tmp_path / "a", SETTINGS, should_stop=lambda: True)
@@ -178,7 +210,7 @@ def test_a_damaged_checkpoint_is_refused_on_resume_and_ignored_without(capture: 
     ("settings", "sentence"),
     [
         (BuildSettings(preset="best"), "preset 'best' is unknown; expected one of draft, fast, full"),
-        (BuildSettings(binding="ropes"), "binding 'ropes' is not available"),
+        (BuildSettings(binding="ropes"), "binding 'ropes' is unknown; expected one of particles, mesh"),
         (BuildSettings(device="tpu"), "device 'tpu' is unknown"),
     ],
 )
