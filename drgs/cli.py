@@ -91,7 +91,9 @@ def build(
     dataset: DatasetPath,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Asset folder to write.")],
     preset: Annotated[Preset, typer.Option(help="How much time to spend.")] = Preset.fast,
-    binding: Annotated[BindingKind, typer.Option(help="Where Gaussians lie: as fitted, or rebuilt on the faces of the mesh.")] = BindingKind.particles,
+    binding: Annotated[
+        BindingKind, typer.Option(help="Where Gaussians lie: as fitted, or rebuilt on the faces of the mesh.")
+    ] = BindingKind.particles,
     device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
     seed: Annotated[int, typer.Option()] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint that a stopped build left.")] = False,
