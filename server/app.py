@@ -6,8 +6,9 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from html import escape
 
+import psutil
 from fastapi import FastAPI, Request, Response
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, PlainTextResponse
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -17,7 +18,9 @@ from server import routes_assets, routes_jobs, routes_sessions, stream
 from server.context import ServerContext
 from server.docs_page import docs_page
 from server.environments import EnvironmentStore
+from server.metrics import Metrics, MetricsMiddleware
 from server.problems import ProblemError, add_problem_handlers
+from server.rate_limit import RateLimit
 from server.render_session import AbstractRenderer
 from server.render_thread import RenderThread
 from server.rest_records import Health, TokenRequest
@@ -44,7 +47,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     Raises:
         ValueError: the data directory cannot be used.
     """
-    directory = open_data_directory(settings.data)
+    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
     engine = open_database(directory)
     environments = EnvironmentStore(directory.environments)
     environments.add_bundled(settings.bundled_environments)
@@ -59,6 +62,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
             connection.tell_error(sentence)
 
     thread = RenderThread(tell)
+    metrics = Metrics()
     context = ServerContext(
         settings=settings,
         directory=directory,
@@ -66,9 +70,10 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
         queue=JobQueue(directory, engine),
         environments=environments,
         render_thread=thread,
-        sessions=SessionRegistry(directory, engine, renderer, thread, environments, settings.limits),
+        sessions=SessionRegistry(directory, engine, renderer, thread, environments, settings.limits, metrics),
         gatekeeper=Gatekeeper(read_token(directory), settings.host_names),
         connections=connections,
+        metrics=metrics,
     )
 
     @asynccontextmanager
@@ -94,7 +99,9 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     _add_pages(app, settings)
     # Outermost last: the gate comes before anything reads a body.
     app.add_middleware(_BodyLimit, limits=settings.limits)
+    app.add_middleware(RateLimit, requests_a_second=settings.limits.requests_a_second)
     app.add_middleware(GateMiddleware, gatekeeper=context.gatekeeper)
+    app.add_middleware(MetricsMiddleware, metrics=context.metrics)
     return app
 
 
@@ -127,6 +134,19 @@ def _add_small_routes(app: FastAPI, context: ServerContext) -> None:
     @app.get("/healthz", tags=["service"])
     async def healthz() -> Health:
         return Health()
+
+    @app.get("/metrics", tags=["service"], response_class=PlainTextResponse)
+    def read_metrics() -> PlainTextResponse:
+        """In Prometheus' text format; needs the token, as `Authorization: Bearer`."""
+        gauges = {
+            "drgs_viewers": context.sessions.viewer_count(),
+            "drgs_sessions_live": context.sessions.live_count(),
+            "drgs_assets_loaded": context.sessions.loaded_count(),
+            "drgs_jobs": context.queue.active_count(),
+            "drgs_workers_alive": len(context.queue.alive_workers()),
+            "drgs_resident_bytes": psutil.Process().memory_info().rss,
+        }
+        return PlainTextResponse(context.metrics.text(gauges), media_type="text/plain; version=0.0.4")
 
     @app.post("/api/login", status_code=204, tags=["service"])
     async def login(body: TokenRequest, request: Request) -> Response:

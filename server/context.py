@@ -9,6 +9,7 @@ from fastapi import Request
 from sqlalchemy import Engine
 
 from server.environments import EnvironmentStore
+from server.metrics import Metrics
 from server.render_thread import RenderThread
 from server.security import Gatekeeper
 from server.sessions import SessionRegistry
@@ -33,6 +34,7 @@ class ServerContext:
     render_thread: RenderThread
     sessions: SessionRegistry
     gatekeeper: Gatekeeper
+    metrics: Metrics
     connections: dict[Viewer, Connection] = field(default_factory=dict)
     """Open streams by their viewer."""
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import uvicorn
 
 from server.app import create_app
-from server.settings import ServerSettings
 from worker.data_directory import open_data_directory, read_token
+from worker.logs import set_up_logging
+from worker.settings import read_settings
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 LONGEST_RESTART_SECONDS = 60.0
 QUICK_DEATH_SECONDS = 10.0
 """A worker that lived shorter than this is started again later and later."""
@@ -27,16 +27,16 @@ log = logging.getLogger(__name__)
 
 
 def serve(
-    data: Path,
-    host: str = "127.0.0.1",
-    port: int = 8000,
-    with_worker: bool = True,
+    data: Path | None = None,
+    host: str | None = None,
+    port: int | None = None,
+    with_worker: bool | None = None,
     open_browser: bool = False,
     ready: Callable[[str], None] | None = None,
-    capture_roots: tuple[Path, ...] = (),
-    device: str = "auto",
+    capture_roots: tuple[Path, ...] | None = None,
+    device: str | None = None,
 ) -> int:
-    """Serve until SIGTERM or Ctrl-C. Returns the exit code.
+    """Serve until SIGTERM or Ctrl-C. Returns the exit code. What is None is as the settings say (worker/settings.py).
 
     Args:
         port: 0 picks a free one.
@@ -44,22 +44,22 @@ def serve(
         capture_roots: folders below which a job may name a capture.
 
     Raises:
-        ValueError: the data directory cannot be used, the host is not this machine's own, or the port is taken.
+        ValueError: a setting is wrong, the data directory cannot be used, the host is not this machine's own, or the port is taken.
     """
-    if host not in LOOPBACK:
-        raise ValueError(
-            f"--host {host}: drgs serve listens on this machine only ({', '.join(LOOPBACK)}), since it has no TLS of its own; "
-            "put a TLS proxy or an SSH tunnel in front of it"
-        )
+    settings = read_settings(data=data, host=host, port=port, worker=with_worker, capture_roots=capture_roots or None, device=device)
+    settings = settings.model_copy(update={"data": settings.data.expanduser().resolve()})
+    host, port = settings.host, settings.port
+    set_up_logging(settings.log_format)
     # torch's idle threads would otherwise spin, and server and worker share the cores; read when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    directory = open_data_directory(data)
-    app = create_app(ServerSettings(data=directory.root, host=host, port=port, capture_roots=capture_roots, device=device))
+    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
+    app = create_app(settings)
     # ws_per_message_deflate costs a third of the frame rate at 1080p and gains nothing on JPEG.
     config = uvicorn.Config(
         app,
         host=host,
         port=port,
+        log_config=None,
         log_level="warning",
         ws="websockets-sansio",
         ws_max_size=1 << 20,
@@ -70,7 +70,7 @@ def serve(
         limit_concurrency=512,
     )
     server = _Server(config, lambda bound: _announce(bound, host, read_token(directory), open_browser, ready))
-    worker = WorkerProcess(directory.root, device) if with_worker else None
+    worker = WorkerProcess(directory.root, settings.device) if settings.worker else None
     if worker:
         worker.start()
     try:

@@ -67,7 +67,7 @@ class Gatekeeper:
         host, origin = headers.get("host", ""), headers.get("origin")
         if not self.is_our_host(host):
             return 400, "This Host name is not served here; use the address that `drgs serve` printed."
-        needs_token = websocket or (scope["path"].startswith("/api") and scope["path"] not in OPEN_API_PATHS)
+        needs_token = websocket or scope["path"] == "/metrics" or (scope["path"].startswith("/api") and scope["path"] not in OPEN_API_PATHS)
         changes = websocket or scope.get("method") not in ("GET", "HEAD")
         bearer = self.has_bearer(headers)
         if origin is not None and changes and origin not in (f"http://{host}", f"https://{host}"):

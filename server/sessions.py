@@ -1,6 +1,6 @@
 """Live sessions: one asset, one ordered log of edits, any number of viewers. The log is on disk before an edit is acknowledged.
 
-Loaded assets are kept while memory allows (`Limits.loaded_assets`); a session whose asset was unloaded, or whose server died, comes
+Loaded assets are kept while memory allows (`Limits.loaded_assets`, `loaded_bytes`); a session whose asset was unloaded, or whose server died, comes
 back from its log the next time somebody looks at it.
 """
 
@@ -21,11 +21,13 @@ from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, PoseEdit, parse_
 from server import messages
 from server.edit_log import EditLog, EventKind
 from server.environments import EnvironmentStore
+from server.metrics import Metrics
 from server.problems import ProblemError
 from server.render_session import AbstractLoadedAsset, AbstractRenderer
 from server.render_thread import RenderThread
 from server.settings import Limits
 from server.viewer import Posed, Viewer
+from worker.asset_folder import folder_bytes
 from worker.data_directory import DataDirectory
 from worker.database import AssetRow, SessionEventRow, SessionRow, SnapshotRow, now
 from worker.save_version import plain_edit
@@ -84,6 +86,7 @@ class SessionRegistry:
         render_thread: RenderThread,
         environments: EnvironmentStore,
         limits: Limits,
+        metrics: Metrics,
     ) -> None:
         self._directory = directory
         self._engine = engine
@@ -91,6 +94,7 @@ class SessionRegistry:
         self._thread = render_thread
         self._environments = environments
         self._limits = limits
+        self._metrics = metrics
         self._live: dict[str, LiveSession] = {}
         self._loaded: OrderedDict[str, AbstractLoadedAsset] = OrderedDict()
         self._loading = asyncio.Lock()
@@ -178,7 +182,13 @@ class SessionRegistry:
         await asyncio.to_thread(forget)
 
     def viewer_count(self) -> int:
-        return sum(len(session.viewers) for session in self._live.values())
+        return sum(len(session.viewers) for session in list(self._live.values()))
+
+    def live_count(self) -> int:
+        return len(self._live)
+
+    def loaded_count(self) -> int:
+        return len(self._loaded)
 
     def uses(self, asset_id: str) -> bool:
         """Whether somebody looks at this asset."""
@@ -215,7 +225,11 @@ class SessionRegistry:
         return session.posed
 
     def _unload_some(self) -> None:
-        for asset_id in list(self._loaded)[: -self._limits.loaded_assets]:
+        """The least recently used first; one that somebody looks at stays, and so does the newest."""
+        for asset_id in list(self._loaded)[:-1]:
+            used = sum(folder_bytes(self._directory.asset(name)) for name in self._loaded)
+            if len(self._loaded) <= self._limits.loaded_assets and used <= self._limits.loaded_bytes:
+                return
             if not self.uses(asset_id):
                 del self._loaded[asset_id]
                 for session in self._live.values():
@@ -271,6 +285,7 @@ class SessionRegistry:
         for viewer in session.viewers:
             viewer.scene_changed()
         self._thread.wake()
+        self._metrics.add("drgs_edits_total", kind=kind)
         message = log.message()
         for listener in list(session.listeners):
             listener(message)

@@ -33,6 +33,7 @@ from server.messages import (
     UndoMessage,
     VisibilityMessage,
     client_message,
+    unpack_frame,
 )
 from server.problems import ProblemError
 from server.sessions import LiveSession
@@ -161,6 +162,11 @@ class Connection:
 
     def _deliver(self, out: bytes | StatusMessage) -> None:
         """From the render thread."""
+        if isinstance(out, bytes):
+            metrics = self._context.metrics
+            metrics.add("drgs_frames_total")
+            metrics.add("drgs_frame_bytes_total", len(out))
+            metrics.add("drgs_render_seconds_total", unpack_frame(out)[0].render_us / 1e6)
         self._loop.call_soon_threadsafe(self._enqueue, out if isinstance(out, bytes) else out.model_dump_json())
 
     def _say(self, message: BaseModel) -> None:

@@ -9,8 +9,8 @@ from worker.run import run_worker
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m worker")
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
+    parser.add_argument("--data", type=Path, default=None)
+    parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default=None)
     parser.add_argument("--parent-pid", type=int, default=None, help="end when this process is gone")
     arguments = parser.parse_args()
     return run_worker(arguments.data, arguments.device, arguments.parent_pid)

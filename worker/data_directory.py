@@ -1,8 +1,8 @@
 """The folder that holds everything a service keeps: one record of its paths, made on first use with mode 0700.
 
 token               who knows it may use the service (mode 0600)
-app.sqlite          assets, jobs, workers, sessions with their edit logs
-jobs.sqlite         the queue's own state (DBOS). Whoever can write it runs code in workers, hence the mode of the folder
+app.sqlite          assets, jobs, workers, sessions with their edit logs; unless settings name another database
+jobs.sqlite         the queue's own state (DBOS), likewise. Whoever can write it runs code in workers, hence the mode of the folder
 assets/ID/          finished assets
 uploads/ID/         captures as they came, unpacked
 jobs/ID/            a job's working folder: checkpoints, preview, log.txt, and in files/ what can be downloaded
@@ -74,8 +74,12 @@ class DataDirectory:
         return self.environments / "clips" / job_id
 
 
-def open_data_directory(root: Path) -> DataDirectory:
+def open_data_directory(root: Path, database_url: str | None = None, queue_url: str | None = None) -> DataDirectory:
     """Make what is missing and return the paths.
+
+    Args:
+        database_url: SQLite in the folder where None.
+        queue_url: where None, the database NAME_jobs beside `database_url`'s NAME, or SQLite in the folder.
 
     Raises:
         ValueError: `root` is a file, or cannot be made or entered.
@@ -90,7 +94,9 @@ def open_data_directory(root: Path) -> DataDirectory:
             (root / name).mkdir(mode=0o700, exist_ok=True)
     except OSError as error:
         raise ValueError(f"data directory {root}: {error.strerror}; name a folder you may write with --data") from error
-    directory = DataDirectory(root, f"sqlite:///{root / 'app.sqlite'}", f"sqlite:///{root / 'jobs.sqlite'}")
+    if database_url is not None and queue_url is None and not database_url.startswith("sqlite"):
+        queue_url = f"{database_url}_jobs" if "?" not in database_url else database_url.replace("?", "_jobs?", 1)
+    directory = DataDirectory(root, database_url or f"sqlite:///{root / 'app.sqlite'}", queue_url or f"sqlite:///{root / 'jobs.sqlite'}")
     _ensure_token(directory)
     return directory
 

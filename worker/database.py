@@ -8,12 +8,15 @@ from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import JSON, BigInteger, Engine, ForeignKey, UniqueConstraint, create_engine, event
+from sqlalchemy import JSON, BigInteger, Engine, ForeignKey, UniqueConstraint, create_engine, event, text
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from worker.data_directory import DataDirectory, lock_file
+
+MIGRATION_LOCK = 0x64726773
+"""Any number, the same in all processes."""
 
 
 class Base(DeclarativeBase):
@@ -129,13 +132,19 @@ class SessionEventRow(Base):
 
 def open_database(directory: DataDirectory) -> Engine:
     """An engine on the migrated database; safe to call from several processes at once."""
-    engine = create_engine(directory.database_url)
+    url = directory.database_url
+    if url.startswith("postgresql://"):
+        url = url.replace("postgresql://", "postgresql+psycopg://", 1)
+    # A connection is tried before it is used: the database may have been restarted meanwhile.
+    engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _prepare_sqlite)
     with lock_file(directory.root / ".setup.lock"):
         config = Config()
         config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
         with engine.begin() as connection:
+            if engine.dialect.name == "postgresql":  # the file lock holds on one machine only
+                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": MIGRATION_LOCK})
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
     return engine

@@ -20,20 +20,27 @@ from worker.builders import find_builder
 from worker.data_directory import DataDirectory, open_data_directory, try_lock_file
 from worker.database import WorkerRow, now, open_database
 from worker.jobs import WorkerContext, set_context
+from worker.logs import set_up_logging
 from worker.queue import APPLICATION_NAME, HEARTBEAT_SECONDS, JOBS_VERSION, QUEUE_NAME, migrate_queue, refuse_pickled_rows
+from worker.settings import read_settings
 
 SHUTDOWN_SECONDS = 30
 """For the checkpoint of a build that is told to stop."""
 MAX_SLOTS = 64
 
 
-def run_worker(data: Path, device: str = "auto", parent_pid: int | None = None) -> int:
+def run_worker(data: Path | None = None, device: str | None = None, parent_pid: int | None = None) -> int:
     """Work until SIGTERM, SIGINT, or until the process `parent_pid` is gone. Returns the exit code.
 
+    Args:
+        data, device: those of the settings where None.
+
     Raises:
-        ValueError: the data directory cannot be used.
+        ValueError: a setting is wrong, or the data directory cannot be used.
     """
-    directory = open_data_directory(data)
+    settings = read_settings(data=data, device=device)
+    set_up_logging(settings.log_format)
+    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
     worker_id, slot_lock = _claim_slot(directory)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would otherwise spin beside the server's
     os.nice(10)  # the viewer comes first where both run on one machine
@@ -41,7 +48,7 @@ def run_worker(data: Path, device: str = "auto", parent_pid: int | None = None) 
     migrate_queue(directory)
     refuse_pickled_rows()
     stopping = threading.Event()
-    set_context(WorkerContext(directory, engine, worker_id, find_builder(), device, stopping))
+    set_context(WorkerContext(directory, engine, worker_id, find_builder(), settings.device, stopping))
 
     def stop(_signal: int, _frame: FrameType | None) -> None:
         stopping.set()

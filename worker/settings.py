@@ -1,0 +1,121 @@
+"""One settings object of the whole service, server and workers alike.
+
+Read, the first that says something: arguments of the command; environment variables DRGS_NAME (DRGS_LIMITS__NAME for limits, lists as
+JSON); the TOML file that DRGS_CONFIG names; the defaults below. A worker that the server starts gets the server's by inheriting its
+environment.
+"""
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+CONFIG_VARIABLE = "DRGS_CONFIG"
+"""Environment variable: path of a TOML file."""
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+Positive = Annotated[int, Field(ge=1)]
+
+
+class Limits(BaseModel):
+    """What callers may ask for, and how much is kept in memory."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    body_bytes: Positive = 16 << 20
+    """Of requests that are not uploads."""
+    upload_bytes: Positive = 4 << 30
+    active_jobs: Positive = 1000
+    """That wait or run; more are answered 429."""
+    requests_a_second: Annotated[float, Field(gt=0)] = 200.0
+    """Over a minute's mean, of one address; more are answered 429. Streams count once."""
+    viewers: Positive = 64
+    sessions: Positive = 1000
+    snapshots: Positive = 200
+    """Of one session."""
+    edits: Positive = 20_000
+    """In one session's log."""
+    undo_delete_seconds: Annotated[float, Field(ge=0)] = 24 * 3600
+    """How long a deleted asset can be brought back."""
+    loaded_assets: Positive = 16
+    """In memory; the least recently used one that nobody looks at goes first."""
+    loaded_bytes: Positive = 4 << 30
+    """Of asset folders whose contents are in memory, which is about what they need there."""
+
+
+class ServiceSettings(BaseSettings):
+    """How a service runs."""
+
+    model_config = SettingsConfigDict(env_prefix="DRGS_", env_nested_delimiter="__", extra="forbid", frozen=True)
+
+    data: Path = Path("data")
+    """Folder of everything that is kept (worker/data_directory.py)."""
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    """0 picks a free one."""
+    behind_proxy: bool = False
+    """A proxy with TLS stands before the server: it may then listen on other addresses than loopback, and host_names must name it."""
+    host_names: tuple[str, ...] = ("localhost", "127.0.0.1", "[::1]")
+    """Values of `Host`, without the port, that are answered."""
+    capture_roots: tuple[Path, ...] = ()
+    """Folders below which a job may name a capture."""
+    worker: bool = True
+    """Whether the server keeps a worker of its own."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where frames are rendered and jobs computed."""
+    database_url: str | None = None
+    """postgresql://USER:PASSWORD@HOST/NAME, for several workers and servers; None: SQLite in the data folder."""
+    queue_url: str | None = None
+    """Of DBOS's tables; None: NAME_jobs beside database_url's NAME, or SQLite in the data folder."""
+    log_format: Literal["text", "json"] = "text"
+    limits: Limits = Limits()
+    sample_capture: Path = REPOSITORY / "examples" / "sample_capture"
+    bundled_environments: Path = REPOSITORY / "examples" / "environments"
+    """EXR files that every data directory gets a copy of."""
+    static_folder: Path = REPOSITORY / "server" / "static"
+    """Where the web build writes."""
+
+    @field_validator("database_url", "queue_url")
+    @classmethod
+    def _is_a_known_database(cls, url: str | None) -> str | None:
+        if url is not None and not url.startswith(("postgresql://", "postgresql+psycopg://", "sqlite:///")):
+            raise ValueError("expected postgresql://USER:PASSWORD@HOST/NAME or sqlite:///PATH")
+        return url
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        file = os.environ.get(CONFIG_VARIABLE)
+        toml = (TomlConfigSettingsSource(settings_cls, Path(file)),) if file else ()
+        return (init_settings, env_settings, *toml)
+
+
+def read_settings(**given: object) -> ServiceSettings:
+    """The settings in force, with what is given (and not None) before all else.
+
+    Raises:
+        ValueError: one sentence that names the wrong setting, or the missing or damaged file.
+    """
+    file = os.environ.get(CONFIG_VARIABLE)
+    if file and not Path(file).is_file():
+        raise ValueError(f"{CONFIG_VARIABLE}={file}: there is no such file")
+    try:
+        settings = ServiceSettings(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise ValueError(f"setting {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    if settings.host not in LOOPBACK and not settings.behind_proxy:
+        raise ValueError(
+            f"--host {settings.host}: drgs serve listens on this machine only ({', '.join(LOOPBACK)}), since it has no TLS of its own; "
+            "put a TLS proxy in front of it and say so with DRGS_BEHIND_PROXY=true and DRGS_HOST_NAMES, or use an SSH tunnel"
+        )
+    return settings
