@@ -1,11 +1,15 @@
 """Light transport against an independent path tracer: error, bias and time, in one run.
 
-    python -m benchmarks integrator --reference DIR [--spp 8 32 128] [--mitsuba] [--json] [--pictures OUT]
+    python -m benchmarks integrator --reference DIR [--spp 8 32 128] [--variants paper sobol plan svgf oidn] [--mitsuba] [--json] [--plots OUT]
 
 DIR holds mesh.ply, cameras.json, env_*.exr, `<env>_<direct|bounce1>_<camera>.exr` (linear, premultiplied, many
 samples) and `*_se.npy` (standard error of each pixel's mean). relmse = mean over covered pixels and channels of
 (x - ref)^2 / (ref^2 + 0.01); bias = (sum x - sum ref) / sum ref; its error bar has both sides' noise.
 seconds is wall time from a built tracer on, cpu_seconds the sum over threads (steadier on a busy machine). within_4se = share of covered pixels whose RGB mean is within four standard errors (both sides' noise).
+Variants, each with what the one before it has: `paper`, the published split of 16 cosine, 8 GGX and 8 environment samples with independent
+numbers; `sobol`, low-discrepancy numbers; `plan`, what the scene does not need left out; `svgf`, its sums denoised. `oidn` denoises those of
+`plan` by Open Image Denoise. Independent numbers are passes of 2, 1 and 1 samples with a seed each; their time is that of `sobol`, since the rays are
+as many. --plots draws error against time, with the curve of Mitsuba that lies with the reference (seconds of another machine).
 With --mitsuba the same images are rendered by Mitsuba's path tracer in the same run (_mitsuba.py), and `time_to_error` gives for both the time
 to relmse 0.01 and 0.003, read off the measured points (log-log between them, error ~ 1 / time beyond).
 """
@@ -14,6 +18,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -21,7 +26,9 @@ import numpy as np
 import OpenEXR
 import torch
 
-from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, samples_a_pass, start_frame
+from benchmarks._plot import Curve, log_log_svg
+from drgs.render.accumulate import FrameState, RenderSettings, refine_frame, resolve_frame, samples_a_pass, start_frame
+from drgs.render.denoise_oidn import oidn_filter
 from drgs.render.sample_rays import SampleCounts
 from drgs.render.trace_rays import build_tracer
 from drgs.render.tracer import AbstractTracer
@@ -104,21 +111,74 @@ def time_to_error(rows: list[dict], target: float, clock: str) -> float:
     return float(np.exp(np.interp(-wanted, -errors, seconds)))
 
 
-def ours(scene: PosedScene, camera: Camera, settings: RenderSettings, tracer: AbstractTracer, samples: list[int]) -> Iterator[tuple]:
-    """(samples a pixel, premultiplied mean, its variance, wall seconds, seconds over threads) as samples grow."""
-    refine_frame(start_frame(scene, camera, settings, tracer))  # compile and warm up
-    started, cpu_started = time.perf_counter(), time.process_time()
+VARIANTS = ("paper", "sobol", "plan", "svgf", "oidn")
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A picture of one renderer."""
+
+    variant: str
+    spp: int
+    mean: np.ndarray
+    """(height, width, 3) premultiplied linear radiance."""
+    variance: np.ndarray
+    """(height, width) of the mean luminance; 0 where it is not told."""
+    seconds: float
+    """On the clock."""
+    cpu_seconds: float
+    """Summed over threads."""
+
+
+def shot(variant: str, state: FrameState, seconds: float, cpu_seconds: float, denoise: str = "none") -> Shot:
+    """The sums so far, shown; what showing takes is added to the time where it denoises."""
+    clock, cpu_clock = time.perf_counter(), time.process_time()
+    frame = resolve_frame(replace(state, settings=replace(state.settings, denoise=denoise)))
+    if denoise != "none":
+        seconds, cpu_seconds = seconds + time.perf_counter() - clock, cpu_seconds + time.process_time() - cpu_clock
+    coverage = frame.gbuffer.coverage
+    variance = (frame.radiance.variance * coverage**2).numpy() * (denoise == "none")
+    return Shot(variant, frame.radiance.samples, (frame.radiance_linear * coverage[..., None]).numpy(), variance, seconds, cpu_seconds)
+
+
+def ours(
+    scene: PosedScene, camera: Camera, settings: RenderSettings, tracer: AbstractTracer, samples: list[int], variants: list[str]
+) -> Iterator[Shot]:
+    """Pictures of the variants as samples grow."""
+    for skip in (False, True):
+        shown = [name for name in variants if (name in ("paper", "sobol")) != skip]
+        if not shown:
+            continue
+        settings = replace(settings, skip=skip)
+        warm = refine_frame(start_frame(scene, camera, settings, tracer))  # compile and warm up
+        for name in shown:
+            shot(name, warm, 0.0, 0.0, name if name in ("svgf", "oidn") else "none")
+        tracer.horizons = None
+        state, seconds, cpu_seconds = None, 0.0, 0.0
+        for spp in sorted(samples):
+            clock, cpu_clock = time.perf_counter(), time.process_time()
+            state = start_frame(scene, camera, settings, tracer) if state is None else state
+            state = refine_frame(state, max(0, -(-spp // samples_a_pass(settings, True).total) - state.passes))
+            seconds, cpu_seconds = seconds + time.perf_counter() - clock, cpu_seconds + time.process_time() - cpu_clock
+            for name in shown:
+                if name == "paper":
+                    yield shot(
+                        name, independent(scene, camera, settings, tracer, state.passes * state.plan.counts.total), seconds, cpu_seconds
+                    )
+                else:
+                    yield shot(name, state, seconds, cpu_seconds, name if name in ("svgf", "oidn") else "none")
+
+
+def independent(scene: PosedScene, camera: Camera, settings: RenderSettings, tracer: AbstractTracer, spp: int) -> FrameState:
+    """A frame of passes that know nothing of each other."""
+    settings = replace(settings, counts=SampleCounts(2, 1, 1), skip=False)
     state = start_frame(scene, camera, settings, tracer)
-    for spp in sorted(samples):
-        state = refine_frame(state, max(0, -(-spp // samples_a_pass(settings, True).total) - state.passes))
-        seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-        frame = resolve_frame(state)
-        coverage = frame.gbuffer.coverage
-        mean, variance = (frame.radiance_linear * coverage[..., None]).numpy(), (frame.radiance.variance * coverage**2).numpy()
-        yield frame.radiance.samples, mean, variance, seconds, cpu_seconds
+    for number in range(-(-spp // 4)):
+        state = refine_frame(replace(state, settings=replace(settings, seed=settings.seed + 7919 * (number + 1))))
+    return state
 
 
-def mitsubas(scene: PosedScene, camera: Camera, bounces: int, seed: int, samples: list[int]) -> Iterator[tuple]:
+def mitsubas(scene: PosedScene, camera: Camera, bounces: int, seed: int, samples: list[int]) -> Iterator[Shot]:
     """As `ours`; each picture is made from nothing, its own variance is not told."""
     from benchmarks._mitsuba import MitsubaScene
 
@@ -126,7 +186,21 @@ def mitsubas(scene: PosedScene, camera: Camera, bounces: int, seed: int, samples
     renderer.render(4, seed + 1)  # compile
     for spp in sorted(samples):
         mean, seconds, cpu_seconds = renderer.render(spp, seed)
-        yield spp, mean, np.zeros(mean.shape[:2], np.float32), seconds, cpu_seconds
+        yield Shot("path", spp, mean, np.zeros(mean.shape[:2], np.float32), seconds, cpu_seconds)
+
+
+def stored_curve(folder: Path, env: str, light: str) -> list[Curve]:
+    """Mitsuba's curve that lies with the reference (camera 0), if it does."""
+    path = folder / "mitsuba_error_vs_time.json"
+    rows = json.loads(path.read_text()) if path.is_file() else []
+    points = [(row["seconds"], row["relmse"]) for row in rows if (row["env"], row["light"]) == (env, light)]
+    return [Curve("Mitsuba, stored", points)] if points else []
+
+
+def plot(of_image: dict[str, list[dict]], stored: list[Curve], title: str) -> str:
+    """Error against wall time of one picture (SVG)."""
+    curves = [Curve(name, [(row["seconds"], row["relmse"]) for row in rows]) for name, rows in of_image.items()]
+    return log_log_svg(curves + stored, title, "seconds", "relmse")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -142,13 +216,18 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--pictures", type=Path, help="folder for linear images and differences (npy)")
-    parser.add_argument("--no-skip", action="store_true", help="without the plan: fixed sample counts")
+    parser.add_argument("--no-skip", action="store_true", help="without the plan: the same as --variants sobol")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["plan"])
+    parser.add_argument("--plots", type=Path, help="folder for error against time, log-log (svg)")
     parser.add_argument("--mitsuba-rows", action="store_true", help="look the environment up as Mitsuba does (mitsuba_rows)")
     parser.add_argument("--mitsuba", action="store_true", help="also render with Mitsuba, in the same run")
     parser.add_argument("--mitsuba-spp", type=int, nargs="+", default=[16, 64, 256], help="its samples a pixel")
     arguments = parser.parse_args(argv)
 
     folder: Path = arguments.reference
+    variants = ["sobol"] if arguments.no_skip else arguments.variants
+    if "oidn" in variants:
+        oidn_filter()  # complain before measuring
     mesh = read_mesh(folder / "mesh.ply")
     tracer = build_tracer(mesh)
     rows, times = [], []
@@ -163,23 +242,28 @@ def main(argv: list[str] | None = None) -> None:
             camera = read_cameras(folder / "cameras.json", len(reference))[number]
             counts = SampleCounts(*arguments.counts) if arguments.counts else None
             bounces = int(light == "bounce1")
-            settings = RenderSettings(bounces=bounces, primary="mesh", seed=arguments.seed, counts=counts, skip=not arguments.no_skip)
-            runs = {"drgs": ours(scene, camera, settings, tracer, arguments.spp)}
+            settings = RenderSettings(bounces=bounces, primary="mesh", seed=arguments.seed, counts=counts)
+            shots = {"drgs": ours(scene, camera, settings, tracer, arguments.spp, variants)}
             if arguments.mitsuba:
-                runs["mitsuba"] = mitsubas(as_given, camera, bounces, arguments.seed, arguments.mitsuba_spp)
+                shots["mitsuba"] = mitsubas(as_given, camera, bounces, arguments.seed, arguments.mitsuba_spp)
             of_image: dict[str, list[dict]] = {}
-            for renderer, run in runs.items():
-                for spp, mean, variance, seconds, cpu_seconds in run:
-                    row = {"renderer": renderer, "env": env, "light": light, "camera": number, "spp": spp}
-                    row |= {"seconds": round(seconds, 4), "cpu_seconds": round(cpu_seconds, 4)}
-                    row |= compare(mean, variance, reference, standard_error)
-                    of_image.setdefault(renderer, []).append(row)
+            for renderer, of_renderer in shots.items():
+                for taken in of_renderer:
+                    row = {"renderer": renderer, "variant": taken.variant, "env": env, "light": light, "camera": number, "spp": taken.spp}
+                    row |= {"seconds": round(taken.seconds, 4), "cpu_seconds": round(taken.cpu_seconds, 4)}
+                    row |= compare(taken.mean, taken.variance, reference, standard_error)
+                    of_image.setdefault(renderer if taken.variant in ("plan", "path") else f"{renderer}_{taken.variant}", []).append(row)
                     _print(row, arguments.json)
                 if renderer == "drgs" and arguments.pictures:
                     arguments.pictures.mkdir(parents=True, exist_ok=True)
-                    maps = np.stack([mean, reference[..., :3], np.repeat(variance[..., None], 3, -1)])
+                    maps = np.stack([taken.mean, reference[..., :3], np.repeat(taken.variance[..., None], 3, -1)])
                     np.save(arguments.pictures / f"{env}_{light}_{number}.npy", maps)
             rows += [row for of_renderer in of_image.values() for row in of_renderer]
+            if arguments.plots:
+                arguments.plots.mkdir(parents=True, exist_ok=True)
+                stored = stored_curve(folder, env, light) if number == 0 else []
+                picture = plot(of_image, stored, f"{env}, {light}, camera {number}")
+                (arguments.plots / f"{env}_{light}_{number}.svg").write_text(picture)
             for target in (0.01, 0.003) if arguments.mitsuba else ():
                 row = {"env": env, "light": light, "camera": number, "relmse": target}
                 for renderer, clock in product(of_image, ("seconds", "cpu_seconds")):
