@@ -222,7 +222,7 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files) -> ClipF
         frame = _remembered(asset, key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True))).at(edit.time)
     elif (rig := split_rig_clip(edit.clip)) is not None:
         key = ("rig", files.stamp(rig[0]), edit.model_dump_json(exclude={"time"}))
-        bound = _remembered(asset, key, lambda: bind_rig(files.path(rig[0]), rig[1], rest, asset.meters_per_unit, edit.rig))
+        bound = _remembered(asset, key, lambda: bind_rig(files.path(rig[0]), rig[1], asset, rest, edit.rig))
         frame = bound.at(edit.time)
     else:
         clip = open_clip(files.path(f"{edit.clip}/clip.json").parent)

@@ -1,11 +1,12 @@
 """Points that follow a simpler mesh near them: a scanned object moves with the low-polygon model that an animator has rigged.
 
 In: the proxy's triangles at rest and points near them; each frame the proxy's moved vertices and their deformation gradients. Out: where
-the points go, and F there. Two ways to bind, both exact for rigid motions and similarities:
+the points go. Two ways to bind, both exact for rigid motions and similarities:
 
 closest: a point keeps its place relative to its closest triangle, p' = sum w v' + F (p - sum w v), F from the corners; between nearby parts
-(two legs) the one that faces as the point does is chosen. mls: moving least squares over samples of the triangles (gmls.py), smoother
-across the proxy's edges, but blind to gaps narrower than its neighbourhoods.
+(two legs) the one that faces as the point does is chosen. For proxies that hug the object: where they stand off, neighbours may follow
+triangles far apart, and what lies between is torn. mls: moving least squares (gmls.py) over patches of the proxy as wide as the point is
+away from it, so that a loose proxy moves the object smoothly; blind to gaps narrower than its patches.
 """
 
 from dataclasses import dataclass
@@ -22,12 +23,34 @@ from drgs.warp_torch import launch, warp_array, warp_device
 wp.set_module_options({"enable_backward": False})
 
 ProxyMethod = Literal["closest", "mls"]
-SAMPLE_SPACING = 0.02
-"""Between the samples of `mls`, as a share of the proxy's diagonal."""
-MOST_SAMPLES = 40_000
-"""Of the whole proxy; it gets a few per triangle more than that where it has more triangles."""
+FINEST_PATCH = 0.02
+"""Width of the smallest patches of `mls`, as a share of the proxy's diagonal; the next are twice as wide, and so on."""
+LEVELS = 5
+"""Of patches: the widest have a third of the diagonal."""
+STAND_OFF = 2.0
+"""A point uses patches of this part of its distance to the proxy: some two dozen of them then span about that distance."""
+MOST_SAMPLES = 60_000
+"""Of the whole proxy, where it does not have more triangles than that."""
+PATCHES = GmlsSettings(neighbours=24, reach=1.0)
+"""reach 1: the farthest patch counts nothing, so that nothing jumps where another becomes the farthest."""
 FACING_MARGIN = 0.05
 """How much farther than its closest triangle one that faces as the point does may be, as a share of the proxy's diagonal."""
+
+
+@dataclass(frozen=True, eq=False)
+class PatchLevel:
+    """Samples of a proxy gathered in patches of one width, and the points that follow these."""
+
+    patch: Tensor
+    """(sample,) int64"""
+    share: Tensor
+    """(sample,) float64 of its patch; the shares of a patch sum to 1."""
+    points: Tensor
+    """(n,) int64: the points that this level takes part in."""
+    part: Tensor
+    """(n, 1) float64: how much; the parts of a point's levels sum to 1."""
+    weights: Weights
+    """From patches to points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +61,10 @@ class ProxyBinding:
     """(k, 3) int64 corners of the triangles of `barycentric`."""
     barycentric: Tensor
     """(k, 3) float64: feet of the points (closest), or samples (mls)."""
-    offset: Tensor | None
-    """(point, 3) float64 from foot to point at rest [world units]; None for mls."""
-    weights: Weights | None
-    """From samples to points; None for closest."""
+    offset: Tensor
+    """(point, 3) float64 from the closest point of the proxy to the point, at rest [world units]."""
+    levels: tuple[PatchLevel, ...]
+    """Empty for closest."""
 
 
 @wp.func
@@ -133,38 +156,34 @@ def bind_to_proxy(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tens
     faces = faces.long().to(device)[area > DEGENERATE * area.median().clamp(min=1e-300)] if len(area) else faces.long()
     if not len(faces):
         raise ValueError("the rig's mesh has no faces with area")
-    if method == "mls":
-        chosen, barycentric = _samples(vertices, faces)
-        sampled = (vertices[faces[chosen]] * barycentric[..., None]).sum(1)
-        return ProxyBinding(faces[chosen], barycentric, None, build_weights(sampled, points, GmlsSettings()))
-    chosen, barycentric = _closest(vertices, faces, points, normals)
-    foot = (vertices[faces[chosen]] * barycentric[..., None]).sum(1)
-    return ProxyBinding(faces[chosen], barycentric, points.detach().double() - foot, None)
+    chosen, barycentric = closest_faces(vertices, faces, points, normals)
+    offset = points.detach().double() - (vertices[faces[chosen]] * barycentric[..., None]).sum(1)
+    if method == "closest":
+        return ProxyBinding(faces[chosen], barycentric, offset, ())
+    chosen, barycentric, size = _samples(vertices, faces)
+    sampled = (vertices[faces[chosen]] * barycentric[..., None]).sum(1)
+    return ProxyBinding(faces[chosen], barycentric, offset, _levels(vertices, sampled, size, points, offset.norm(dim=-1)))
 
 
-def carry_points(binding: ProxyBinding, moved: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions (point, 3) and deformation gradients (point, 3, 3), float32, from the proxy's vertices, (vertex, 3) and (vertex, 3, 3)."""
+def carry_points(binding: ProxyBinding, moved: Tensor, gradients: Tensor) -> Tensor:
+    """Positions (point, 3) float64 from the proxy's vertices, (vertex, 3) and (vertex, 3, 3)."""
     device = binding.faces.device
     weights = binding.barycentric[..., None]
     foot = (moved.double().to(device)[binding.faces] * weights).sum(1)
     gradient = (gradients.double().to(device)[binding.faces] * weights[..., None]).sum(1)
-    if binding.weights is not None:
-        return interpolate(binding.weights, foot.float(), gradient.float())
-    assert binding.offset is not None
-    return (foot + (gradient @ binding.offset[..., None]).squeeze(-1)).float(), gradient.float()
+    if not binding.levels:
+        return foot + (gradient @ binding.offset[..., None]).squeeze(-1)
+    positions = torch.zeros_like(binding.offset)
+    for level in binding.levels:
+        patches, count = level.patch, len(level.weights.particles)
+        middle = foot.new_zeros(count, 3).index_add_(0, patches, foot * level.share[:, None])
+        turned = foot.new_zeros(count, 3, 3).index_add_(0, patches, gradient * level.share[:, None, None])
+        positions.index_add_(0, level.points, level.part * interpolate(level.weights, middle.float(), turned.float())[0])
+    return positions
 
 
-def distances_to_proxy(binding: ProxyBinding) -> Tensor:
-    """(point,) world units from each point to what it is bound to: its foot, or its nearest sample."""
-    if binding.offset is not None:
-        return binding.offset.norm(dim=-1)
-    assert binding.weights is not None
-    nearest = binding.weights.particles[binding.weights.neighbours[:, 0].long()]
-    return (binding.weights.points - nearest).norm(dim=-1)
-
-
-def _closest(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Face (point,) and barycentrics (point, 3) of the closest points that face alike."""
+def closest_faces(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Face (point,) and barycentrics (point, 3) float64 of the closest points, on faces that look the way of the normals (point, 3), or zero."""
     # About the proxy's middle: Warp's tree is in float32.
     middle = vertices.mean(0)
     local, targets = (vertices - middle).float().contiguous(), (points.detach().double() - middle).float().contiguous()
@@ -193,11 +212,32 @@ def _closest(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tensor) -
     return face.long(), inside / inside.sum(-1, keepdim=True)
 
 
-def _samples(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Face (sample,) and barycentrics (sample, 3): middles of the n * n small triangles that each face is cut into."""
+def _levels(vertices: Tensor, sampled: Tensor, size: Tensor, points: Tensor, distance: Tensor) -> tuple[PatchLevel, ...]:
+    """Each point follows the two levels of patches whose widths lie about `distance` / STAND_OFF, blended by where it lies between."""
+    low = vertices.amin(0)
+    finest = FINEST_PATCH * float((vertices.amax(0) - low).norm())
+    height = torch.log2((distance / (STAND_OFF * finest)).clamp(min=1)).clamp(max=LEVELS - 1)
+    levels = []
+    for k in range(LEVELS):
+        nearness = (1 - (height - k).abs()).clamp(min=0)
+        part = nearness * nearness * (3 - 2 * nearness)  # of two neighbouring levels, these sum to 1
+        chosen = torch.nonzero(part > 0).squeeze(-1)
+        if not len(chosen):
+            continue
+        _, patch = torch.unique(torch.floor((sampled - low) / (finest * 2**k)).long(), dim=0, return_inverse=True)
+        total = size.new_zeros(int(patch.max()) + 1).index_add_(0, patch, size)
+        share = size / total[patch]
+        middle = size.new_zeros(len(total), 3).index_add_(0, patch, sampled * share[:, None])
+        levels.append(PatchLevel(patch, share, chosen, part[chosen, None], build_weights(middle, points[chosen], PATCHES)))
+    return tuple(levels)
+
+
+def _samples(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Face (sample,), barycentrics (sample, 3) and area (sample,): middles of the n * n small triangles that each face is cut into."""
     corners = vertices[faces]
     longest = torch.stack([(corners[:, k] - corners[:, k - 1]).norm(dim=-1) for k in range(3)], -1).amax(-1)
-    spacing = SAMPLE_SPACING * float((vertices.amax(0) - vertices.amin(0)).norm())
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1) / 2
+    spacing = FINEST_PATCH / 2 * float((vertices.amax(0) - vertices.amin(0)).norm())
     cuts = torch.ceil(longest / spacing).clamp(min=1).long()
     while int((cuts**2).sum()) > MOST_SAMPLES and int(cuts.max()) > 1:
         cuts = torch.ceil(cuts / 2).long()
@@ -209,4 +249,5 @@ def _samples(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
         of_size = torch.nonzero(cuts == n).squeeze(-1)
         chosen.append(of_size.repeat_interleave(len(pattern)))
         barycentric.append(torch.cat([pattern, 1 - pattern.sum(-1, keepdim=True)], -1).repeat(len(of_size), 1))
-    return torch.cat(chosen), torch.cat(barycentric)
+    face = torch.cat(chosen)
+    return face, torch.cat(barycentric), area[face] / cuts[face] ** 2

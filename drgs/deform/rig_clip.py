@@ -1,7 +1,8 @@
 """An animation in a glTF file as a clip of an object: read, laid over the object at rest, bound, and evaluated at any time.
 
-In: a file, the name of an animation, where the object's parts are at rest, and a `RigBinding`. Out: `ClipFrame`s. glTF's y up and metres
-become z up and world units first, so that a rig made around an exported object lies where that object is.
+In: a file, the name of an animation, an asset and a `RigBinding`. Out: `ClipFrame`s. glTF's y up and metres become z up and world units
+first, so that a rig made around an exported object lies where that object is. The rig moves the object's mesh; how far the surface really
+turns and stretches, which normals and surfels must follow, is read from the moved mesh (drive_mesh.py).
 """
 
 import math
@@ -9,15 +10,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from drgs.deform.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.carry_gaussians import carry_normals
 from drgs.deform.clip import ClipFrame
-from drgs.deform.proxy import ProxyBinding, bind_to_proxy, carry_points, distances_to_proxy
+from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
+from drgs.deform.proxy import ProxyBinding, bind_to_proxy, carry_points, closest_faces
 from drgs.deform.skeleton import RigPose, pose_rig, rig_gradients
 from drgs.exchange.gltf_rig import Rig, RigAnimation, read_gltf_rig
 from drgs.maths.frames import rotation_from_quat_wxyz
+from drgs.scene.asset import Asset
+from drgs.scene.binding import Binding
 from drgs.scene.edits import RigBinding
 
 FARTHEST = 0.5
@@ -46,8 +49,12 @@ class BoundRig:
     rest_pose: RigPose
     """In the file's axes: the rig as it stands when the object is at rest."""
     binding: ProxyBinding
-    """Of the object's vertices, then its surfels."""
+    """Of the object's vertices to the rig's mesh."""
     rest: ClipFrame
+    faces: Tensor
+    """(face, 3) of the object's mesh."""
+    surfels: Binding | None
+    """Of the object's surfels to its mesh."""
     loop: bool
 
     def at(self, seconds: float) -> ClipFrame:
@@ -58,20 +65,24 @@ class BoundRig:
         if torch.equal(pose.vertices, self.rest_pose.vertices):
             return self.rest
         moved = self.alignment.place(pose)
-        positions, gradient = carry_points(self.binding, moved.vertices, rig_gradients(self.alignment.place(self.rest_pose), moved))
-        rest, count = self.rest, len(self.rest.vertices)
-        normals = carry_normals(rest.normals, gradient[:count])
-        if rest.centers is None or rest.tangents is None:
-            return ClipFrame(positions, normals, None, None)
-        tangents = carry_tangents(rest.tangents, gradient[count:])
-        return ClipFrame(positions[:count].contiguous(), normals, positions[count:].contiguous(), tangents)
+        rest = self.rest
+        # float64 up to the gradients: edges are short, and their ends' rounding would turn normals.
+        vertices = carry_points(self.binding, moved.vertices, rig_gradients(self.alignment.place(self.rest_pose), moved))
+        gradient = vertex_gradients(rest.vertices.double(), vertices, self.faces).to(rest.vertices.dtype)
+        vertices = vertices.to(rest.vertices.dtype)
+        normals = carry_normals(rest.normals, gradient)
+        if rest.centers is None or rest.tangents is None or self.surfels is None:
+            return ClipFrame(vertices, normals, None, None)
+        surfels = drive_surfels(rest.vertices, vertices, self.faces, gradient, self.surfels, rest.centers, rest.tangents)
+        return ClipFrame(vertices, normals, *surfels)
 
 
-def bind_rig(path: Path, animation: str, rest: ClipFrame, meters_per_unit: float, binding: RigBinding | None = None) -> BoundRig:
-    """Bind an object at rest to an animation of a file.
+def bind_rig(path: Path, animation: str, asset: Asset, rest: ClipFrame, binding: RigBinding | None = None) -> BoundRig:
+    """Bind an object to an animation of a file.
 
     Args:
         animation: its name, or its number if none has that name; "" for the file's only one.
+        rest: the asset's own tensors.
 
     Raises:
         ValueError: one sentence that names the file: unreadable, no such animation, or a rig that does not lie on the object.
@@ -81,15 +92,10 @@ def bind_rig(path: Path, animation: str, rest: ClipFrame, meters_per_unit: float
     try:
         clip = find_animation(rig, animation)
         rest_pose = pose_rig(rig) if options.rest is None else pose_rig(rig, clip, options.rest)
-        alignment = align_rig(rest_pose.vertices, rest.vertices, meters_per_unit, options)
+        alignment = align_rig(rest_pose.vertices, rest.vertices, asset.meters_per_unit, options)
         placed = alignment.place(rest_pose)
-        points, normals = rest.vertices, rest.normals
-        if rest.centers is not None:
-            # A surfel's own normal may point either way; its neighbour's on the mesh points out.
-            near = cKDTree(rest.vertices.cpu().numpy()).query(rest.centers.detach().cpu().numpy(), workers=-1)[1]
-            points, normals = torch.cat([points, rest.centers]), torch.cat([normals, normals[torch.from_numpy(near).to(normals.device)]])
-        bound = bind_to_proxy(placed.vertices, placed.faces, points, normals, options.method)
-        distance = float(distances_to_proxy(bound)[: len(rest.vertices)].median())
+        bound = bind_to_proxy(placed.vertices, placed.faces, rest.vertices, rest.normals, options.method)
+        distance = float(bound.offset.norm(dim=-1).median())
         size = float((rest.vertices.amax(0) - rest.vertices.amin(0)).norm())
         if distance > FARTHEST * size:
             raise ValueError(
@@ -98,7 +104,13 @@ def bind_rig(path: Path, animation: str, rest: ClipFrame, meters_per_unit: float
             )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return BoundRig(rig, clip, alignment, rest_pose, bound, rest, options.loop)
+    surfels = asset.binding
+    if surfels is None and rest.centers is not None:
+        # A surfel's normal may point either way: none is given, and the closest face is taken.
+        mesh, centers = asset.mesh, rest.centers
+        face, barycentric = closest_faces(mesh.vertices.double(), mesh.faces.long(), centers, torch.zeros_like(centers))
+        surfels = Binding(face.int(), barycentric.float(), torch.zeros(len(centers), device=centers.device))
+    return BoundRig(rig, clip, alignment, rest_pose, bound, rest, asset.mesh.faces, surfels, options.loop)
 
 
 def find_animation(rig: Rig, name: str) -> RigAnimation:
