@@ -9,6 +9,7 @@ from html import escape
 import psutil
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, PlainTextResponse
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -119,14 +120,21 @@ class _BodyLimit:
 async def _requeue_dead_workers_jobs(queue: JobQueue) -> None:
     while True:
         await asyncio.sleep(LIVENESS_SECONDS)
-        moved = await asyncio.to_thread(queue.requeue_dead)
+        try:
+            moved = await asyncio.to_thread(queue.requeue_dead)
+        except SQLAlchemyError as error:  # looked for again in a moment
+            logging.getLogger(__name__).warning("the database does not answer: %s", error)
+            continue
         if moved:
             logging.getLogger(__name__).warning("handed over %d jobs of dead workers", len(moved))
 
 
 async def _remove_deleted_assets(context: ServerContext) -> None:
     while True:
-        await asyncio.to_thread(routes_assets.remove_deleted_assets, context)
+        try:
+            await asyncio.to_thread(routes_assets.remove_deleted_assets, context)
+        except SQLAlchemyError as error:
+            logging.getLogger(__name__).warning("deleted assets were not removed: %s", error)
         await asyncio.sleep(REMOVAL_SECONDS)
 
 

@@ -6,6 +6,7 @@ from http import HTTPStatus
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from server.rest_records import Problem
@@ -48,6 +49,12 @@ def add_problem_handlers(app: FastAPI) -> None:
         elif error.status_code == 405:
             detail = f"{request.method} is not possible at {request.url.path}; the calls are listed at /api/docs."
         return problem_response(error.status_code, detail, dict(error.headers or {}))
+
+    @app.exception_handler(OperationalError)
+    async def _database(request: Request, error: OperationalError) -> JSONResponse:
+        logging.getLogger(__name__).error("%s %s failed", request.method, request.url.path, exc_info=error)
+        sentence = "The database does not answer, or its disk is full; nothing was changed. Try again in a moment."
+        return problem_response(503, sentence, {"retry-after": "2"})
 
     @app.exception_handler(Exception)
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:

@@ -3,18 +3,26 @@
 Times are UTC seconds since the epoch: one meaning in SQLite and Postgres, and comparisons need no time zones.
 """
 
+import logging
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from alembic import command
 from alembic.config import Config
 from sqlalchemy import JSON, BigInteger, Engine, ForeignKey, UniqueConstraint, create_engine, event, text
 from sqlalchemy.engine.interfaces import DBAPIConnection
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from worker.data_directory import DataDirectory, lock_file
 
+OUTAGE_SECONDS = 60.0
+"""How long a worker waits for a database that does not answer."""
+OUTAGE_POLL_SECONDS = 0.5
+Result = TypeVar("Result")
 MIGRATION_LOCK = 0x64726773
 """Any number, the same in all processes."""
 
@@ -148,6 +156,23 @@ def open_database(directory: DataDirectory) -> Engine:
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
     return engine
+
+
+def through_outage(work: Callable[[], Result], patience_seconds: float = OUTAGE_SECONDS) -> Result:
+    """Do it again while the database does not answer, since it may be on its way up; for work that may be done twice.
+
+    Raises:
+        OperationalError: it did not answer in all that time.
+    """
+    give_up_at = time.monotonic() + patience_seconds
+    while True:
+        try:
+            return work()
+        except OperationalError:
+            if time.monotonic() > give_up_at:
+                raise
+            logging.getLogger(__name__).warning("the database does not answer; trying again")
+            time.sleep(OUTAGE_POLL_SECONDS)
 
 
 def _prepare_sqlite(connection: DBAPIConnection, _: ConnectionPoolEntry) -> None:

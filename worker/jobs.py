@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 
 from worker.builders import Builder, BuildProgress, BuildStopped
 from worker.data_directory import DataDirectory, try_lock_file
-from worker.database import JobRow, now
+from worker.database import JobRow, now, through_outage
 from worker.job_build import BuildRun, RedecoupleRun
 from worker.job_export import ExportRun
 from worker.job_render import RenderRun
@@ -106,8 +106,11 @@ def _finish(job_id: str) -> None:
 
 
 def _read_job(job_id: str) -> JobRow:
-    with Session(_worker().engine) as session:
-        row = session.get(JobRow, job_id)
+    def read() -> JobRow | None:
+        with Session(_worker().engine) as session:
+            return session.get(JobRow, job_id)
+
+    row = through_outage(read)
     if row is None:
         raise ValueError("This job was deleted before it began.")
     return row
@@ -165,15 +168,18 @@ def _stop_flag(job_id: str, limits: JobLimits) -> Callable[[], bool]:
     started, checked_at, stop = time.monotonic(), 0.0, False
     process = psutil.Process()
 
+    def is_cancelled() -> bool:
+        with Session(_worker().engine) as session:
+            row = session.get(JobRow, job_id)
+            return row is None or row.cancel_requested
+
     def should_stop() -> bool:
         nonlocal checked_at, stop
         if _worker().stopping.is_set():
             return True
         if not stop and time.monotonic() - checked_at > STOP_POLL_SECONDS:
             checked_at = time.monotonic()
-            with Session(_worker().engine) as session:
-                row = session.get(JobRow, job_id)
-                stop = row is None or row.cancel_requested
+            stop = through_outage(is_cancelled)
             if limits.seconds is not None and checked_at - started > limits.seconds:
                 raise ValueError(f"The job took longer than its limit of {limits.seconds:g} s.")
             if limits.memory_bytes is not None and process.memory_info().rss > limits.memory_bytes:
@@ -228,5 +234,8 @@ def _progress_writer(job_id: str) -> Callable[[BuildProgress], None]:
 
 
 def _update_job(job_id: str, **values: object) -> None:
-    with Session(_worker().engine) as session, session.begin():
-        session.execute(update(JobRow).where(JobRow.id == job_id).values(**values))
+    def write() -> None:
+        with Session(_worker().engine) as session, session.begin():
+            session.execute(update(JobRow).where(JobRow.id == job_id).values(**values))
+
+    through_outage(write)

