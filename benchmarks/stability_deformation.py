@@ -1,0 +1,110 @@
+"""Deformation and simulation at their extremes: what becomes of each, and where the limit is. Writes docs/stability_deformation.md.
+
+    python -m benchmarks stability_deformation [--json] [--page FILE] [--largest 100000]
+
+--largest is the greatest number of particles that falls (1000000 takes about 6 GB and some minutes). About a minute on two cores without it.
+"""
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks import _matter_sweeps as sweeps
+from benchmarks._matter_sweeps import Row
+
+PAGE = Path(__file__).parent.parent / "docs" / "stability_deformation.md"
+NOTES = {
+    "surfels": "Surfels under F: even, along one axis, sheared with stretches of 30 and 0.1, and nearly flat, each turned at random. What a length of 1 becomes.",
+    "meshes": "A ball whose vertices a file moves: F from its faces, and surfels of length 1 on its vertices.",
+    "handles": "A bar of length 4 held at both ends. `missed`: mean distance of held vertices from their targets, as surfels see it.",
+    "neighbourhoods": "Points carried by particles; errors in spacings of the particles, for a rigid and an affine motion.",
+    "strained matter": "A cube let go with this elastic F in every particle, falling at 1 m/s.",
+    "stiffness": "The cube hits the floor at 3 m/s; stiff ones for a shorter time.",
+    "incompressibility": "The same at E = 1e5 Pa.",
+    "speed": "The same at 10 m/s, every law.",
+    "time steps": "C of dt = C dx / (wave speed + speed). The settings refuse more than 0.9; what lies past that was done behind their back.",
+    "numbers": "How many particles.",
+    "room": "Particles that would leave the room.",
+}
+LIMITS = """
+## Limits
+- **Surfels** feel singular values of F between 1/100 and 100, with det F > 0: flat, folded and inverted gradients are moved to the nearest
+  such matrix. What a simulation hands to surfels is limited to stretches of 1/10 to 10.
+- **Neighbourhoods** of any rank carry affine motions; a point far from all particles is carried too, and a simulation lets it go rigidly with
+  the nearest beyond three cells. Far off the origin float32 positions cost the digits, not the weights.
+- **Handles** go up to 1000 sizes of the object away; further is refused. Where targets contradict a shape (a half turn, one end through the
+  other) the pose is finite, and the same each time.
+- **Poisson's ratio** up to 0.49, **C** up to 0.9; more is refused. Up to twice the stable time step nothing becomes NaN, but matter that is
+  stepped so is not right: look at its energy.
+- **Strained matter**: what starts so far from rest that four halvings of the time step do not help is frozen where it is, and reported.
+  A stretch of 10 in all directions does that to fixed corotated matter, a compression to a twentieth to fluids.
+- **Speed**: matter some thousand times faster than its own waves is frozen; a hundred m/s into a wall is not.
+- **Substeps**: 2000 a call by default; more are refused with a sentence that names wave speed and cell size.
+- **Particles** cannot leave the room; one that starts outside is refused.
+"""
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks stability_deformation", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", action="store_true", help="print the rows instead of writing the page")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--largest", type=int, default=100_000)
+    given = parser.parse_args(arguments)
+    if given.largest < 1:
+        raise ValueError(f"--largest is {given.largest}; expected at least 1")
+    found = measure(given.largest)
+    if given.json:
+        print(json.dumps({name: [asdict(row) for row in rows] for name, rows in found.items()}))
+        return
+    given.page.write_text(page(found))
+    print(f"Wrote {given.page}")
+
+
+def measure(largest: int) -> dict[str, list[Row]]:
+    """All sweeps, by section."""
+    counts = [count for count in (1, 8, 100, 1000, 10_000, 100_000, 1_000_000) if count < largest]
+    return {
+        "surfels": sweeps.surfel_rows(200),
+        "meshes": sweeps.mesh_rows(),
+        "handles": sweeps.handle_rows(),
+        "neighbourhoods": sweeps.neighbourhood_rows(),
+        "strained matter": sweeps.strained_rows(512, 0.02),
+        "stiffness": sweeps.stiffness_rows(512, 0.1),
+        "incompressibility": sweeps.poisson_rows(512, 0.1),
+        "speed": sweeps.speed_rows(512, 0.1),
+        "time steps": sweeps.time_step_rows(4096, 0.3),
+        "numbers": sweeps.count_rows([*counts, largest], 0.05),
+        "room": sweeps.room_rows(512, 0.1),
+    }
+
+
+def page(found: dict[str, list[Row]]) -> str:
+    """The whole document."""
+    lines = [
+        "# Stability of deformation and simulation",
+        "",
+        "Written by `python -m benchmarks stability_deformation`. `not finite` counts NaN and infinite values in all that came out, and must be 0;",
+        "`energy left` is kinetic, elastic and gravity's energy against that at the start; tests/stress asks the same of smaller sweeps.",
+    ]
+    for name, rows in found.items():
+        columns = list(dict.fromkeys(key for row in rows for key in row.values if key != "wall_seconds"))
+        lines += [
+            "",
+            f"## {name.capitalize()}",
+            NOTES[name],
+            "",
+            "| case | " + " | ".join(key.replace("_", " ") for key in columns) + " | not finite |",
+        ]
+        lines.append("|---" * (len(columns) + 2) + "|")
+        for row in rows:
+            if row.refused is not None:
+                continue
+            values = [f"{row.values[key]:.4g}" if key in row.values else "–" for key in columns]
+            lines.append(f"| {row.case} | " + " | ".join(values) + f" | {row.not_finite} |")
+        lines += ["", *(f"- {row.case}: refused: {row.refused}" for row in rows if row.refused is not None)]
+        while not lines[-1]:
+            lines.pop()
+    return "\n".join(lines) + "\n" + LIMITS
