@@ -78,7 +78,7 @@ class ExportFormat(StrEnum):
 AssetPath = Annotated[Path, typer.Argument(metavar="ASSET", help="Asset folder, or the same zipped.")]
 DatasetPath = Annotated[Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP or NeRO folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
-DataFolder = Annotated[Path, typer.Option("--data", help="Folder of assets, jobs and the token.")]
+DataFolder = Annotated[Path | None, typer.Option("--data", help="Folder of assets, jobs and the token.", show_default="data")]
 
 
 @app.callback()
@@ -262,27 +262,30 @@ def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
 
 @app.command()
 def serve(
-    data: DataFolder = Path("data"),
-    host: Annotated[str, typer.Option(help="An address of this machine alone.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 picks a free one.")] = 8000,
+    data: DataFolder = None,
+    host: Annotated[str | None, typer.Option(help="An address of this machine alone.", show_default="127.0.0.1")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 picks a free one.", show_default="8000")] = None,
     captures: Annotated[list[Path] | None, typer.Option(help="Folder below which builds may find captures; may be given again.")] = None,
-    worker: Annotated[bool, typer.Option("--worker/--no-worker", help="Also run a worker for the builds.")] = True,
+    worker: Annotated[
+        bool | None, typer.Option("--worker/--no-worker", help="Also run a worker for the jobs.", show_default="worker")
+    ] = None,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the viewer in a browser.")] = False,
-    device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
+    device: Annotated[DeviceName | None, typer.Option(show_default="auto")] = None,
 ) -> None:
-    """Start the server and a worker for its builds; prints the address to open."""
+    """Start the server and a worker for its jobs; prints the address to open. More settings: docs/operations.md."""
     from server.run import serve as run_server
 
     roots = tuple(path.resolve() for path in captures or ())
-    raise typer.Exit(run_server(data, host, port, with_worker=worker, open_browser=open_browser, capture_roots=roots, device=device.value))
+    on = device.value if device else None
+    raise typer.Exit(run_server(data, host, port, with_worker=worker, open_browser=open_browser, capture_roots=roots, device=on))
 
 
 @app.command()
-def worker(data: DataFolder = Path("data"), device: Annotated[DeviceName, typer.Option()] = DeviceName.auto) -> None:
-    """Run queued builds without serving pages, for example on another machine."""
+def worker(data: DataFolder = None, device: Annotated[DeviceName | None, typer.Option(show_default="auto")] = None) -> None:
+    """Run queued jobs without serving pages, for example on another machine."""
     from worker.run import run_worker
 
-    raise typer.Exit(run_worker(data, device.value))
+    raise typer.Exit(run_worker(data, device.value if device else None))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
