@@ -1,10 +1,10 @@
 """Time and error of what moves surfels: particles' motion interpolated, tangents pushed forward.
 
-    python -m benchmarks carry [--surfels 100000] [--particles 20000] [--repeats 9] [--json] [--errors]
+    python -m benchmarks carry [--surfels 100000] [--particles 20000] [--repeats 9] [--json] [--errors | --sweep]
 
 `ms` is one frame with the weights built: positions and F of every surfel, then B' = F B. --errors prints tables instead: the
 interpolation (ours, the paper's) on a bend, at a growing distance from the origin; the surfel rule (exact, the paper's Eq. 7) under
-known gradients.
+known gradients. --sweep prints the interpolation's error against its time: every variant with 8 to 32 neighbours, at half and full spacing.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
-from drgs.deform.gmls import GmlsSettings, build_weights, interpolate
+from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate
 from drgs.deform.maps import evaluate_map
 from drgs.scene.edits import BendMap
 from drgs.warp_torch import device_from_name, thread_count
@@ -35,10 +35,14 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--device", default="cpu", choices=["auto", "cpu", "cuda"])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--errors", action="store_true")
+    parser.add_argument("--sweep", action="store_true")
     given = parser.parse_args(arguments)
     if min(given.surfels, given.particles, given.repeats) < 1:
         raise ValueError("--surfels, --particles and --repeats are at least 1")
-    result = errors() if given.errors else measure(given.surfels, given.particles, given.repeats, given.device)
+    if given.sweep:
+        result = sweep(given.surfels, given.particles, given.repeats)
+    else:
+        result = errors() if given.errors else measure(given.surfels, given.particles, given.repeats, given.device)
     print(json.dumps(result, indent=None if given.json else 1))
 
 
@@ -106,6 +110,52 @@ def interpolation_errors() -> list[dict]:
             row[variant] = float((found - shift - truth).norm(dim=-1).max() * 16)
         rows.append(row)
     return rows
+
+
+def sweep(surfels: int, particles: int, repeats: int) -> dict:
+    """Error against time on a bend: position errors in spacings of the fewer particles, F errors as they are, medians of the times.
+
+    The paper's are Algorithm 3 with linear and quadratic bases at the point, not at the origin as printed; ours see SWEPT.
+    """
+    rows, spacing = [], particles ** (-1 / 3)
+    for count in (particles, 8 * particles):
+        rest, points = cloud(count, surfels)
+        moved, gradients = evaluate_map(BEND, rest)
+        truth, truth_gradient = evaluate_map(BEND, points)
+        for variant, order in (("paper_centred", 1), ("paper_centred", 2), ("taylor", 1), ("taylor", 2)):
+            for neighbours in (8, 12, 16, 24, 32):
+                clock = time.perf_counter()
+                told = torch.eye(3).expand_as(gradients).contiguous() if (variant, order) == ("taylor", 1) else gradients
+                weights = build_weights(rest, points, GmlsSettings(neighbours=neighbours, variant=variant, order=order))
+                built, times = time.perf_counter() - clock, []
+                for _ in range(repeats + 1):
+                    clock = time.perf_counter()
+                    found, _ = interpolate(weights, moved, told)
+                    times.append(1e3 * (time.perf_counter() - clock))
+                gradient = interpolate(weights, moved, gradients)[1]
+                distance = (found - truth).norm(dim=-1)
+                rows.append(
+                    {
+                        "particles": len(rest),
+                        "variant": SWEPT[variant, order],
+                        "neighbours": neighbours,
+                        "position_rms": float(distance.square().mean().sqrt() / spacing),
+                        "position_max": float(distance.max() / spacing),
+                        "gradient_rms": float((gradient - truth_gradient).square().sum((1, 2)).mean().sqrt()),
+                        "build_seconds": round(built, 3),
+                        "ms": round(statistics.median(times[1:]), 3),
+                    }
+                )
+    return {"surfels": surfels, "threads": thread_count(), "sweep": rows}
+
+
+SWEPT = {
+    ("paper_centred", 1): "paper, p = 1",
+    ("paper_centred", 2): "paper, p = 2",
+    ("taylor", 1): "ours, p = 1",
+    ("taylor", 2): "ours, p = 2",
+}
+"""ours: weights that reproduce affine maps; p = 1 with the positions alone, p = 2 as in use, where F of the particles corrects them."""
 
 
 def surfel_errors() -> list[dict]:
