@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 320, 62, 12, 28, 42
+WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 600, 320, 62, 170, 28, 42
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
 DASHES = ("", "6 3", "2 3")
 """Taken in turn with the colours, so that curves differ without them."""
@@ -38,7 +38,7 @@ def log_log_svg(curves: list[Curve], title: str, x_name: str, y_name: str) -> st
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" font-family="sans-serif" font-size="11" fill="#222">',
         f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#fff"/>',
-        f'<text x="{WIDTH / 2}" y="17" text-anchor="middle" font-size="13">{escape(title)}</text>',
+        f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="17" text-anchor="middle" font-size="13">{escape(title)}</text>',
         f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 8}" text-anchor="middle">{escape(x_name)}</text>',
         f'<text transform="translate(14 {HEIGHT / 2}) rotate(-90)" text-anchor="middle">{escape(y_name)}</text>',
     ]
@@ -56,9 +56,9 @@ def log_log_svg(curves: list[Curve], title: str, x_name: str, y_name: str) -> st
         line = " ".join(f"{x:.1f},{y:.1f}" for x, y in at)
         parts.append(f'<polyline points="{line}" fill="none" stroke="{color}" stroke-width="1.8" stroke-dasharray="{dash}"/>')
         parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{color}"/>' for x, y in at]
-        y = TOP + 14 + 14 * k
-        parts.append(f'<path d="M{WIDTH - 176} {y - 4}h22" stroke="{color}" stroke-width="1.8" stroke-dasharray="{dash}"/>')
-        parts.append(f'<text x="{WIDTH - 148}" y="{y}">{escape(curve.name)}</text>')
+        x, y = WIDTH - RIGHT + 10, TOP + 12 + 16 * k
+        parts.append(f'<path d="M{x} {y - 4}h22" stroke="{color}" stroke-width="1.8" stroke-dasharray="{dash}"/>')
+        parts.append(f'<text x="{x + 28}" y="{y}">{escape(curve.name)}</text>')
     return "\n".join([*parts, "</svg>"]) + "\n"
 
 

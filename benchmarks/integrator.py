@@ -9,7 +9,7 @@ seconds is wall time from a built tracer on, cpu_seconds the sum over threads (s
 Variants, each with what the one before it has: `paper`, the published split of 16 cosine, 8 GGX and 8 environment samples with independent
 numbers; `sobol`, low-discrepancy numbers; `plan`, what the scene does not need left out; `svgf`, its sums denoised. `oidn` denoises those of
 `plan` by Open Image Denoise. Independent numbers are passes of 2, 1 and 1 samples with a seed each; their time is that of `sobol`, since the rays are
-as many. --plots draws error against time, with the curve of Mitsuba that lies with the reference (seconds of another machine).
+as many. --plots draws error against processor time, with the curve of Mitsuba that lies with the reference (another machine's clock).
 With --mitsuba the same images are rendered by Mitsuba's path tracer in the same run (_mitsuba.py), and `time_to_error` gives for both the time
 to relmse 0.01 and 0.003, read off the measured points (log-log between them, error ~ 1 / time beyond).
 """
@@ -112,6 +112,15 @@ def time_to_error(rows: list[dict], target: float, clock: str) -> float:
 
 
 VARIANTS = ("paper", "sobol", "plan", "svgf", "oidn")
+LABELS = {
+    "drgs_paper": "ours, paper's sampling",
+    "drgs_sobol": "+ low discrepancy",
+    "drgs": "+ plan",
+    "drgs_svgf": "+ plan, SVGF",
+    "drgs_oidn": "+ plan, OIDN",
+    "mitsuba": "Mitsuba, same run",
+}
+"""In plots."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,13 +203,13 @@ def stored_curve(folder: Path, env: str, light: str) -> list[Curve]:
     path = folder / "mitsuba_error_vs_time.json"
     rows = json.loads(path.read_text()) if path.is_file() else []
     points = [(row["seconds"], row["relmse"]) for row in rows if (row["env"], row["light"]) == (env, light)]
-    return [Curve("Mitsuba, stored", points)] if points else []
+    return [Curve("Mitsuba, stored curve", points)] if points else []
 
 
 def plot(of_image: dict[str, list[dict]], stored: list[Curve], title: str) -> str:
-    """Error against wall time of one picture (SVG)."""
-    curves = [Curve(name, [(row["seconds"], row["relmse"]) for row in rows]) for name, rows in of_image.items()]
-    return log_log_svg(curves + stored, title, "seconds", "relmse")
+    """Error against processor time of one picture (SVG)."""
+    curves = [Curve(LABELS.get(name, name), [(row["cpu_seconds"], row["relmse"]) for row in rows]) for name, rows in of_image.items()]
+    return log_log_svg(curves + stored, title, "processor seconds", "relmse")
 
 
 def main(argv: list[str] | None = None) -> None:
