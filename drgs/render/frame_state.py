@@ -27,7 +27,7 @@ class RenderSettings:
     samples_per_pixel: int = 32
     """Light samples behind a finished frame."""
     samples_per_pass: int | None = None
-    """Light samples a pass adds; None: 32 on Gaussians, 8 on a mesh, whose passes are its antialiasing as well."""
+    """Light samples a pass adds; None: 32 on Gaussians, 4 on a mesh, whose passes are its antialiasing as well."""
     counts: SampleCounts | None = None
     """Samples of each strategy a pass; None: 2:1:1. Overrides samples_per_pass."""
     bounces: int = 1
@@ -112,7 +112,7 @@ def samples_a_pass(settings: RenderSettings, mesh: bool) -> SampleCounts:
     Args:
         mesh: whether the camera sees the mesh.
     """
-    return settings.counts or sample_counts(settings.samples_per_pass or (8 if mesh else 32))
+    return settings.counts or sample_counts(settings.samples_per_pass or (4 if mesh else 32))
 
 
 def passes_needed(state: FrameState) -> int:

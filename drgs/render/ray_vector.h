@@ -84,15 +84,10 @@ const auto split_at = [&](const auto& samples, const auto& points, int point, in
     const float diffuse = (1.0f - metal) * largest, mirror_like = 0.04f * (1.0f - metal) + metal * largest;
     const float sum = diffuse + mirror_like, share = diffuse / (sum > 1e-6f ? sum : 1e-6f);
     split[0] = min_int((int)((float)samples.cosine * share + 0.5f), count - 1);
-    const int rest = count - split[0];
-    split[1] = rest;
-    if (samples.environment != 0) {
-        const float even = (float)samples.ggx / (float)(samples.ggx + samples.environment);
-        const float clamped = 1.0f - 4.0f * points.roughness.data[point];
-        const float mirror = (1.0f - share) * (clamped > 0.0f ? (clamped < 1.0f ? clamped : 1.0f) : 0.0f);
-        split[1] = min_int(max_int((int)((float)rest * (even + (1.0f - even) * mirror) + 0.5f), 1), rest);
-    }
-    split[2] = rest - split[1];
+    const float clamped = 1.0f - 4.0f * points.roughness.data[point];
+    const float mirror = (1.0f - share) * (clamped > 0.0f ? (clamped < 1.0f ? clamped : 1.0f) : 0.0f);
+    split[2] = (int)((float)samples.environment * (1.0f - mirror) + 0.5f);
+    split[1] = count - split[0] - split[2];
 };
 // strategy_of of sample_rays.py: a sample's strategy, and its number in the sequence of that strategy
 const auto strategy_of = [](const int* split, int round, int slot, unsigned& strategy, unsigned& index) {
@@ -152,50 +147,61 @@ const auto lobe_at = [&](const Lobes& l, V3 d, v16 n_dot_l, v16& pdf, v16& dv, v
     const v16 c2 = c * c;
     c5 = c2 * c2 * c;
 };
-// Directions drawn from the environment's table, for lanes that ask for one.
-const auto draw_environment = [&](const auto& light, i16 asked, v16 u0, v16 u1) -> V3 {
+// Directions drawn from the environment's table. All lanes search side by side, without branches: their
+// loads overlap.
+const auto draw_environment = [&](const auto& light, v16 u0, v16 u1) -> V3 {
     const int height = light.height, width = light.width;
     const float* const rows = light.row_sums.data;
-    const float total = rows[height + 1];
-    alignas(64) float azimuth_lane[16], polar_lane[16], first_number[16], second_number[16];
-    alignas(64) int asked_lane[16];
-    store16(first_number, u0);
+    alignas(64) float azimuth_lane[16], polar_lane[16], target[16], second_number[16], between[16];
+    alignas(64) int row[16] = {0}, column[16] = {0};
+    store16(target, u0 * rows[height + 1]);
     store16(second_number, u1);
-    *(i16*)asked_lane = asked;
-    for (int lane = 0; lane < 16; ++lane) {
-        azimuth_lane[lane] = polar_lane[lane] = 0.0f;
-        if (asked_lane[lane] == 0) continue;
-        const auto linear_place = [](float u, float a, float b) -> float {
-            u = u < 0.0f ? 0.0f : (u > 1.0f ? 1.0f : u);
-            const float square = a * a + u * (b * b - a * a), root = a + __builtin_sqrtf(square > 0.0f ? square : 0.0f);
-            return u * (a + b) / (root > 1e-37f ? root : 1e-37f);
-        };
-        float target = first_number[lane] * total;
-        int low = 0, high = height + 1;
-        while (high - low > 1) {
-            const int middle = (low + high) >> 1;
-            if (rows[middle] <= target) low = middle; else high = middle;
+    const auto linear_place = [](float u, float a, float b) -> float {
+        u = u < 0.0f ? 0.0f : (u > 1.0f ? 1.0f : u);
+        const float square = a * a + u * (b * b - a * a), root = a + __builtin_sqrtf(square > 0.0f ? square : 0.0f);
+        return u * (a + b) / (root > 1e-37f ? root : 1e-37f);
+    };
+    int step = 1;
+    while (2 * step <= height) step *= 2;
+    for (; step > 0; step >>= 1) {
+        for (int lane = 0; lane < 16; ++lane) {
+            const int probe = row[lane] + step, there = min_int(probe, height);
+            row[lane] += (probe <= height) & (rows[there] <= target[lane]) ? step : 0;
         }
-        const int r = low;
-        float mass = rows[r + 1] - rows[r];
+    }
+    for (int lane = 0; lane < 16; ++lane) {
+        const int r = row[lane];
         const float* const upper = light.column_sums.data + (long)r * (width + 1);
         const float* const lower = upper + (width + 1);
-        const float t = linear_place((target - rows[r]) / (mass > 1e-37f ? mass : 1e-37f), upper[width], lower[width]);
+        const float mass = rows[r + 1] - rows[r];
+        const float t = linear_place((target[lane] - rows[r]) / (mass > 1e-37f ? mass : 1e-37f), upper[width], lower[width]);
         const float y = r == 0 ? 0.5f * t : (r == height ? (float)r - 0.5f + 0.5f * t : (float)r - 0.5f + t);
-        target = second_number[lane] * (upper[width] * (1.0f - t) + lower[width] * t);
-        low = 0;
-        high = width;
-        while (high - low > 1) {
-            const int middle = (low + high) >> 1;
-            if (upper[middle] * (1.0f - t) + lower[middle] * t <= target) low = middle; else high = middle;
-        }
-        const float at = upper[low] * (1.0f - t) + lower[low] * t;
-        mass = upper[low + 1] * (1.0f - t) + lower[low + 1] * t - at;
-        const int next = low + 1 == width ? 0 : low + 1;
-        const float* const top = light.nodes.data + (long)r * width;
-        const float a = top[low] * (1.0f - t) + top[width + low] * t, b = top[next] * (1.0f - t) + top[width + next] * t;
-        azimuth_lane[lane] = 0.5f - ((float)low + 0.5f + linear_place((target - at) / (mass > 1e-37f ? mass : 1e-37f), a, b)) / (float)width;
+        between[lane] = t;
         polar_lane[lane] = 0.5f * y / (float)height;
+        target[lane] = second_number[lane] * (upper[width] * (1.0f - t) + lower[width] * t);
+    }
+    step = 1;
+    while (2 * step < width) step *= 2;
+    for (; step > 0; step >>= 1) {
+        for (int lane = 0; lane < 16; ++lane) {
+            const float* const upper = light.column_sums.data + (long)row[lane] * (width + 1);
+            const float t = between[lane];
+            const int probe = column[lane] + step, there = min_int(probe, width - 1);
+            const float sum = upper[there] * (1.0f - t) + upper[width + 1 + there] * t;
+            column[lane] += (probe < width) & (sum <= target[lane]) ? step : 0;
+        }
+    }
+    for (int lane = 0; lane < 16; ++lane) {
+        const int low = column[lane], next = low + 1 == width ? 0 : low + 1;
+        const float t = between[lane];
+        const float* const upper = light.column_sums.data + (long)row[lane] * (width + 1);
+        const float* const lower = upper + (width + 1);
+        const float at = upper[low] * (1.0f - t) + lower[low] * t;
+        const float mass = upper[low + 1] * (1.0f - t) + lower[low + 1] * t - at;
+        const float* const top = light.nodes.data + (long)row[lane] * width;
+        const float a = top[low] * (1.0f - t) + top[width + low] * t, b = top[next] * (1.0f - t) + top[width + next] * t;
+        azimuth_lane[lane] =
+            0.5f - ((float)low + 0.5f + linear_place((target[lane] - at) / (mass > 1e-37f ? mass : 1e-37f), a, b)) / (float)width;
     }
     v16 sin_azimuth, cos_azimuth, sin_polar, cos_polar;
     sincos_turns(load16(azimuth_lane), sin_azimuth, cos_azimuth);

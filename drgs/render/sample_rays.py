@@ -98,8 +98,8 @@ class SampleSet:
 def split_at(samples: SampleSet, points: PointArrays, point: int) -> wp.vec3i:
     """Cosine, GGX and environment samples of one point; their sum is the same everywhere.
 
-    Cosine samples in proportion to the diffuse share of the reflected energy: bare metal gets none. Of the others, GGX gets more the
-    more mirror-like a metal is: an environment sample hardly ever falls into a narrow lobe. Any split is unbiased.
+    Cosine samples in proportion to the diffuse share of the reflected energy: bare metal gets none, and GGX gets theirs. It also gets the
+    environment's the more mirror-like a metal is: these hardly ever fall into a narrow lobe. Any split is unbiased.
     """
     if samples.by_material == 0:
         return wp.vec3i(samples.cosine, samples.ggx, samples.environment)
@@ -110,13 +110,9 @@ def split_at(samples: SampleSet, points: PointArrays, point: int) -> wp.vec3i:
     specular = 0.04 * (1.0 - metallic) + metallic * base
     share = diffuse / wp.max(diffuse + specular, 1.0e-6)
     cosine = wp.min(int(float(samples.cosine) * share + 0.5), total - 1)
-    rest = total - cosine
-    if samples.environment == 0:
-        return wp.vec3i(cosine, rest, 0)
-    even = float(samples.ggx) / float(samples.ggx + samples.environment)
     mirror = (1.0 - share) * wp.clamp(1.0 - 4.0 * points.roughness[point], 0.0, 1.0)
-    ggx = wp.clamp(int(float(rest) * (even + (1.0 - even) * mirror) + 0.5), 1, rest)
-    return wp.vec3i(cosine, ggx, rest - ggx)
+    environment = int(float(samples.environment) * (1.0 - mirror) + 0.5)
+    return wp.vec3i(cosine, total - cosine - environment, environment)
 
 
 @wp.func

@@ -47,7 +47,7 @@ sobol_pair(*(const u16*)index_lane, hash_combine(hash_combine(u16(samples.seed),
 const i16 is_environment = strategy == 2u;
 V3 d = lobe_direction(lobes, u0, u1, strategy == 0u);
 if (any(is_environment)) {
-    const V3 drawn = draw_environment(light, is_environment, u0, u1);
+    const V3 drawn = draw_environment(light, u0, u1);
     d = {select(is_environment, drawn.x, d.x), select(is_environment, drawn.y, d.y), select(is_environment, drawn.z, d.z)};
 }
 d = unit3(d);

@@ -9,7 +9,7 @@ import torch
 from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, start_frame
 from drgs.render.environment_table import build_environment_table, environment_light
 from drgs.render.horizon import Horizons
-from drgs.render.plan import SceneFacts, plan_frame, scene_facts
+from drgs.render.plan import SceneFacts, light_spread, plan_frame, scene_facts
 from drgs.render.render_frame import render_frame
 from drgs.render.sample_rays import SampleCounts
 from drgs.render.shade import RayStarts, shade
@@ -30,6 +30,36 @@ def test_a_faint_sun_keeps_its_environment_samples() -> None:
     sky = constant_sky().radiance.clone()
     sky[5, 5] = 1.01
     assert plan_frame(Environment(sky), 1.0, SampleCounts(16, 8, 8), 1, skip=True).counts.environment == 8
+
+
+def test_the_spread_of_a_sky_is_the_share_of_the_sphere_that_lights() -> None:
+    assert abs(light_spread(constant_sky()) - 1) < 1e-6
+    half = torch.zeros(64, 128, 3)
+    half[:32] = 2.0
+    assert abs(light_spread(Environment(half)) - 0.5) < 1e-3
+    assert light_spread(sunny_sky(sun=1e5)) < 1e-2
+
+
+def test_under_a_sun_half_of_the_samples_go_to_the_environment() -> None:
+    for total in (SampleCounts(16, 8, 8), SampleCounts(2, 1, 1)):
+        plan = plan_frame(sunny_sky(sun=1e5), 1.0, total, 1, skip=True)
+        assert plan.counts.total == total.total and plan.counts.environment == total.total // 2
+        assert min(plan.counts.cosine, plan.counts.ggx) >= 1
+        assert "part of the cosine and GGX samples" in [skip.what for skip in plan.skips]
+    assert plan_frame(sunny_sky(sun=1e5), 1.0, SampleCounts(16, 8, 8), 1, skip=False).counts == SampleCounts(16, 8, 8)
+
+
+def test_more_samples_of_the_environment_lower_the_error_under_a_sun() -> None:
+    points = points_seen_at([40.0], roughness=0.4, metallic=0.0, copies=400)
+    sky = sunny_sky(sun=1e4)
+    light = environment_light(sky, build_environment_table(sky))
+    starts = RayStarts(points.position_world + 100 * points.normal_world, points.normal_world)
+    tracer = build_tracer(sphere_mesh(1, radius=1e-3))
+    spread = [
+        float(shade(points, starts, light, tracer, counts, 0, 0, by_material=True).diffuse.mean(-1).var())
+        for counts in (plan_frame(sky, 1.0, SampleCounts(16, 8, 8), 0, skip=True).counts, SampleCounts(16, 8, 8))
+    ]
+    assert spread[0] < 0.7 * spread[1]
 
 
 def test_nothing_is_skipped_when_told_not_to() -> None:
