@@ -46,7 +46,14 @@ def fit_tensors(parameters: dict[str, Tensor], optimizer: torch.optim.Adam, gene
 
 
 def restore_fit(tensors: dict[str, Tensor], parameters: dict[str, Tensor], optimizer: torch.optim.Adam, generator: torch.Generator) -> None:
-    """Put fit_tensors back, in place of what a fresh start made (surfel counts may differ)."""
+    """Put fit_tensors back, in place of what a fresh start made (surfel counts may differ).
+
+    Raises:
+        ValueError: the checkpoint lacks what this version of the program fits.
+    """
+    missing = {"generator", *(f"parameter.{group['name']}" for group in optimizer.param_groups)} - tensors.keys()
+    if missing:
+        raise ValueError(f"the checkpoint lacks {', '.join(sorted(missing))}: another version wrote it; build without --resume")
     for group in optimizer.param_groups:
         name = group["name"]
         optimizer.state.pop(group["params"][0], None)

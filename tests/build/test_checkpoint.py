@@ -110,3 +110,12 @@ def test_facts_are_plain_json_in_the_file(tmp_path: Path):
     length = struct.unpack("<Q", (tmp_path / "x").read_bytes()[:8])[0]
     header = json.loads((tmp_path / "x").read_bytes()[8 : 8 + length])
     assert json.loads(header["__metadata__"]["facts"]) == {"seed": 4}
+
+
+def test_a_checkpoint_of_another_version_is_refused_and_leaves_the_fit_as_it_is():
+    tensors, fit = fit_tensors(*small_fit(seed=1)), small_fit(seed=2)
+    before = {name: value.detach().clone() for name, value in fit[0].items()}
+    del tensors["parameter.sh"]
+    with pytest.raises(ValueError, match=r"lacks parameter.sh: another version wrote it; build without --resume"):
+        restore_fit(tensors, *fit)
+    assert all(torch.equal(fit[0][name], value) for name, value in before.items())
