@@ -1,12 +1,13 @@
 """Points that follow a simpler mesh near them: a scanned object moves with the low-polygon model that an animator has rigged.
 
 In: the proxy's triangles at rest and points near them; each frame the proxy's moved vertices and their deformation gradients. Out: where
-the points go. Two ways to bind, both exact for rigid motions and similarities:
+the points go. Two ways to bind, and a blend of them, all exact for rigid motions and similarities:
 
 closest: a point keeps its place relative to its closest triangle, p' = sum w v' + F (p - sum w v), F from the corners; between nearby parts
 (two legs) the one that faces as the point does is chosen. For proxies that hug the object: where they stand off, neighbours may follow
 triangles far apart, and what lies between is torn. mls: moving least squares (gmls.py) over patches of the proxy as wide as the point is
-away from it, so that a loose proxy moves the object smoothly; blind to gaps narrower than its patches.
+away from it, so that a loose proxy moves the object smoothly; blind to gaps narrower than its patches. auto: closest up to a distance of
+the finest patch's width, mls from twice that.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
 
-ProxyMethod = Literal["closest", "mls"]
+ProxyMethod = Literal["auto", "closest", "mls"]
 FINEST_PATCH = 0.02
 """Width of the smallest patches of `mls`, as a share of the proxy's diagonal; the next are twice as wide, and so on."""
 LEVELS = 5
@@ -58,13 +59,18 @@ class ProxyBinding:
     """What of a set of points does not change while their proxy moves."""
 
     faces: Tensor
-    """(k, 3) int64 corners of the triangles of `barycentric`."""
+    """(point, 3) int64 corners of the triangle closest to each point."""
     barycentric: Tensor
-    """(k, 3) float64: feet of the points (closest), or samples (mls)."""
+    """(point, 3) float64 of the closest point in it."""
     offset: Tensor
-    """(point, 3) float64 from the closest point of the proxy to the point, at rest [world units]."""
+    """(point, 3) float64 from there to the point, at rest [world units]."""
+    near: Tensor
+    """(point, 1) float64: how much a point follows its closest triangle; its levels of patches have the rest."""
+    samples: Tensor
+    """(sample, 3) int64 corners of the triangles that hold the samples of the patches."""
+    sample_barycentric: Tensor
+    """(sample, 3) float64"""
     levels: tuple[PatchLevel, ...]
-    """Empty for closest."""
 
 
 @wp.func
@@ -141,45 +147,79 @@ def find_closest_faces(
     facing[i] = wp.dot(normals[i], wp.mesh_eval_face_normal(mesh, best))
 
 
-def bind_to_proxy(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tensor, method: ProxyMethod = "closest") -> ProxyBinding:
+def bind_to_proxy(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tensor, method: ProxyMethod = "auto") -> ProxyBinding:
     """Bind points (point, 3) to a proxy's vertices (vertex, 3) and faces (face, 3) at rest.
 
     Args:
-        normals: (point, 3) of the surface at the points; zero where it has none. Only `closest` looks at them.
+        normals: (point, 3) of the surface at the points; zero where it has none. `mls` does not look at them.
 
     Raises:
         ValueError: the proxy has no faces with area.
     """
-    vertices, device = vertices.double().to(points.device), points.device
-    corners = vertices[faces.long().to(device)]
+    vertices, faces = vertices.double().to(points.device), faces.long().to(points.device)
+    corners = vertices[faces]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)
-    faces = faces.long().to(device)[area > DEGENERATE * area.median().clamp(min=1e-300)] if len(area) else faces.long()
+    faces = faces[area > DEGENERATE * area.median().clamp(min=1e-300)] if len(area) else faces
     if not len(faces):
         raise ValueError("the rig's mesh has no faces with area")
     chosen, barycentric = closest_faces(vertices, faces, points, normals)
     offset = points.detach().double() - (vertices[faces[chosen]] * barycentric[..., None]).sum(1)
-    if method == "closest":
-        return ProxyBinding(faces[chosen], barycentric, offset, ())
-    chosen, barycentric, size = _samples(vertices, faces)
+    feet = (faces[chosen], barycentric, offset)
+    finest = FINEST_PATCH * float((vertices.amax(0) - vertices.amin(0)).norm())
+    # 0 at the distance that the finest patches are made for, rising by 1 with each doubling; -1 and below is next to the proxy.
+    height = torch.log2((offset.norm(dim=-1) / (STAND_OFF * finest)).clamp(min=0.5)).clamp(max=LEVELS - 1)
+    height = {"auto": height, "closest": torch.full_like(height, -1), "mls": height.clamp(min=0)}[method]
+    near = _level_part(height, -1)[:, None]
+    if bool((near == 1).all()):
+        return ProxyBinding(*feet, near, faces[:0], barycentric[:0], ())
+    chosen, barycentric, size = _samples(vertices, faces, finest / 2)
     sampled = (vertices[faces[chosen]] * barycentric[..., None]).sum(1)
-    return ProxyBinding(faces[chosen], barycentric, offset, _levels(vertices, sampled, size, points, offset.norm(dim=-1)))
+    levels = []
+    for k in range(LEVELS):
+        part = _level_part(height, k)
+        followers = torch.nonzero(part > 0).squeeze(-1)
+        if len(followers):
+            patch, share, middle = _patches(sampled, size, vertices.amin(0), finest * 2**k)
+            weights = build_weights(middle, points[followers], PATCHES)
+            levels.append(PatchLevel(patch, share, followers, part[followers, None], weights))
+    return ProxyBinding(*feet, near, faces[chosen], barycentric, tuple(levels))
 
 
 def carry_points(binding: ProxyBinding, moved: Tensor, gradients: Tensor) -> Tensor:
     """Positions (point, 3) float64 from the proxy's vertices, (vertex, 3) and (vertex, 3, 3)."""
     device = binding.faces.device
-    weights = binding.barycentric[..., None]
-    foot = (moved.double().to(device)[binding.faces] * weights).sum(1)
-    gradient = (gradients.double().to(device)[binding.faces] * weights[..., None]).sum(1)
+    moved, gradients = moved.double().to(device), gradients.double().to(device)
+
+    def blend(corners: Tensor, barycentric: Tensor) -> tuple[Tensor, Tensor]:
+        return (moved[corners] * barycentric[..., None]).sum(1), (gradients[corners] * barycentric[..., None, None]).sum(1)
+
+    foot, gradient = blend(binding.faces, binding.barycentric)
+    positions = foot + (gradient @ binding.offset[..., None]).squeeze(-1)
     if not binding.levels:
-        return foot + (gradient @ binding.offset[..., None]).squeeze(-1)
-    positions = torch.zeros_like(binding.offset)
+        return positions
+    positions = positions * binding.near
+    place, turn = blend(binding.samples, binding.sample_barycentric)
     for level in binding.levels:
-        patches, count = level.patch, len(level.weights.particles)
-        middle = foot.new_zeros(count, 3).index_add_(0, patches, foot * level.share[:, None])
-        turned = foot.new_zeros(count, 3, 3).index_add_(0, patches, gradient * level.share[:, None, None])
+        count = len(level.weights.particles)
+        middle = place.new_zeros(count, 3).index_add_(0, level.patch, place * level.share[:, None])
+        turned = turn.new_zeros(count, 3, 3).index_add_(0, level.patch, turn * level.share[:, None, None])
         positions.index_add_(0, level.points, level.part * interpolate(level.weights, middle.float(), turned.float())[0])
     return positions
+
+
+def _level_part(height: Tensor, level: int) -> Tensor:
+    """(point,) how much points at a height belong to a level: 1 at its own, falling smoothly to 0 at the next ones; sums to 1."""
+    nearness = (1 - (height - level).abs()).clamp(min=0)
+    return nearness * nearness * (3 - 2 * nearness)
+
+
+def _patches(sampled: Tensor, size: Tensor, low: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Patch (sample,), share in it (sample,) by size, and middles of the patches (patch, 3): the cells of a grid that hold samples."""
+    # Half a cell lower: walls along the axes would lie on the cells' borders, where rounding decides.
+    _, patch = torch.unique(torch.floor((sampled - low) / width + 0.5).long(), dim=0, return_inverse=True)
+    total = size.new_zeros(int(patch.max()) + 1).index_add_(0, patch, size)
+    share = size / total[patch]
+    return patch, share, size.new_zeros(len(total), 3).index_add_(0, patch, sampled * share[:, None])
 
 
 def closest_faces(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
@@ -212,32 +252,11 @@ def closest_faces(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tens
     return face.long(), inside / inside.sum(-1, keepdim=True)
 
 
-def _levels(vertices: Tensor, sampled: Tensor, size: Tensor, points: Tensor, distance: Tensor) -> tuple[PatchLevel, ...]:
-    """Each point follows the two levels of patches whose widths lie about `distance` / STAND_OFF, blended by where it lies between."""
-    low = vertices.amin(0)
-    finest = FINEST_PATCH * float((vertices.amax(0) - low).norm())
-    height = torch.log2((distance / (STAND_OFF * finest)).clamp(min=1)).clamp(max=LEVELS - 1)
-    levels = []
-    for k in range(LEVELS):
-        nearness = (1 - (height - k).abs()).clamp(min=0)
-        part = nearness * nearness * (3 - 2 * nearness)  # of two neighbouring levels, these sum to 1
-        chosen = torch.nonzero(part > 0).squeeze(-1)
-        if not len(chosen):
-            continue
-        _, patch = torch.unique(torch.floor((sampled - low) / (finest * 2**k)).long(), dim=0, return_inverse=True)
-        total = size.new_zeros(int(patch.max()) + 1).index_add_(0, patch, size)
-        share = size / total[patch]
-        middle = size.new_zeros(len(total), 3).index_add_(0, patch, sampled * share[:, None])
-        levels.append(PatchLevel(patch, share, chosen, part[chosen, None], build_weights(middle, points[chosen], PATCHES)))
-    return tuple(levels)
-
-
-def _samples(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _samples(vertices: Tensor, faces: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
     """Face (sample,), barycentrics (sample, 3) and area (sample,): middles of the n * n small triangles that each face is cut into."""
     corners = vertices[faces]
     longest = torch.stack([(corners[:, k] - corners[:, k - 1]).norm(dim=-1) for k in range(3)], -1).amax(-1)
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1) / 2
-    spacing = FINEST_PATCH / 2 * float((vertices.amax(0) - vertices.amin(0)).norm())
     cuts = torch.ceil(longest / spacing).clamp(min=1).long()
     while int((cuts**2).sum()) > MOST_SAMPLES and int(cuts.max()) > 1:
         cuts = torch.ceil(cuts / 2).long()

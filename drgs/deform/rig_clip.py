@@ -16,6 +16,7 @@ from drgs.deform.carry_gaussians import carry_normals
 from drgs.deform.clip import ClipFrame
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.proxy import ProxyBinding, bind_to_proxy, carry_points, closest_faces
+from drgs.deform.simulate import limit_stretch
 from drgs.deform.skeleton import RigPose, pose_rig, rig_gradients
 from drgs.exchange.gltf_rig import Rig, RigAnimation, read_gltf_rig
 from drgs.maths.frames import rotation_from_quat_wxyz
@@ -25,6 +26,8 @@ from drgs.scene.edits import RigBinding
 
 FARTHEST = 0.5
 """Median distance from the object to the rig, in diagonals of the object, beyond which they do not lie on each other."""
+LARGEST_STRETCH = 4.0
+"""Of a surfel: what a rig pulls apart farther is torn, and should show a gap rather than needles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +71,7 @@ class BoundRig:
         rest = self.rest
         # float64 up to the gradients: edges are short, and their ends' rounding would turn normals.
         vertices = carry_points(self.binding, moved.vertices, rig_gradients(self.alignment.place(self.rest_pose), moved))
-        gradient = vertex_gradients(rest.vertices.double(), vertices, self.faces).to(rest.vertices.dtype)
+        gradient = limit_stretch(vertex_gradients(rest.vertices.double(), vertices, self.faces), LARGEST_STRETCH).to(rest.vertices.dtype)
         vertices = vertices.to(rest.vertices.dtype)
         normals = carry_normals(rest.normals, gradient)
         if rest.centers is None or rest.tangents is None or self.surfels is None:

@@ -198,16 +198,16 @@ def simulate(
     return kept, simulation.report
 
 
-def limit_stretch(gradients: Tensor) -> Tensor:
-    """(n, 3, 3) with singular values within the bounds of a surfel's; matrices that have such values are returned as they were."""
+def limit_stretch(gradients: Tensor, largest: float = LARGEST_STRETCH) -> Tensor:
+    """(n, 3, 3) with singular values from 1 / largest to largest; matrices that have such values are returned as they were."""
     # sigma_1 <= |F|, and sigma_3 >= J / sigma_1^2.
     size = gradients.flatten(1).norm(dim=1)
-    suspect = (size > LARGEST_STRETCH) | (torch.linalg.det(gradients) < size.square() / LARGEST_STRETCH)
+    suspect = (size > largest) | (torch.linalg.det(gradients) < size.square() / largest)
     if not bool(suspect.any()):
         return gradients
     u, s, vt = torch.linalg.svd(gradients[suspect].double())
     limited = gradients.clone()
-    limited[suspect] = (u @ torch.diag_embed(s.clamp(1 / LARGEST_STRETCH, LARGEST_STRETCH)) @ vt).to(gradients.dtype)
+    limited[suspect] = (u @ torch.diag_embed(s.clamp(1 / largest, largest)) @ vt).to(gradients.dtype)
     return limited
 
 

@@ -181,8 +181,9 @@ class RigBinding(_Plain):
     """Then scale, about the fitted centre, or the origin without `fit`."""
     translation: Triple = (0.0, 0.0, 0.0)
     """Then move [world units]."""
-    method: Literal["closest", "mls"] = "closest"
-    """closest: with the closest triangle that faces alike. mls: moving least squares over the triangles; smoother, blind to narrow gaps."""
+    method: Literal["auto", "closest", "mls"] = "auto"
+    """closest: with the closest triangle that faces alike. mls: moving least squares over patches as wide as the rig is away; smoother, blind
+    to narrow gaps. auto: closest where the rig hugs the object, mls where it stands off."""
     rest: Annotated[float, Field(ge=0)] | None = None
     """Seconds into the animation where the rig stands as the object does at rest; None: where the file's nodes stand."""
     loop: bool = False

@@ -425,7 +425,7 @@ export interface RigBinding {
   fit?: boolean;
   scale?: number;
   translation?: [number, number, number];
-  method?: "closest" | "mls";
+  method?: "auto" | "closest" | "mls";
   rest?: number | null;
   loop?: boolean;
 }
