@@ -70,6 +70,7 @@ class Weights:
 def gather_motion(
     first: int,
     motion: wp.array[Motion],
+    still: wp.array[wp.bool],
     neighbours: wp.array2d[wp.int32],
     psi: wp.array2d[float],
     lever: wp.array[wp.vec3],
@@ -81,6 +82,15 @@ def gather_motion(
     volume: wp.array[float],
 ):
     i = first + wp.tid()
+    # Among particles that are where they were, with F = I, nothing is to be summed: zeros would be.
+    moves = wp.bool(False)
+    for k in range(neighbours.shape[1]):
+        moves = moves or not still[neighbours[i, k]]
+    if not moves:
+        position[i] = base[i]
+        gradient[i] = diagonal * wp.identity(n=3, dtype=float)
+        volume[i] = diagonal
+        return
     total = Motion()
     for k in range(neighbours.shape[1]):
         total += psi[i, k] * motion[neighbours[i, k]]
@@ -214,7 +224,7 @@ def _gather(weights: Weights, psi: Tensor, shift: Tensor, matrix: Tensor, base: 
     position = torch.empty_like(base)
     gradient = torch.empty(len(base), 3, 3, device=base.device)
     inputs = [
-        wp.from_torch(motion, dtype=Motion), warp_array(weights.neighbours), warp_array(psi), warp_array(weights.lever, wp.vec3),
+        wp.from_torch(motion, dtype=Motion), warp_array((motion == 0).all(1)), warp_array(weights.neighbours), warp_array(psi), warp_array(weights.lever, wp.vec3),
         warp_array(base, wp.vec3), diagonal,
     ]  # fmt: skip
     volume = torch.empty(len(base), device=base.device)

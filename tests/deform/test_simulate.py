@@ -222,3 +222,14 @@ def test_a_region_may_be_a_mesh():
     box = {"shape": {"box": {"minimum": [1, -2, 5.2], "maximum": [3, 0, 6]}}, "matter": {"preset": "rubber"}}
     models = [Simulation(ball_asset(), scene(regions=[one])).model for one in (region, box)]
     assert torch.equal(models[0].laws, models[1].laws) and int((models[0].laws == 1).sum()) > 0
+
+
+def test_a_body_that_came_to_rest_sleeps_until_something_acts():
+    drifting = scene(floor=None, gravity=0.0, velocity=[0.05, 0, 0], damping=60.0, duration=1.0)
+    frames, report = simulate(ball_asset(), drifting)
+    assert 0 < report.sleeping_frames < 20 and frames[-1].vertices is frames[-2].vertices and frames[-1].tangents is frames[-2].tangents
+    assert frames[1].vertices is not frames[0].vertices
+    push = {"shape": {"sphere": {"center": [2, -1, 5], "radius": 2}}, "effect": "push", "velocity": [0, 0, 1], "start": 0.7, "end": 1.0}
+    awake, report = simulate(ball_asset(), drifting.model_copy(update={"acts": parse_simulation_scene({"acts": [push]}).acts}))
+    assert report.sleeping_frames == 0  # it is known that something will act
+    assert float((awake[-1].vertices - frames[-1].vertices)[:, 2].mean()) > 1e-4
