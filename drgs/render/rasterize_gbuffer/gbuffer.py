@@ -15,6 +15,8 @@ MIN_COVERAGE = 1.0 / 255.0
 
 SEEN_FROM_BEHIND = 0.3
 """Cosine between a surfel's normal and the viewing ray above which the surfel is taken to show its back."""
+NEAR_SHARE = 0.01
+"""Distance of the near plane in half sides of the surfels' box; builds fit with about the same."""
 LEAST_FACING = 0.02
 """Blended normals face the camera at least by this cosine."""
 
@@ -39,11 +41,23 @@ def face_camera(normals: Tensor, wo: Tensor) -> Tensor:
     return torch.nn.functional.normalize(unit + lacking * wo, dim=-1)
 
 
+def near_plane(centers: Tensor) -> float:
+    """Distance before which nothing is drawn [world units]: a share of what the surfels span, so that pictures know no unit."""
+    if len(centers) == 0:
+        return 0.0
+    low, high = centers.detach().aminmax(dim=0)
+    return NEAR_SHARE * 0.5 * float((high - low).max())
+
+
 def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSettings | None = None) -> GBuffer:
     """What the camera sees of the surfels.
 
     Depth is the expected one; the shaded point lies on the pixel's ray at that depth. Where nothing is met: depth inf, the rest 0.
+
+    Args:
+        settings: None: the near plane follows the surfels' span.
     """
+    settings = settings or RasterSettings(near=near_plane(surfels.centers))
     materials = surfels.materials
     crosses = torch.linalg.cross(surfels.tangents[:, :, 0], surfels.tangents[:, :, 1])
     normals = facing_normals(torch.nn.functional.normalize(crosses, dim=-1, eps=1e-20), surfels.centers, camera)
