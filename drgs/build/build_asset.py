@@ -385,17 +385,27 @@ def _mesh_stage(views, points, fit, mesh_settings, work, identity, resume) -> tu
     path = work / "mesh.safetensors"
     device = fit.parameters["centers"].device
     if resume and path.exists():
-        tensors, facts = read_tensors(path, device)
+        gaussians, mesh, facts = read_geometry(path, device)
         _same_build(facts, identity, path)
-        records = [
-            record(*(tensors[f"{record.__name__}.{name}"] for name in record.__dataclass_fields__)) for record in (Gaussians, TriangleMesh)
-        ]
-        return records[0], records[1]
+        return gaussians, mesh
     gaussians = drop_unseen(gaussians_from_state(fit), views.cameras, points.bounds_radius)
     mesh = mesh_from_gaussians(gaussians, views.cameras, points, mesh_settings)
     tensors = {f"{type(record).__name__}.{name}": value for record in (gaussians, mesh) for name, value in vars(record).items()}
     write_tensors(path, tensors, identity)
     return gaussians, mesh
+
+
+def read_geometry(path: Path, device: torch.device) -> tuple[Gaussians, TriangleMesh, dict]:
+    """What the stage `mesh` left: the surfels that cameras see, the mesh, and of which build they are.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    tensors, facts = read_tensors(path, device)
+    gaussians, mesh = (
+        record(*(tensors[f"{record.__name__}.{name}"] for name in record.__dataclass_fields__)) for record in (Gaussians, TriangleMesh)
+    )
+    return gaussians, mesh, facts
 
 
 def _bind_stage(views, gaussians, fit, mesh, radius, bind_settings, work, identity, resume, reporter, stop_now) -> MeshFitState:

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -69,6 +70,8 @@ class MeshFitSettings:
     """False: surfels stay on the faces themselves (Fig. 9: spikes and blur)."""
     learn_opacity: bool = True
     """False: opacities stay as they were taken over (Fig. 9: stains and cracks)."""
+    variant: Literal["corrected", "paper"] = "corrected"
+    """How Alg. 1 was read (see mesh_surfels): decides the unit of offsets here."""
     rates: MeshRates = field(default_factory=MeshRates)
     losses: FitSettings = field(default_factory=FitSettings)
     """Whose weights are used."""
@@ -96,7 +99,7 @@ def start_mesh_fit(
     gaussians: Gaussians, binding: Binding, mesh: TriangleMesh, stage_one: dict[str, Tensor], settings: MeshFitSettings
 ) -> MeshFitState:
     """State from mesh_surfels' result and the light among stage 1's parameters."""
-    frames = face_frames(mesh)
+    frames = face_frames(mesh, settings.variant)
     index = binding.face.long()
     unit = frames.unit[index]
     offsets = (binding.normal_offset / unit).clamp(-FARTHEST, FARTHEST)
