@@ -1,85 +1,21 @@
-"""A real server with an empty data directory, and a real browser on it. The browser is $DRGS_CHROMIUM, else Debian's chromium."""
+"""A real server with an empty data directory, and a real browser on it."""
 
 import base64
 import io
-import json
-import os
-import re
-import shutil
-import signal
 import subprocess
 import sys
-import threading
 import time
-import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from queue import Empty, Queue
 from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
-ROOT = Path(__file__).resolve().parents[2]
-START_SECONDS = 60
-CHROMIUM_ARGUMENTS = (
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-background-networking",
-)
-
-
-@dataclass
-class RunningServer:
-    """`drgs serve` as a process of its own, so that it can die and come back on the same port."""
-
-    data: Path
-    port: int = 0
-    token: str = ""
-    process: subprocess.Popen | None = None
-
-    def start(self) -> None:
-        command = [sys.executable, "-c", "from drgs.cli import main; main()", "serve", "--no-worker"]
-        command += ["--data", str(self.data), "--port", str(self.port)]
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        lines: Queue[str] = Queue()
-        assert process.stdout is not None
-        output = process.stdout
-        threading.Thread(target=lambda: [lines.put(line) for line in output], daemon=True).start()
-        self.process = process
-        said = ""
-        deadline = time.monotonic() + START_SECONDS
-        while time.monotonic() < deadline and process.poll() is None:
-            try:
-                said += lines.get(timeout=0.2)
-            except Empty:
-                continue
-            if address := re.search(r"http://[^/]*:(\d+)/#token=(\S+)", said):
-                self.port, self.token = int(address[1]), address[2]
-                return
-        self.stop()
-        pytest.fail(f"drgs serve did not say its address within {START_SECONDS} s; it said: {said or 'nothing'}")
-
-    def stop(self) -> None:
-        if self.process and self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
-            self.process.wait(20)
-
-    @property
-    def address(self) -> str:
-        return f"http://127.0.0.1:{self.port}"
-
-    def ask(self, path: str) -> dict:
-        """GET with the token, as a script would."""
-        request = urllib.request.Request(self.address + path, headers={"Authorization": f"Bearer {self.token}"})
-        with urllib.request.urlopen(request, timeout=20) as answer:
-            return json.load(answer)
+from tests.web.browser import CHROMIUM_ARGUMENTS, ROOT, RunningServer, chromium_path, write_ball
 
 
 @dataclass
@@ -145,15 +81,6 @@ def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], seco
     return answer
 
 
-def chromium_path() -> str:
-    """The browser to test with."""
-    candidates = (os.environ.get("DRGS_CHROMIUM"), "/usr/bin/chromium", shutil.which("chromium"), shutil.which("google-chrome"))
-    for candidate in candidates:
-        if candidate and Path(candidate).exists():
-            return candidate
-    pytest.fail("the viewer's tests need Chromium: install the package `chromium`, or name a binary in DRGS_CHROMIUM")
-
-
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
     subprocess.run([sys.executable, ROOT / "web" / "build.py"], check=True)
@@ -166,16 +93,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
 @pytest.fixture(scope="session")
 def ball_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball with red, green and blue thirds around z, rough and not metallic, as a PLY with material properties."""
-    ball = trimesh.creation.icosphere(3, 0.5)
     path = tmp_path_factory.mktemp("mesh") / "ball.ply"
-    names = ("x", "y", "z", "albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")
-    lines = ["ply", "format ascii 1.0", f"element vertex {len(ball.vertices)}", *(f"property float {name}" for name in names)]
-    lines += [f"element face {len(ball.faces)}", "property list uchar int vertex_indices", "end_header"]
-    for x, y, z in ball.vertices:
-        albedo = (0.8, 0.1, 0.1) if y < -0.1 else (0.1, 0.8, 0.1) if x > 0 else (0.1, 0.1, 0.8)
-        lines.append(" ".join(f"{value:.6f}" for value in (x, y, z, *albedo, 0.6, 0.0)))
-    lines += [f"3 {a} {b} {c}" for a, b, c in ball.faces]
-    path.write_text("\n".join(lines) + "\n")
+    write_ball(path)
     return path
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import expect
 
-from tests.web.conftest import RunningServer, Viewer, wait_until
+from tests.web.browser import RunningServer
+from tests.web.conftest import Viewer, wait_until
 
 TOO_SMALL_TO_SEE = 6.0
 """Euclidean difference of mean sRGB colours that noise between two pictures of the same thing stays below."""

@@ -1,6 +1,6 @@
 /** The REST calls of the viewer, each once. Every failure is an ApiError whose message is a sentence for the user. */
 
-import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobInfo, JobList, Problem, SessionInfo, SessionList, Settings } from './protocol.gen';
+import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest } from './protocol.gen';
 import type { View } from './viewpoint';
 
 export class ApiError extends Error {
@@ -86,10 +86,13 @@ export function uploadEnvironment(file: File, onProgress?: (share: number) => vo
 }
 
 export const listJobs = () => call<JobList>('GET', '/api/jobs');
-export const startBuild = (request: BuildRequest) => call<JobInfo>('POST', '/api/jobs', request);
+export const startJob = (request: BuildRequest | RenderRequest | SimulateRequest) => call<JobInfo>('POST', '/api/jobs', request);
 export const cancelJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/cancel`);
 export const resumeJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/resume`);
 export const retryJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/retry`);
+export const deleteJob = (id: string) => call<void>('DELETE', `/api/jobs/${part(id)}`);
+export const jobFiles = (id: string) => call<JobFileList>('GET', `/api/jobs/${part(id)}/files`);
+export const jobFile = (id: string, name: string) => `/api/jobs/${part(id)}/files/${part(name)}`;
 export const jobPreview = (job: JobInfo) => `/api/jobs/${part(job.id)}/preview.jpg?v=${job.preview_version}`;
 
 export function uploadCapture(file: File, preset: string, onProgress?: (share: number) => void): Promise<JobInfo> {
@@ -103,6 +106,8 @@ export function uploadCapture(file: File, preset: string, onProgress?: (share: n
 export const listSessions = () => call<SessionList>('GET', '/api/sessions');
 export const openSession = (asset: string) => call<SessionInfo>('POST', '/api/sessions', { asset });
 export const getSession = (id: string) => call<SessionInfo>('GET', `/api/sessions/${part(id)}`);
+/** A new version of the asset with the session's edits put into it. */
+export const saveVersion = (session: string) => call<AssetInfo>('POST', `/api/sessions/${part(session)}/save`);
 export const appendEdit = (session: string, edit: Edit) => call<unknown>('POST', `/api/sessions/${part(session)}/edits`, { edit });
 
 /** Query of `frame.png` for a camera; a background colour is the stream's alone. */

@@ -33,10 +33,18 @@ const plain = ({ all, sphere, box, region, similar, vertex_weights }: Selection)
   similar: similar ? { ...similar, tolerance: similar.tolerance ?? 0.1 } : undefined,
   vertex_weights: vertex_weights ?? undefined,
 });
-export const sameEdits = (a: Edit[], b: Edit[]) => JSON.stringify(a.map(comparable)) === JSON.stringify(b.map(comparable));
-const comparable = (edit: Edit) => (edit.op === 'material' ? { ...edit, select: plain(edit.select), set: valuesOf(edit.set), mode: edit.mode ?? 'absolute' } : withoutNulls(edit));
+/** Whether two lists of edits mean the same; of what one side leaves out (defaults that the server fills in) nothing is asked. */
+export const sameEdits = (a: Edit[], b: Edit[]) => a.length === b.length && a.every((edit, i) => agree(comparable(edit), comparable(b[i]!)));
+const comparable = (edit: Edit) =>
+  edit.op === 'material' ? { op: edit.op, select: JSON.stringify(plain(edit.select)), set: JSON.stringify(valuesOf(edit.set)), mode: edit.mode ?? 'absolute' } : edit;
 const valuesOf = ({ albedo, roughness, metallic }: MaterialValues) => ({ albedo: albedo ?? undefined, roughness: roughness ?? undefined, metallic: metallic ?? undefined });
-const withoutNulls = (edit: Edit) => Object.fromEntries(Object.entries(edit).filter(([, value]) => value !== null).sort(([a], [b]) => (a < b ? -1 : 1)));
+
+function agree(a: unknown, b: unknown): boolean {
+  if (a === undefined || b === undefined) return true;
+  if (a === null || b === null || typeof a !== 'object' || typeof b !== 'object') return a === b;
+  if (Array.isArray(a) !== Array.isArray(b) || (Array.isArray(a) && a.length !== (b as unknown[]).length)) return false;
+  return Object.keys({ ...a, ...b }).every((key) => agree((a as Record<string, unknown>)[key], (b as Record<string, unknown>)[key]));
+}
 
 const touches = (edit: Edit, select: Selection, key: keyof MaterialValues): edit is MaterialEdit =>
   edit.op === 'material' && edit.set[key] != null && sameSelection(edit.select, select);

@@ -1,9 +1,9 @@
 /** Builds, assets and environments: what the server holds, kept up to date by asking. */
 
 import * as api from './api';
-import type { AssetInfo, JobInfo } from './protocol.gen';
+import type { AssetInfo, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
 import { editLight, openAsset } from './session';
-import { assets, attempt, environments, jobs, notify, session, workersAlive } from './state';
+import { assets, attempt, environments, jobs, notify, psnrCurves, session, workersAlive } from './state';
 
 const BUSY_MS = 1000;
 const IDLE_MS = 6000;
@@ -18,15 +18,32 @@ export async function refreshJobs(): Promise<void> {
   const before = new Map(jobs.value.map((job) => [job.id, job.state]));
   jobs.value = list.jobs;
   workersAlive.value = list.workers_alive;
+  followPsnr(list.jobs);
   for (const job of list.jobs) {
     const earlier = before.get(job.id);
     if (earlier === undefined || earlier === job.state) continue;
-    if (job.state === 'done') await built(job);
-    if (job.state === 'failed') notify(`The build “${job.name}” failed: ${job.error ?? 'the server gave no reason.'}`);
+    if (job.state === 'done') await finished(job);
+    if (job.state === 'failed') notify(`“${job.name}” failed: ${job.error ?? 'the server gave no reason.'}`);
   }
 }
 
-async function built(job: JobInfo): Promise<void> {
+/** The curve is what this browser saw; it keeps it over a reload, and forgets jobs that are gone. */
+function followPsnr(list: JobInfo[]): void {
+  const known = psnrCurves.value;
+  const next: typeof known = {};
+  let changed = false;
+  for (const job of list) {
+    const curve = known[job.id] ?? [];
+    const newest = curve.at(-1);
+    const fresh = job.psnr !== null && isActive(job) && (!newest || newest[0] !== job.fraction);
+    if (fresh || curve.length) next[job.id] = fresh ? [...curve, [job.fraction, job.psnr!] as [number, number]].slice(-400) : curve;
+    changed ||= fresh;
+  }
+  if (changed || Object.keys(known).length !== Object.keys(next).length) psnrCurves.value = next;
+}
+
+async function finished(job: JobInfo): Promise<void> {
+  if (!job.asset_id) return notify(job.kind === 'simulate' ? `“${job.name}” is simulated: play it under Shape.` : `“${job.name}” is done: its files are in the list.`, 'info');
   await refreshAssets();
   const wanted = toOpen.delete(job.id);
   if (job.asset_id && (wanted || !session.value)) await openAsset(job.asset_id);
@@ -61,20 +78,29 @@ export function watchJobs(): void {
   void step();
 }
 
-async function follow(started: Promise<JobInfo>): Promise<void> {
+async function follow(started: Promise<JobInfo>): Promise<JobInfo | null> {
   const job = await attempt(started);
-  if (!job) return;
+  if (!job) return null;
   toOpen.add(job.id);
   jobs.value = [job, ...jobs.value.filter((other) => other.id !== job.id)];
   void attempt(refreshJobs());
+  return job;
 }
 
-export const buildSample = (preset: Preset) => follow(api.startBuild({ dataset: 'sample', preset }));
+export const buildSample = (preset: Preset) => follow(api.startJob({ dataset: 'sample', preset }));
+/** Jobs that make no asset: the list shows them. */
+export const startJob = (request: RenderRequest | SimulateRequest) => follow(api.startJob(request));
+export const resume = (job: JobInfo) => follow(api.resumeJob(job.id));
 export const retry = (job: JobInfo) => follow(api.retryJob(job.id));
 export type Preset = 'draft' | 'fast' | 'full';
 
 export async function cancel(job: JobInfo): Promise<void> {
   await attempt(api.cancelJob(job.id));
+  await attempt(refreshJobs());
+}
+
+export async function remove(job: JobInfo): Promise<void> {
+  await attempt(api.deleteJob(job.id));
   await attempt(refreshJobs());
 }
 

@@ -46,6 +46,7 @@ export async function openAsset(id: string): Promise<void> {
     rewrite = null;
     past = [];
     future = [];
+    later = [];
   });
   history.replaceState(null, '', `#asset=${encodeURIComponent(id)}`);
   document.title = `${info.asset_name} · DR-GS`;
@@ -96,6 +97,7 @@ function events(asset: string): ConstructorParameters<typeof Stream>[1] {
           return continueRewrite();
         case 'rejected':
           rewrite = draft.value = null;
+          later = [];
           pending.value = pending.value.filter((waiting) => waiting.id !== message.id);
           return notify(message.reason);
         case 'status':
@@ -228,12 +230,13 @@ export function editTime(edit: Edit): void {
 
 /** Show what `edit` does, in place of the newest one that it replaces; the server hears of it by `commitDraft`. */
 export function draftEdit(edit: Edit, replaces: (other: Edit) => boolean): void {
-  if (rewrite) return;
+  if (rewrite) return void later.push(() => draftEdit(edit, replaces));
   draft.value = withReplaced([...log.value.edits, ...pending.value.map((waiting) => waiting.edit)], edit, replaces);
 }
 
 export function commitDraft(): void {
-  if (draft.value && !rewrite) replaceEdits(draft.value);
+  if (rewrite) later.push(commitDraft);
+  else if (draft.value) replaceEdits(draft.value);
 }
 
 interface Rewrite {
@@ -246,10 +249,13 @@ interface Rewrite {
 let rewrite: Rewrite | null = null;
 let past: Rewrite[] = [];
 let future: Rewrite[] = [];
+/** What the user did while the log was being changed, to be done then. */
+let later: (() => void)[] = [];
 
 /** Make the log hold exactly these edits: undo back to the first that differs, then add the rest. */
 export function replaceEdits(after: Edit[], remember = true): void {
-  if (!stream || rewrite) return;
+  if (rewrite) return void later.push(() => replaceEdits(after, remember));
+  if (!stream) return;
   const before = log.value.edits;
   if (sameEdits(before, after)) {
     draft.value = null;
@@ -270,6 +276,7 @@ function continueRewrite(): void {
   const now = log.value.edits;
   if (sameEdits(now, after) || rewrite.attempts-- === 0) {
     rewrite = draft.value = null;
+    while (!rewrite && later.length) later.shift()!();
     return;
   }
   let same = 0;
@@ -279,8 +286,9 @@ function continueRewrite(): void {
 }
 
 export function undo(): void {
+  if (rewrite) return void later.push(undo);
   const step = past.at(-1);
-  if (step && !rewrite && sameEdits(step.after, log.value.edits)) {
+  if (step && sameEdits(step.after, log.value.edits)) {
     past = past.slice(0, -1);
     future = [...future, step];
     replaceEdits(step.before, false);
@@ -288,8 +296,9 @@ export function undo(): void {
 }
 
 export function redo(): void {
+  if (rewrite) return void later.push(redo);
   const step = future.at(-1);
-  if (step && !rewrite && sameEdits(step.before, log.value.edits)) {
+  if (step && sameEdits(step.before, log.value.edits)) {
     future = future.slice(0, -1);
     past = [...past, step];
     replaceEdits(step.after, false);

@@ -110,6 +110,10 @@ export const inspectorOpen = kept<boolean>('inspectorOpen', true);
 export const resolution = kept<'low' | 'medium' | 'full'>('resolution', 'medium');
 export type Tab = 'material' | 'light' | 'shape' | 'view' | 'out';
 export const tab = kept<Tab>('tab', 'material');
+/** (share of the job, dB) by job, as far as this browser saw it. */
+export const psnrCurves = kept<Record<string, [number, number][]>>('psnr', {});
+/** Length of clips that this browser ordered, by the job that made them [s]; a clip itself does not tell. */
+export const clipSeconds = kept<Record<string, number>>('clipSeconds', {});
 export const savedMaterials = kept<NamedMaterial[]>('materials', []);
 /** Shown in this order, each with a picture once the viewport has drawn it. */
 export const ballsWanted = computed(() => [...presets, ...savedMaterials.value]);

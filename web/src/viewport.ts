@@ -9,6 +9,9 @@ import { effect } from '@preact/signals';
 import CameraControls from 'camera-controls';
 import { Box3, Matrix4, MOUSE, PerspectiveCamera, Quaternion, Raycaster, Sphere, Spherical, Vector2, Vector3, Vector4 } from 'three';
 import * as api from './api';
+import { Flight } from './flight';
+import { frameBox } from './framing';
+import { LocalPace } from './local_pace';
 import { LocalPicture } from './local_picture';
 import { FLAG_CONVERGED, FLAG_MOVING, MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from './protocol.gen';
 import { editLight, listen, pick, sendCamera } from './session';
@@ -27,19 +30,7 @@ const BALL_PIXELS = 72;
 const SKY_PIXELS = 160;
 /** How long a selection shows, in two pulses. */
 const FLASH_MS = 1400;
-/** Of a fly, in object radii a second; shift makes it so many times faster, alt slower. */
-const FLY_SPEED = 0.8;
-const FLY_FACTOR = 4;
-const FLY_CODES = ['KeyW', 'KeyA', 'KeyS', 'KeyD', 'KeyQ', 'KeyE'];
 const MOVING_MS = 120;
-/** Room around a framed object: 1 is none. */
-const MARGIN = 1.06;
-/** Sharpness of the local picture while it moves, as shares of the screen's own; slow machines go down this list. */
-const LOCAL_SCALES = [1, 0.75, 0.55, 0.4, 0.3];
-const SLOW_FRAME_MS = 40;
-const AIMED_FRAME_MS = 25;
-const QUICK_FRAME_MS = 17.5;
-const FRAMES_BEFORE_STEP = 4;
 const PIXEL_BUDGET = { low: 200_000, medium: 500_000, full: MAX_PIXELS };
 /** A fresh picture with fewer samples a pixel than this is too noisy to replace the local one: denoised, and as it is. */
 const SHOW_FROM_SAMPLES = { denoised: 4, raw: 16 };
@@ -62,11 +53,8 @@ export class Viewport {
   private staleUpTo = 0;
   private fresh = false;
   private localDirty = true;
-  /** Index into LOCAL_SCALES, and the running mean of the time between two moving pictures. */
-  private localScale = 0;
+  private readonly localPace = new LocalPace();
   private localSharp = true;
-  private frameMs = AIMED_FRAME_MS;
-  private framesMeasured = 0;
   private localMesh = '';
   private localEnvironment = '';
   private turning: { pointer: number; x: number; rotation: number } | null = null;
@@ -74,7 +62,7 @@ export class Viewport {
   private painting: number | null = null;
   private flashedAt = -Infinity;
   private readonly stillMotion = matchMedia('(prefers-reduced-motion: reduce)').matches;
-  private readonly flyKeys = new Set<string>();
+  private readonly flight: Flight;
 
   constructor(
     private readonly stage: HTMLElement,
@@ -94,9 +82,9 @@ export class Viewport {
       notify('This browser offers no WebGL 2, so the instant local picture is off; traced pictures work.', 'info');
       localPicture.value = false;
     }
+    this.flight = new Flight(this.camera, this.controls, this.bounds);
     listen(this.onHello, this.onFrame);
     this.listenToPointers();
-    this.listenToFlyKeys();
     new ResizeObserver(this.onResize).observe(stage);
     this.followState();
     requestAnimationFrame(this.tick);
@@ -145,26 +133,12 @@ export class Viewport {
     this.controls.update(0);
   };
 
-  /** Look at the centre of the object from `direction`, so near that its bounding box fills the free part of the window. */
+  /** Look at the object from `direction`, so near that it fills the free part of the window. */
   private showAll(direction: Vector3, smooth: boolean): void {
     const { clientWidth: width, clientHeight: height } = this.stage;
-    const free = freeArea(width, height);
-    const tangent = Math.tan((this.camera.fov * Math.PI) / 360); // of half the height
-    const center = this.box.getCenter(new Vector3());
-    const back = direction.clone().normalize();
-    const right = new Vector3().crossVectors(this.camera.up, back).normalize();
-    const up = new Vector3().crossVectors(back, right);
-    let distance = 0;
-    for (let corner = 0; corner < 8; corner++) {
-      const { min, max } = this.box;
-      const p = new Vector3(corner & 1 ? max.x : min.x, corner & 2 ? max.y : min.y, corner & 4 ? max.z : min.z).sub(center);
-      const across = Math.max(Math.abs(p.dot(right)) / free.width, Math.abs(p.dot(up)) / free.height);
-      distance = Math.max(distance, p.dot(back) + (MARGIN * across * height) / tangent);
-    }
-    const eye = back.multiplyScalar(distance).add(center);
-    const unitsPerPixel = (2 * tangent * distance) / height;
+    const { eye, center, focalOffset } = frameBox(this.box, direction, this.camera, { width, height });
     void this.controls.setLookAt(eye.x, eye.y, eye.z, center.x, center.y, center.z, smooth);
-    void this.controls.setFocalOffset((width / 2 - free.x) * unitsPerPixel, (height / 2 - free.y) * unitsPerPixel, 0, smooth);
+    void this.controls.setFocalOffset(focalOffset.x, focalOffset.y, 0, smooth);
   }
 
   private onFrame = (header: FrameHeader, picture: ImageBitmap, cameraNumber: number) => {
@@ -182,6 +156,7 @@ export class Viewport {
     } else this.traced.clearRect(0, 0, header.width, header.height);
     this.traced.drawImage(picture, 0, 0, header.width, header.height);
     picture.close();
+    this.stage.dataset.tracedFrames = String(Number(this.stage.dataset.tracedFrames ?? 0) + 1);
     this.stage.dataset.samples = String(header.spp);
     this.stage.dataset.revision = String(header.stateRev);
     this.setFresh(shown && (enough || this.fresh));
@@ -244,7 +219,10 @@ export class Viewport {
       this.stage.dataset.before = String(before.value);
       this.localDirty = true;
     });
-    effect(() => this.fly(flying.value));
+    effect(() => {
+      this.stage.dataset.flying = String(flying.value);
+      this.flight.turn(flying.value);
+    });
     effect(() => {
       if (ballsWanted.value && mesh.value) this.drawBalls();
     });
@@ -313,9 +291,9 @@ export class Viewport {
     requestAnimationFrame(this.tick);
     const elapsed = now - this.lastTick;
     this.lastTick = now;
-    this.flyOn(elapsed / 1000);
+    this.flight.move(elapsed / 1000);
     const moved = this.controls.update(elapsed / 1000);
-    if (moved && now - this.movedAt < MOVING_MS) this.paceLocal(elapsed);
+    if (moved && now - this.movedAt < MOVING_MS && this.localPace.measure(elapsed)) this.resizeLocal();
     if (!session.value) return;
     if (moved) {
       this.movedAt = now;
@@ -350,22 +328,8 @@ export class Viewport {
     this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
   }
 
-  /** Fewer pixels where moving pictures come too slowly, more where there is room: time goes with the number of pixels. */
-  private paceLocal(elapsed: number): void {
-    this.frameMs += 0.4 * (Math.min(elapsed, 500) - this.frameMs);
-    if (++this.framesMeasured < FRAMES_BEFORE_STEP || (this.frameMs < SLOW_FRAME_MS && this.frameMs > QUICK_FRAME_MS)) return;
-    const wanted = LOCAL_SCALES[this.localScale]! * Math.sqrt(AIMED_FRAME_MS / this.frameMs);
-    const fitting = LOCAL_SCALES.findIndex((scale) => scale <= wanted * 1.05);
-    const next = fitting < 0 ? LOCAL_SCALES.length - 1 : Math.max(fitting, this.localScale - 1);
-    this.framesMeasured = 0;
-    if (next === this.localScale) return;
-    this.localScale = next;
-    this.frameMs = AIMED_FRAME_MS; // measure anew before the next step
-    this.resizeLocal();
-  }
-
   private resizeLocal(): void {
-    const scale = this.localSharp ? 1 : LOCAL_SCALES[this.localScale]!;
+    const scale = this.localSharp ? 1 : this.localPace.scale;
     this.local?.resize(this.stage.clientWidth, this.stage.clientHeight, scale * pixelRatio());
     this.localDirty = true;
   }
@@ -497,66 +461,6 @@ export class Viewport {
       if (picked.hit && picked.position) void this.controls.moveTo(...picked.position, true);
     });
   }
-
-  // ---- flying ------------------------------------------------------------------------------------------------------------
-
-  private fly(on: boolean): void {
-    const { controls, camera } = this;
-    this.flyKeys.clear();
-    this.stage.dataset.flying = String(on);
-    if (on === (controls.maxDistance < 1e-3 * this.bounds.radius)) return;
-    const eye = camera.position.clone();
-    const forward = camera.getWorldDirection(new Vector3());
-    // Orbiting at no distance turns the head; dragging the picture then is the other way round.
-    const distance = on ? 1e-4 * this.bounds.radius : Math.max(0.3 * this.bounds.radius, this.bounds.center.clone().sub(eye).dot(forward));
-    controls.minDistance = on ? distance : 0.05 * this.bounds.radius;
-    controls.maxDistance = on ? distance : 60 * this.bounds.radius;
-    controls.azimuthRotateSpeed = controls.polarRotateSpeed = on ? -0.3 : 1;
-    const { ACTION } = CameraControls;
-    controls.mouseButtons.wheel = on ? ACTION.NONE : ACTION.DOLLY;
-    const target = eye.clone().addScaledVector(forward, distance);
-    void controls.setFocalOffset(0, 0, 0, false);
-    void controls.setLookAt(eye.x, eye.y, eye.z, target.x, target.y, target.z, false);
-  }
-
-  private flyOn(seconds: number): void {
-    const has = (code: string) => (this.flyKeys.has(code) ? 1 : 0);
-    const faster = has('ShiftLeft') || has('ShiftRight') ? FLY_FACTOR : has('AltLeft') || has('AltRight') ? 1 / FLY_FACTOR : 1;
-    const step = FLY_SPEED * faster * this.bounds.radius * Math.min(seconds, 0.1);
-    const along = has('KeyW') - has('KeyS');
-    const across = has('KeyD') - has('KeyA');
-    const up = has('KeyE') - has('KeyQ');
-    if (!flying.value || !(along || across || up)) return;
-    const move = this.camera.getWorldDirection(new Vector3()).multiplyScalar(along * step);
-    move.addScaledVector(new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0), across * step);
-    move.addScaledVector(this.camera.up, up * step);
-    const target = this.controls.getTarget(new Vector3()).add(move);
-    void this.controls.moveTo(target.x, target.y, target.z, true);
-  }
-
-  private listenToFlyKeys(): void {
-    // Physical keys, so that W A S D lie together on every keyboard.
-    window.addEventListener('keydown', (event) => {
-      const typing = event.target instanceof HTMLElement && event.target.matches('input, textarea, select');
-      if (flying.value && !typing && !event.ctrlKey && !event.metaKey && (FLY_CODES.includes(event.code) || /^(Shift|Alt)/.test(event.code))) {
-        this.flyKeys.add(event.code);
-        event.preventDefault();
-      }
-    });
-    window.addEventListener('keyup', (event) => this.flyKeys.delete(event.code));
-    window.addEventListener('blur', () => this.flyKeys.clear());
-  }
 }
 
 const pixelRatio = () => Math.min(window.devicePixelRatio || 1, 2);
-
-/** Centre and size of what bars and open panels leave of the window [CSS pixels]. */
-function freeArea(width: number, height: number): { x: number; y: number; width: number; height: number } {
-  const edge = (selector: string, side: 'left' | 'right' | 'top' | 'bottom') => document.querySelector(selector)?.getBoundingClientRect()[side];
-  const narrow = width < 620; // panels lie below the picture then
-  const left = narrow ? 0 : (edge('.library', 'right') ?? 0);
-  const right = narrow ? width : (edge('.inspector', 'left') ?? width);
-  const top = edge('.topbar', 'bottom') ?? 0;
-  const bottom = narrow ? (edge('.panel', 'top') ?? height) : (edge('.hud', 'top') ?? height);
-  return { x: (left + right) / 2, y: (top + bottom) / 2, width: right - left, height: bottom - top };
-}

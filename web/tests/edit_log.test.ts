@@ -17,6 +17,15 @@ describe('taking a value back', () => {
     expect(isSet(rest, sphere, 'roughness')).toBe(true);
   });
 
+  it('knows an edit to which the server added defaults, but not another kind of deformation', () => {
+    const twist: Edit = { op: 'deform', map: { type: 'twist', rate: 1 } };
+    const echoed = { ...twist, vertices: null, time: 0 } as Edit;
+    expect(sameEdits([twist], [echoed])).toBe(true);
+    expect(sameEdits([twist], [{ ...echoed, map: null, vertices: 'a.npz' } as Edit])).toBe(false);
+    expect(sameEdits([twist], [{ op: 'deform', map: { type: 'twist', rate: 2 } }])).toBe(false);
+    expect(sameEdits([twist], [twist, twist])).toBe(false);
+  });
+
   it('knows a selection that came back from the server', () => {
     const echoed = rough(0.9, fromServer({ sphere: { center: [0, 0, 0.5], radius: 0.2, falloff: 0 } }));
     expect(withoutValue([echoed], sphere, 'roughness')).toEqual([]);

@@ -2,7 +2,8 @@
 
 import { signal } from '@preact/signals';
 import * as api from '../api';
-import { attempt, log, notify, session, settings } from '../state';
+import { refreshAssets, startJob } from '../jobs';
+import { attempt, libraryOpen, log, notify, session, settings } from '../state';
 import { titleFor } from '../shortcuts';
 import { viewNow } from '../viewpoint';
 import { asCurl, asEdits, asPython } from '../scripts';
@@ -60,10 +61,33 @@ function Still() {
         <button class="primary" disabled={rendering.value || !viewNow.value} onClick={() => void saveStill()}>
           <Icon name="camera" /> {rendering.value ? 'Rendering…' : 'Render PNG'}
         </button>
+        <button title="72 pictures round the object, as MP4; a job" onClick={() => void renderTurntable()}>
+          Turntable (MP4)
+        </button>
       </div>
       <p class="hint">{titleFor('still', 'What is on screen is saved at once')}.</p>
     </Section>
   );
+}
+
+const TURNTABLE = { frames: 72, fps: 24, width: 800, height: 600 };
+
+/** All round the object with its edits, as a job whose film is in the list of jobs. */
+async function renderTurntable(): Promise<void> {
+  const open = session.value!;
+  libraryOpen.value = true;
+  await startJob({
+    kind: 'render',
+    asset: open.asset,
+    name: `${open.assetName}, turntable`,
+    turntable: { frames: TURNTABLE.frames },
+    variants: [{ name: 'edited', edits: log.value.edits }],
+    video_fps: TURNTABLE.fps,
+    width: TURNTABLE.width,
+    height: TURNTABLE.height,
+    spp: Number(samples.value),
+    background: transparent.value ? 'transparent' : 'environment',
+  });
 }
 
 const FILES: { format: api.ExportFormat; text: string; title: string }[] = [
@@ -88,9 +112,23 @@ function Files() {
           </li>
         ))}
       </ul>
-      {log.value.edits.length > 0 && <p class="hint">Files hold the object as captured. Its edits go along as JSON, below.</p>}
+      {log.value.edits.length > 0 && (
+        <>
+          <p class="hint">These files hold the object without this session’s edits. A new version has them in it, and files of its own.</p>
+          <div class="buttons">
+            <button onClick={() => void saveVersion()}>Save a new version</button>
+          </div>
+        </>
+      )}
     </Section>
   );
+}
+
+async function saveVersion(): Promise<void> {
+  const saved = await attempt(api.saveVersion(session.value!.id));
+  if (!saved) return;
+  await attempt(refreshAssets());
+  notify(`Saved as version ${saved.version}: it is in the list of assets.`, 'info');
 }
 
 function Script() {

@@ -1,12 +1,12 @@
 /** Left-hand panel: builds under way or past, and the assets that can be opened. */
 
 import { signal } from '@preact/signals';
-import { useRef } from 'preact/hooks';
+import { useEffect, useRef, useState } from 'preact/hooks';
 import * as api from '../api';
-import { buildSample, cancel, isActive, retry, takeFile, type Preset } from '../jobs';
-import type { JobInfo } from '../protocol.gen';
+import { buildSample, cancel, isActive, remove, resume, retry, takeFile, type Preset } from '../jobs';
+import type { JobFile, JobInfo } from '../protocol.gen';
 import { openAsset } from '../session';
-import { assets, jobs, libraryOpen, session, workersAlive } from '../state';
+import { assets, attempt, jobs, libraryOpen, psnrCurves, session, workersAlive } from '../state';
 import { Choice, Section } from './fields';
 import { Icon } from './icons';
 
@@ -95,8 +95,8 @@ function Jobs() {
   const list = jobs.value;
   if (list.length === 0) return null;
   return (
-    <Section title="Builds">
-      {workersAlive.value === 0 && list.some(isActive) && <p class="warning">No worker is running, so builds wait. Start one with `drgs worker`.</p>}
+    <Section title="Jobs">
+      {workersAlive.value === 0 && list.some(isActive) && <p class="warning">No worker is running, so jobs wait. Start one with `drgs worker`.</p>}
       <ul class="jobs">
         {list.slice(0, 12).map((job) => (
           <Job key={job.id} job={job} />
@@ -123,6 +123,8 @@ export function duration(seconds: number): string {
   return minutes < 90 ? `${minutes} min` : `${(whole / 3600).toFixed(1)} h`;
 }
 
+const KIND_TEXT: Record<JobInfo['kind'], string> = { build: 'Build', redecouple: 'Materials again', simulate: 'Simulation', render: 'Pictures', export: 'Files' };
+
 function Job({ job }: { job: JobInfo }) {
   const active = isActive(job);
   const stage = job.stage ? job.stage.replace(/_/g, ' ') : STATE_TEXT[job.state];
@@ -132,24 +134,68 @@ function Job({ job }: { job: JobInfo }) {
     job.eta_seconds !== null && `${duration(job.eta_seconds)} left`,
     job.attempts > 1 && `attempt ${job.attempts}`,
   ].filter(Boolean);
+  const again = job.state === 'failed' || job.state === 'cancelled' || job.state === 'unknown';
   return (
-    <li class={`job ${job.state}`} aria-label={`Build ${job.name}: ${STATE_TEXT[job.state]}`}>
+    <li class={`job ${job.state}`} aria-label={`${KIND_TEXT[job.kind]} ${job.name}: ${STATE_TEXT[job.state]}`}>
       {active && job.preview_version > 0 && <img class="preview" src={api.jobPreview(job)} alt={`Preview of ${job.name}`} />}
       <div class="job-head">
         <strong>{job.name}</strong>
-        <span class="tag">{job.preset}</span>
+        <span class="tag">{job.kind === 'build' ? job.preset : KIND_TEXT[job.kind]}</span>
         <span class={`state ${job.state}`}>{active && job.state === 'running' ? stage : STATE_TEXT[job.state]}</span>
       </div>
       {active && <Bar label={`Progress of ${job.name}`} share={job.fraction} />}
+      {active && <PsnrCurve curve={psnrCurves.value[job.id] ?? []} />}
       {active && <p class="facts">{facts.join(' · ') || job.message}</p>}
       {active && job.message && facts.length > 0 && <p class="facts">{job.message}</p>}
       {job.error && <p class="warning">{job.error}</p>}
+      {job.state === 'done' && (job.kind === 'render' || job.kind === 'export') && <JobFiles job={job} />}
       <div class="buttons">
         {active && <button onClick={() => void cancel(job)}>Cancel</button>}
-        {(job.state === 'failed' || job.state === 'cancelled' || job.state === 'unknown') && <button onClick={() => void retry(job)}>Retry</button>}
+        {job.state === 'stalled' && <button onClick={() => void resume(job)}>Resume</button>}
+        {again && <button onClick={() => void retry(job)}>Retry</button>}
         {job.state === 'done' && job.asset_id && job.asset_id !== session.value?.asset && <button onClick={() => void openAsset(job.asset_id!)}>Open</button>}
+        {!active && <button onClick={() => void remove(job)}>Remove</button>}
       </div>
     </li>
+  );
+}
+
+/** Quality against progress; nothing until there are two points. */
+function PsnrCurve({ curve }: { curve: [number, number][] }) {
+  if (curve.length < 2) return null;
+  const values = curve.map(([, psnr]) => psnr);
+  const low = Math.min(...values);
+  const span = Math.max(1, Math.max(...values) - low);
+  const points = curve.map(([share, psnr]) => `${(100 * share).toFixed(1)},${(28 - (26 * (psnr - low)) / span).toFixed(1)}`).join(' ');
+  return (
+    <svg class="curve" viewBox="0 0 100 30" preserveAspectRatio="none" role="img" aria-label={`Quality from ${values[0]!.toFixed(1)} to ${values.at(-1)!.toFixed(1)} dB`}>
+      <polyline points={points} />
+    </svg>
+  );
+}
+
+const MANY_FILES = 6;
+
+function JobFiles({ job }: { job: JobInfo }) {
+  const [files, setFiles] = useState<JobFile[] | null>(null);
+  useEffect(() => {
+    void attempt(api.jobFiles(job.id)).then((list) => {
+      // A film matters more than its pictures.
+      if (list) setFiles(list.files.toSorted((a, b) => Number(b.media_type.startsWith('video')) - Number(a.media_type.startsWith('video'))));
+    });
+  }, [job.id]);
+  if (!files) return null;
+  return (
+    <ul class="files">
+      {files.slice(0, MANY_FILES).map((file) => (
+        <li>
+          <a class="button" href={api.jobFile(job.id, file.name)} download={file.name}>
+            <Icon name="download" /> {file.name}
+          </a>
+        </li>
+      ))}
+      {files.length > MANY_FILES && <li class="facts">and {files.length - MANY_FILES} more, by the API</li>}
+    </ul>
   );
 }
 
@@ -169,7 +215,7 @@ function Assets() {
                 {asset.has_thumbnail ? <img src={api.assetThumb(asset)} alt="" loading="lazy" /> : <span class="no-thumb" aria-hidden="true"><Icon name="frame" /></span>}
                 <span class="asset-text">
                   <strong>{asset.name}</strong>
-                  <span>{asset.surfel_count > 0 ? `${asset.surfel_count.toLocaleString()} surfels` : `${asset.face_count.toLocaleString()} faces`}</span>
+                  <span>{asset.version > 1 ? `version ${asset.version} · ` : ''}{asset.surfel_count > 0 ? `${asset.surfel_count.toLocaleString()} surfels` : `${asset.face_count.toLocaleString()} faces`}</span>
                 </span>
               </button>
             </li>

@@ -1,9 +1,10 @@
 /** The object as matter: what it is made of, how it falls, and a timeline to play it. Frames are computed as they are first shown. */
 
 import { computed, effect, signal } from '@preact/signals';
-import type { Edit, SimulateEdit } from '../protocol.gen';
+import { startJob } from '../jobs';
+import type { Edit, PoseEdit, SimulateEdit } from '../protocol.gen';
 import { editTime, replaceEdits } from '../session';
-import { draft, edits, pending, session } from '../state';
+import { clipSeconds, draft, edits, jobs, pending, session } from '../state';
 import { Choice, Section, Slider, Switch } from './fields';
 
 const PRESETS = ['jelly', 'rubber', 'clay', 'sand', 'snow', 'honey'] as const;
@@ -22,21 +23,36 @@ const speed = signal('1');
 const PARTICLES = { quick: 4000, fine: 20_000 };
 const FPS = 24;
 
-const running = computed(() => (edits.value.findLast((edit) => edit.op === 'simulate') as SimulateEdit | undefined) ?? null);
-const durationOf = (edit: SimulateEdit) => Number(edit.scene.duration ?? 2);
+type Moving = SimulateEdit | PoseEdit;
+const moves = (edit: Edit): edit is Moving => edit.op === 'simulate' || edit.op === 'pose';
+const running = computed(() => edits.value.findLast(moves) ?? null);
+const LONGEST_CLIP = 5;
+const durationOf = (edit: Moving) => (edit.op === 'simulate' ? Number(edit.scene.duration ?? 2) : (clipSeconds.value[jobOfClip(edit.clip)] ?? LONGEST_CLIP));
+const jobOfClip = (clip: string) => clip.replace(/^clips\//, '');
+const clips = computed(() => jobs.value.filter((job) => job.kind === 'simulate' && job.clip !== null && job.source_asset === session.value?.asset));
 
-function start(height: number, foot: number): void {
+function sceneOf(height: number, foot: number): Record<string, unknown> {
   const matter = stiffness.value === null ? { preset: preset.value } : { preset: preset.value, young_modulus: 1000 * 10 ** stiffness.value };
   const ground = floor.value ? { height: foot - drop.value * height, friction: 0.5 } : null;
-  const scene = { matter, floor: ground, duration: seconds.value, fps: FPS, particles: fine.value ? PARTICLES.fine : PARTICLES.quick };
-  const others = edits.value.filter((edit) => edit.op !== 'simulate');
-  replaceEdits([...others, { op: 'simulate', scene, time: 0 }]);
+  return { matter, floor: ground, duration: seconds.value, fps: FPS, particles: fine.value ? PARTICLES.fine : PARTICLES.quick };
+}
+
+/** From the first moment on, in place of whatever moved before. */
+function start(edit: Moving): void {
+  replaceEdits([...edits.value.filter((other) => !moves(other)), edit]);
   playing.value = true;
 }
 
 function stop(): void {
   playing.value = false;
-  replaceEdits(edits.value.filter((edit) => edit.op !== 'simulate'));
+  replaceEdits(edits.value.filter((edit) => !moves(edit)));
+}
+
+/** On a worker, so that the picture is not held up; the clip can be played when it is done, and rendered by other jobs. */
+async function bake(scene: Record<string, unknown>): Promise<void> {
+  const open = session.value!;
+  const job = await startJob({ kind: 'simulate', asset: open.asset, name: `${open.assetName}, ${preset.value}`, scene });
+  if (job) clipSeconds.value = { ...clipSeconds.value, [job.id]: seconds.value };
 }
 
 /** Next frame of the film once the server has taken the last one: it plays as fast as it is computed, never faster than life. */
@@ -56,7 +72,7 @@ effect(() => {
   return () => clearInterval(timer);
 });
 
-function seek(edit: SimulateEdit, time: number): void {
+function seek(edit: Moving, time: number): void {
   const next: Edit = { ...edit, time: Math.round(time * 1000) / 1000 };
   editTime(next);
 }
@@ -83,13 +99,27 @@ export function Simulation({ height, foot }: { height: number; foot: number }) {
       <Slider label="Length" unit="s" value={seconds.value} min={0.25} max={5} step={0.25} onChange={(value) => (seconds.value = value)} />
       <Switch label="Fine (slow)" value={fine.value} onChange={(value) => (fine.value = value)} />
       <div class="buttons">
-        <button class="primary" onClick={() => start(height, foot)}>
+        <button class="primary" onClick={() => start({ op: 'simulate', scene: sceneOf(height, foot), time: 0 })}>
           {edit ? 'Start again' : 'Let it go'}
+        </button>
+        <button title="Compute all of it on a worker first" onClick={() => void bake(sceneOf(height, foot))}>
+          Bake as a job
         </button>
         {edit && <button onClick={stop}>Remove</button>}
       </div>
+      {clips.value.length > 0 && (
+        <ul class="files" aria-label="Clips">
+          {clips.value.map((job) => (
+            <li>
+              <button aria-pressed={edit?.op === 'pose' && edit.clip === job.clip} onClick={() => start({ op: 'pose', clip: job.clip!, time: 0 })}>
+                Play {job.name}
+              </button>
+            </li>
+          ))}
+        </ul>
+      )}
       {edit && (
-        <div class="timeline">
+        <div class="timeline" role="group" aria-label="Timeline">
           <button onClick={() => (playing.value = !playing.value)}>{playing.value ? 'Pause' : 'Play'}</button>
           <Slider label="Time" unit="s" value={edit.time} min={0} max={durationOf(edit)} step={0.01} onChange={(value) => { playing.value = false; seek(edit, value); }} />
           <Choice label="Speed" value={speed.value} options={['0.25', '0.5', '1'].map((value) => ({ value, text: `${value}×` }))} onChange={(value) => (speed.value = value)} />

@@ -1,0 +1,179 @@
+"""What a user of the viewer waits for, measured in Chromium with software GL on a server of this machine.
+
+    python -m benchmarks viewer [--mesh FILE] [--json]
+
+edit_to_pixel_ms: from a slider's event to the first changed picture on the screen, which the browser draws itself; edit_to_traced_ms: to the
+first traced picture of that edit. local_fps: pictures a second that the browser draws while the camera turns, 800x600. traced_fps: pictures
+a second from the server while the camera turns, 400x400. reconnect_s: from the server answering again to the page showing it.
+bundle_gz_kb: all built files, gzipped. Medians of the repeats.
+"""
+
+import argparse
+import gzip
+import json
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from tests.web.browser import CHROMIUM_ARGUMENTS, ROOT, RunningServer, chromium_path, write_ball
+
+REPEATS = 7
+TURN_SECONDS = 3.0
+WAIT_MS = 60_000
+
+TIME_EDIT = """async (value) => {
+  const stage = document.querySelector('.stage');
+  const slider = document.querySelector('#slider-roughness');
+  const seen = { pixel: null, traced: null };
+  const revision = Number(stage.dataset.revision);
+  const frames = stage.dataset.localFrames;
+  const done = new Promise((resolve) => {
+    const observer = new MutationObserver(() => {
+      const now = performance.now();
+      const traced = Number(stage.dataset.revision) > revision;
+      if (seen.pixel === null && (stage.dataset.localFrames !== frames || traced)) seen.pixel = now - start;
+      if (traced) {
+        seen.traced = now - start;
+        observer.disconnect();
+        resolve(seen);
+      }
+    });
+    observer.observe(stage, { attributes: true });
+  });
+  const start = performance.now();
+  slider.value = value;
+  slider.dispatchEvent(new Event('input', { bubbles: true }));
+  slider.dispatchEvent(new Event('change', { bubbles: true }));
+  return done;
+}"""
+SETTLED = "document.querySelector('.stage').dataset.fresh === 'true' && document.querySelector('.stage').dataset.moving === 'false'"
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks viewer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--mesh", type=Path, help="GLB, PLY, OBJ or a zipped asset; a ball of 1280 faces without it")
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args(arguments)
+    print(json.dumps(measure(given.mesh), indent=None if given.json else 1))
+
+
+def measure(mesh: Path | None) -> dict[str, float]:
+    """Start a server and a browser, and take all figures.
+
+    Raises:
+        ValueError: the viewer is not built, or no Chromium is there.
+    """
+    if not (ROOT / "server" / "static" / "index.html").is_file():
+        raise ValueError("the viewer is not built; run: python web/build.py")
+    with tempfile.TemporaryDirectory(prefix="drgs-viewer-") as folder:
+        if mesh is None:
+            write_ball(mesh := Path(folder) / "ball.ply")
+        server = RunningServer(Path(folder) / "data")
+        try:
+            server.start()
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
+                result = _measure_edits_and_local(browser, server, mesh)
+                result |= _measure_traced(browser, server)
+                browser.close()
+        except RuntimeError as error:
+            raise ValueError(str(error)) from error
+        finally:
+            server.stop()
+    return result | {"bundle_gz_kb": round(bundle_bytes() / 1000, 1)}
+
+
+def bundle_bytes() -> int:
+    """Of all that a browser may fetch of the page, each file gzipped."""
+    return sum(len(gzip.compress(path.read_bytes(), 6)) for path in (ROOT / "server" / "static").rglob("*") if path.is_file())
+
+
+def _open(browser: Browser, server: RunningServer, width: int, height: int, local: bool) -> Page:
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.add_init_script(
+        f"localStorage.setItem('drgs.localPicture', '{str(local).lower()}'); localStorage.setItem('drgs.libraryOpen', 'true')"
+    )
+    page.goto(f"{server.address}/#token={server.token}")
+    return page
+
+
+def _wait(page: Page, condition: str) -> None:
+    # Not Playwright's wait_for_function: the server's content policy forbids the eval that it needs.
+    deadline = time.monotonic() + WAIT_MS / 1000
+    while not page.evaluate(condition):
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"waited {WAIT_MS / 1000:g} s in the viewer for: {condition}")
+        page.wait_for_timeout(20)
+
+
+def _settle(page: Page) -> None:
+    _wait(page, SETTLED)
+
+
+def _turn(page: Page, counter: str) -> float:
+    """Changes a second of a count of pictures while the camera is dragged."""
+    box = page.locator(".stage").bounding_box()
+    assert box is not None
+    x, y = box["width"] / 2, box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 20, y, steps=5)
+    count = f"Number(document.querySelector('.stage').dataset.{counter} ?? 0)"
+    first, start, step = page.evaluate(count), time.perf_counter(), 0
+    while time.perf_counter() - start < TURN_SECONDS:
+        step += 1
+        page.mouse.move(x + 60 * (step % 20 if step % 40 < 20 else 20 - step % 20) / 20, y)
+        page.wait_for_timeout(5)
+    rate = (page.evaluate(count) - first) / (time.perf_counter() - start)
+    page.mouse.up()
+    return rate
+
+
+def _measure_edits_and_local(browser: Browser, server: RunningServer, mesh: Path) -> dict[str, float]:
+    page = _open(browser, server, 800, 600, local=True)
+    page.get_by_label("Capture or mesh").set_input_files(mesh)
+    page.locator("#slider-roughness").wait_for(timeout=WAIT_MS)
+    page.get_by_role("button", name="Library").click()
+    _settle(page)
+    times = []
+    for repeat in range(REPEATS + 1):
+        times.append(page.evaluate(TIME_EDIT, 0.2 + 0.05 * repeat))
+        _settle(page)
+    times = times[1:]  # the first one compiles shaders and kernels
+    fps = _turn(page, "localFrames")
+    server.stop()
+    page.get_by_text("Reconnecting…").wait_for(timeout=WAIT_MS)
+    server.start()
+    answering = time.perf_counter()
+    page.get_by_text("Reconnecting…").wait_for(state="hidden", timeout=WAIT_MS)
+    reconnect = time.perf_counter() - answering
+    page.close()
+    return {
+        "edit_to_pixel_ms": round(statistics.median(entry["pixel"] for entry in times), 1),
+        "edit_to_traced_ms": round(statistics.median(entry["traced"] for entry in times), 1),
+        "local_fps": round(fps, 1),
+        "reconnect_s": round(reconnect, 2),
+    }
+
+
+def _measure_traced(browser: Browser, server: RunningServer) -> dict[str, float]:
+    page = _open(browser, server, 400, 400, local=False)
+    page.locator(".asset").first.click()
+    page.locator("#slider-roughness, .hud").first.wait_for(timeout=WAIT_MS)
+    page.keyboard.press("l")
+    page.keyboard.press("i")
+    _wait(page, "Number(document.querySelector('.stage').dataset.samples ?? 0) > 8")
+    fps = _turn(page, "tracedFrames")
+    page.close()
+    return {"traced_fps": round(fps, 1)}
+
+
+if __name__ == "__main__":
+    import sys
+
+    main(sys.argv[1:])

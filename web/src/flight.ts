@@ -1,0 +1,64 @@
+/** The flying camera: W A S D move, Q and E sink and rise, dragging turns the head. */
+
+import CameraControls from 'camera-controls';
+import { Vector3, type PerspectiveCamera, type Sphere } from 'three';
+import { flying } from './state';
+
+/** In object radii a second; shift makes it so many times faster, alt slower. */
+const SPEED = 0.8;
+const FACTOR = 4;
+/** Physical keys, so that they lie together on every keyboard. */
+const CODES = ['KeyW', 'KeyA', 'KeyS', 'KeyD', 'KeyQ', 'KeyE'];
+
+export class Flight {
+  private readonly held = new Set<string>();
+  private on = false;
+
+  constructor(
+    private readonly camera: PerspectiveCamera,
+    private readonly controls: CameraControls,
+    private readonly bounds: Sphere,
+  ) {
+    window.addEventListener('keydown', (event) => {
+      const typing = event.target instanceof HTMLElement && event.target.matches('input, textarea, select');
+      if (!this.on || typing || event.ctrlKey || event.metaKey || !(CODES.includes(event.code) || /^(Shift|Alt)/.test(event.code))) return;
+      this.held.add(event.code);
+      event.preventDefault();
+    });
+    window.addEventListener('keyup', (event) => this.held.delete(event.code));
+    window.addEventListener('blur', () => this.held.clear());
+  }
+
+  /** Start or end, from where the camera is. */
+  turn(on: boolean): void {
+    if (on === this.on) return;
+    this.on = on;
+    this.held.clear();
+    const { camera, controls, bounds } = this;
+    const eye = camera.position.clone();
+    const forward = camera.getWorldDirection(new Vector3());
+    // Orbiting at no distance turns the head; dragging the picture then is the other way round.
+    const distance = on ? 1e-4 * bounds.radius : Math.max(0.3 * bounds.radius, bounds.center.clone().sub(eye).dot(forward));
+    controls.minDistance = on ? distance : 0.05 * bounds.radius;
+    controls.maxDistance = on ? distance : 60 * bounds.radius;
+    controls.azimuthRotateSpeed = controls.polarRotateSpeed = on ? -0.3 : 1;
+    // The wheel's step would be a share of no distance.
+    controls.mouseButtons.wheel = on ? CameraControls.ACTION.NONE : CameraControls.ACTION.DOLLY;
+    const target = eye.clone().addScaledVector(forward, distance);
+    void controls.setFocalOffset(0, 0, 0, false);
+    void controls.setLookAt(eye.x, eye.y, eye.z, target.x, target.y, target.z, false);
+  }
+
+  /** Once each animation frame. */
+  move(seconds: number): void {
+    if (!flying.value || this.held.size === 0) return;
+    const has = (...codes: string[]) => (codes.some((code) => this.held.has(code)) ? 1 : 0);
+    const faster = has('ShiftLeft', 'ShiftRight') ? FACTOR : has('AltLeft', 'AltRight') ? 1 / FACTOR : 1;
+    const step = SPEED * faster * this.bounds.radius * Math.min(seconds, 0.1);
+    const move = this.camera.getWorldDirection(new Vector3()).multiplyScalar((has('KeyW') - has('KeyS')) * step);
+    move.addScaledVector(new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0), (has('KeyD') - has('KeyA')) * step);
+    move.addScaledVector(this.camera.up, (has('KeyE') - has('KeyQ')) * step);
+    const target = this.controls.getTarget(new Vector3()).add(move);
+    void this.controls.moveTo(target.x, target.y, target.z, true);
+  }
+}

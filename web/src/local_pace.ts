@@ -1,0 +1,33 @@
+/** How sharp the local picture may be while it moves: fewer pixels where pictures come too slowly, more where there is room. */
+
+/** Shares of the screen's own sharpness; slow machines go down this list. */
+const SCALES = [1, 0.75, 0.55, 0.4, 0.3];
+const SLOW_FRAME_MS = 40;
+const AIMED_FRAME_MS = 25;
+const QUICK_FRAME_MS = 17.5;
+const FRAMES_BEFORE_STEP = 4;
+
+export class LocalPace {
+  private step = 0;
+  /** Running mean of the time between two moving pictures. */
+  private frameMs = AIMED_FRAME_MS;
+  private framesMeasured = 0;
+
+  get scale(): number {
+    return SCALES[this.step]!;
+  }
+
+  /** Take in the time since the last moving picture; true where the scale changed. Time goes with the number of pixels. */
+  measure(elapsedMs: number): boolean {
+    this.frameMs += 0.4 * (Math.min(elapsedMs, 500) - this.frameMs);
+    if (++this.framesMeasured < FRAMES_BEFORE_STEP || (this.frameMs < SLOW_FRAME_MS && this.frameMs > QUICK_FRAME_MS)) return false;
+    const wanted = this.scale * Math.sqrt(AIMED_FRAME_MS / this.frameMs);
+    const fitting = SCALES.findIndex((scale) => scale <= wanted * 1.05);
+    const next = fitting < 0 ? SCALES.length - 1 : Math.max(fitting, this.step - 1);
+    this.framesMeasured = 0;
+    if (next === this.step) return false;
+    this.step = next;
+    this.frameMs = AIMED_FRAME_MS; // measure anew before the next step
+    return true;
+  }
+}
