@@ -81,6 +81,8 @@ def measure(given: argparse.Namespace, folder: Path) -> dict:
             sessions = [client.open_session(asset) for _ in range(given.sessions)]
             _queue_jobs(folder / "data", given.jobs)
             width, _, height = given.size.partition("x")
+            for session in sessions:  # kernels are compiled once a machine; that is not what is measured
+                session.frame(int(width), int(height), spp=8)
             memory, probes, seen = asyncio.run(
                 _load(client, server.pid, [session.id for session in sessions], given, int(width), int(height))
             )

@@ -20,6 +20,7 @@ from worker.logs import set_up_logging
 from worker.settings import read_settings
 
 LONGEST_RESTART_SECONDS = 60.0
+SWITCH_SECONDS = 0.001
 QUICK_DEATH_SECONDS = 10.0
 """A worker that lived shorter than this is started again later and later."""
 
@@ -52,6 +53,8 @@ def serve(
     set_up_logging(settings.log_format)
     # torch's idle threads would otherwise spin, and server and worker share the cores; read when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Python's lock is passed on sooner than after its usual 5 ms: an answer needs it several times while the render thread wants it, too.
+    sys.setswitchinterval(SWITCH_SECONDS)
     directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
     app = create_app(settings)
     # ws_per_message_deflate costs a third of the frame rate at 1080p and gains nothing on JPEG.

@@ -127,6 +127,12 @@ def main(arguments: list[str]) -> int:
                 make_version(Path(asset), Path(out), Path(edits), Path(environments), int(version))
             case _:
                 raise ValueError(f"expected asset, environment, export or version with their arguments; found {arguments}")
+    except RecursionError:
+        print("the file is nested deeper than is read here", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print(f"the file needs more memory than the {MEMORY_BYTES >> 30} GiB that reading one may take", file=sys.stderr)
+        return 2
     except (ValueError, OSError) as error:
         print(str(error).replace("\n", " "), file=sys.stderr)
         return 2
