@@ -43,7 +43,7 @@ LIMITS = """
 - **Distance**: the mesh may lie up to 1e5 times its own span from the origin; further is refused. Vertices are float32: at a distance of
   1e3 spans shape and shadows are off by a thousandth of the span at most, at 1e5 spans a silhouette moves by pixels, as the table shows.
 - **Triangles without area, doubled or sharing edges with more than one other** change nothing. Two triangles at one place that face opposite
-  ways do: the ray meets either, and a back is black. Nobody is told; give such sheets a thickness.
+  ways do: the ray meets either, and a back is black. `drgs import` warns of them; give such sheets a thickness.
 - **Normals**: where a vertex normal faces away from the camera on a triangle that faces it, the point is black, as in any path tracer.
 - **Pictures** of no area are refused.
 - **Surfels** of no area are not drawn. Opacity is cut at 0.99, below 1/255 nothing is drawn.

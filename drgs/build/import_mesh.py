@@ -8,6 +8,7 @@ z up; PLY and OBJ coordinates are taken as they are. Textures are read only from
 
 import json
 import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,7 +95,25 @@ def _mesh_from_parts(parts: list[_Part], name: str) -> TriangleMesh:
     agreement = (face_normals * normals[faces.long()].sum(1)).sum(-1)
     if (agreement < 0).sum() > (agreement > 0).sum():  # wound clockwise, yet with outward normals
         faces = faces[:, [0, 2, 1]].contiguous()
+    doubled = _faces_on_faces_turned_over(vertices, faces)
+    if doubled:
+        warnings.warn(
+            f"{name}: {doubled} triangles lie on others that face the other way; a ray meets either one, and a back is black: "
+            "give such sheets a thickness or keep one side",
+            stacklevel=3,
+        )
     return TriangleMesh(vertices, faces, normals, **{key: values.clamp(0, 1) for key, values in materials.items()})
+
+
+def _faces_on_faces_turned_over(vertices: torch.Tensor, faces: torch.Tensor) -> int:
+    """Number of triangles whose corners lie where those of another triangle do that faces the other way."""
+    corners = vertices[faces.long()].double()
+    low, middle = corners.amin(1), corners.sum(1)  # the same in any order of the corners: sums of three float32 are exact
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    order = torch.from_numpy(np.lexsort([*middle.T.numpy(), *low.T.numpy()]))
+    low, middle, normals = low[order], middle[order], normals[order]
+    same = (low[1:] == low[:-1]).all(-1) & (middle[1:] == middle[:-1]).all(-1)
+    return int((same & ((normals[1:] * normals[:-1]).sum(-1) < 0)).sum())
 
 
 def _read_ply(path: Path) -> list[_Part]:

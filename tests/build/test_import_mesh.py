@@ -164,3 +164,21 @@ def test_wrong_meshes_are_refused_with_a_sentence(tmp_path):
         with pytest.raises(ValueError, match=sentence) as caught:
             import_mesh(tmp_path / name)
         assert str(caught.value).startswith(str(tmp_path / name))
+
+
+@pytest.mark.parametrize("own_corners", [False, True])
+def test_sheets_of_two_sides_at_one_place_bring_a_warning(tmp_path, own_corners):
+    turned = FACES[:2, [1, 0, 2]]
+    vertices, faces = VERTICES, np.concatenate([FACES, turned])
+    if own_corners:  # as exporters write them that give each side its normals
+        vertices, faces = np.concatenate([VERTICES, VERTICES]), np.concatenate([FACES, turned + 4])
+    columns = {"vertex": dict(zip("xyz", np.ascontiguousarray(vertices.T), strict=True))}
+    (tmp_path / "a.ply").write_bytes(encode_ply(columns, faces))
+    with pytest.warns(UserWarning, match=r"2 triangles lie on others"):
+        import_mesh(tmp_path / "a.ply")
+
+
+def test_triangles_that_only_share_an_edge_or_are_repeated_bring_none(tmp_path, recwarn):
+    (tmp_path / "a.ply").write_bytes(encode_ply(vertex_columns(), np.concatenate([FACES, FACES[:2], FACES[2:, [1, 2, 0]]])))
+    import_mesh(tmp_path / "a.ply")
+    assert len(recwarn) == 0
