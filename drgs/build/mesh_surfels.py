@@ -5,6 +5,7 @@ the face's normal. Where Alg. 1 is silent or wrong we do otherwise, and `variant
 
     what                     here                                                          paper
     shape and in-plane axes  second moment of the triangle, slivers widened                isotropic, spacing of face centres, any angle
+    normal                   of the surfels nearby, where they agree with the face         the face's
     offset                   mean offset of the face's candidates                          0
     offset's unit            mean edge of the face (finite for slivers)                    circumradius
     opacity without          what the fitted surfels amount to there, at least 0.1         0.1 (the smallest repair: it says nothing)
@@ -129,13 +130,16 @@ def mesh_surfels(
         elsewhere = gathered_opacity(frames.center, gaussians).clamp(min=EMPTY_OPACITY)
     opacity = torch.where(has, opacity, elsewhere).clamp(max=FULL_OPACITY)
 
+    around = vertex_weights(frames.center, frames.rotation[:, :, 2], gaussians)
     # Materials and colour: one table of everything, averaged over candidates, or over what lies nearby.
     parts = [gaussians.sh.flatten(1), gaussians.albedo, gaussians.roughness[:, None], gaussians.metallic[:, None]]
     table = torch.cat(parts, 1)
     weight = opacities[inside]
     own = _sums(table[inside] * weight[:, None], face, len(count)) / _sums(weight, face, len(count)).clamp(min=1e-12)[:, None]
-    nearby = average_surfels(table, *vertex_weights(frames.center, frames.rotation[:, :, 2], gaussians))
+    nearby = average_surfels(table, *around)
     sh, albedo, roughness, metallic = torch.where(has[:, None], own, nearby).split([part.shape[1] for part in parts], 1)
+
+    rotation = frames.rotation if variant == "paper" else turned_frames(frames.rotation, gaussians, *around)
 
     kept = (frames.area > NO_AREA * frames.area.median()).nonzero().squeeze(1)
     binding = Binding(kept.int(), barycentric[kept], offset[kept])
@@ -143,7 +147,7 @@ def mesh_surfels(
         Gaussians(
             centers=points_from_binding(binding, mesh.vertices, mesh.faces),
             log_scales=frames.scales[kept].log(),
-            quats_wxyz=quat_wxyz_from_rotation(frames.rotation[kept]),
+            quats_wxyz=quat_wxyz_from_rotation(rotation[kept]),
             opacity_logits=torch.logit(opacity[kept]),
             sh=sh[kept].reshape(-1, *gaussians.sh.shape[1:]),
             albedo=albedo[kept],
@@ -162,6 +166,19 @@ def gathered_opacity(points: Tensor, gaussians: Gaussians) -> Tensor:
     local = ((points[:, None] - gaussians.centers[indices])[..., None, :] @ rotation).squeeze(-2)
     within = (local[..., :2] / scales).square().sum(-1) + (local[..., 2] / scales.amax(-1)).square()
     return 1 - (1 - torch.sigmoid(gaussians.opacity_logits)[indices] * torch.exp(-0.5 * within)).prod(-1)
+
+
+def turned_frames(rotation: Tensor, gaussians: Gaussians, indices: Tensor, weights: Tensor) -> Tensor:
+    """Frames (face, 3, 3) whose normal is the mean of the surfels' (face, k) around, t_u turned with it; as they were where that mean
+    leans more than 60 degrees from the face: at edges, and where nothing is near."""
+    own = rotation[:, :, 2]
+    normals = rotation_from_quat_wxyz(gaussians.quats_wxyz)[:, :, 2][indices]
+    normals = normals * torch.where((normals * own[:, None]).sum(-1, keepdim=True) < 0, -1.0, 1.0)  # a surfel has two sides
+    mean = torch.nn.functional.normalize((normals * weights[..., None]).sum(1), dim=-1)
+    normal = torch.where((mean * own).sum(-1, keepdim=True) > 0.5, mean, own)
+    t_u = rotation[:, :, 0] - (rotation[:, :, 0] * normal).sum(-1, keepdim=True) * normal
+    t_u = torch.nn.functional.normalize(t_u, dim=-1)
+    return torch.stack([t_u, torch.linalg.cross(normal, t_u), normal], -1)
 
 
 def _sums(values: Tensor, index: Tensor, count: int) -> Tensor:

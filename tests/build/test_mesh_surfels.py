@@ -116,6 +116,22 @@ def test_scales_and_axes_follow_the_triangles_second_moment():
     assert torch.allclose(frame.rotation[0, :, 2], turn[:, 2], atol=1e-6)
 
 
+def test_normals_are_the_surfels_where_they_agree_with_the_face_and_the_faces_elsewhere():
+    mesh = one_triangle([0, 0, 0], [1, 0, 0], [0, 1, 0])
+    fitted = surfel_sphere(8)
+    fitted = replace(fitted, centers=torch.tensor([0.3, 0.3, 0.01]) + 0.01 * fitted.centers, opacity_logits=torch.full((8,), 3.0))
+    for angle, expected in ((0.4, 0.4), (1.3, 0.0)):  # turned about x, one half of them seen from behind
+        turned = torch.tensor(
+            [[math.cos(angle / 2), math.sin(angle / 2), 0, 0]] * 4 + [[-math.sin(angle / 2), math.cos(angle / 2), 0, 0]] * 4
+        )
+        gaussians, _ = mesh_surfels(replace(fitted, quats_wxyz=turned), mesh)
+        frame = rotation_from_quat_wxyz(gaussians.quats_wxyz)[0]
+        assert torch.allclose(frame[:, 2], torch.tensor([0, -math.sin(expected), math.cos(expected)]), atol=1e-5)
+        assert torch.allclose(frame.T @ frame, torch.eye(3), atol=1e-5)
+        printed = rotation_from_quat_wxyz(mesh_surfels(replace(fitted, quats_wxyz=turned), mesh, "paper")[0].quats_wxyz)[0]
+        assert torch.allclose(printed[:, 2], torch.tensor([0.0, 0, 1]), atol=1e-6)
+
+
 def test_slivers_get_bounded_scales_and_faces_without_area_get_nothing():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 1e-4, 0], [4, 0, 0]])
     faces = torch.tensor([[0, 1, 2], [0, 4, 3], [0, 1, 4]])  # a good one, a sliver, one without area
