@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Literal, TypeVar
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import httpx
 from pydantic import BaseModel, TypeAdapter
@@ -39,6 +39,8 @@ from server.rest_records import (
     JobList,
     SessionInfo,
     SessionList,
+    SnapshotInfo,
+    SnapshotList,
 )
 from worker.requests import ExportRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 
@@ -167,8 +169,13 @@ class Client:
 
     # ---- assets and environments ------------------------------------------------------------------------------------
 
-    def assets(self, limit: int = 50, offset: int = 0) -> AssetList:
-        return self._call("GET", "/api/assets", AssetList, params={"limit": limit, "offset": offset})
+    def assets(self, limit: int = 50, offset: int = 0, search: str | None = None) -> AssetList:
+        """
+        Args:
+            search: part of the name, whatever its case.
+        """
+        found = {"search": search} if search else {}
+        return self._call("GET", "/api/assets", AssetList, params={"limit": limit, "offset": offset, **found})
 
     def asset(self, asset_id: str) -> AssetInfo:
         return self._call("GET", f"/api/assets/{asset_id}", AssetInfo)
@@ -178,7 +185,11 @@ class Client:
         return self._upload("/api/assets", path, name, AssetInfo)
 
     def delete_asset(self, asset_id: str) -> None:
+        """`undelete_asset` brings it back for a day."""
         self._request("DELETE", f"/api/assets/{asset_id}")
+
+    def undelete_asset(self, asset_id: str) -> AssetInfo:
+        return self._call("POST", f"/api/assets/{asset_id}/undelete", AssetInfo)
 
     def export(self, asset_id: str, format: Literal["ply", "ply3", "glb", "usd", "env", "zip"], out: Path) -> None:
         """Write the asset to the file `out`, in another program's format."""
@@ -245,16 +256,37 @@ class RemoteSession:
     def info(self) -> SessionInfo:
         return self._client._call("GET", f"/api/sessions/{self.id}", SessionInfo)
 
-    def edit(self, edit: Edit | dict) -> EditLog:
-        """Append an edit (drgs.scene.edits, or the same as plain data)."""
+    def edit(self, edit: Edit | dict, key: str | None = None) -> EditLog:
+        """Append an edit (drgs.scene.edits, or the same as plain data).
+
+        Args:
+            key: the same one appends one edit, however often it is sent.
+        """
+        headers = {"Idempotency-Key": key} if key else {}
         values = _edit.dump_python(_edit.validate_python(edit), mode="json", exclude_none=True)
-        return self._client._call("POST", f"/api/sessions/{self.id}/edits", EditLog, json={"edit": values}, timeout=600)
+        return self._client._call("POST", f"/api/sessions/{self.id}/edits", EditLog, json={"edit": values}, headers=headers, timeout=600)
 
     def undo(self) -> EditLog:
         return self._client._call("POST", f"/api/sessions/{self.id}/undo", EditLog, timeout=600)
 
     def redo(self) -> EditLog:
         return self._client._call("POST", f"/api/sessions/{self.id}/redo", EditLog, timeout=600)
+
+    def snapshots(self) -> list[SnapshotInfo]:
+        """Oldest first."""
+        return self._client._call("GET", f"/api/sessions/{self.id}/snapshots", SnapshotList).snapshots
+
+    def take_snapshot(self, name: str) -> SnapshotInfo:
+        """Keep the edits in force under a name; the same name is overwritten."""
+        return self._client._call("PUT", f"/api/sessions/{self.id}/snapshots/{quote(name, safe='')}", SnapshotInfo)
+
+    def restore_snapshot(self, name: str) -> EditLog:
+        """Put a snapshot's edits in place of those in force; one step of undo."""
+        return self._client._call("POST", f"/api/sessions/{self.id}/snapshots/{quote(name, safe='')}/restore", EditLog, timeout=600)
+
+    def save(self, name: str | None = None) -> AssetInfo:
+        """A new version of the asset with the edits in force put into it."""
+        return self._client._call("POST", f"/api/sessions/{self.id}/save", AssetInfo, json={"name": name}, timeout=600)
 
     def frame(
         self,

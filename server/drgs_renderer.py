@@ -10,6 +10,7 @@ import copy
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from server.render_session import (
     AbstractPose,
     AbstractRenderer,
     Bounds,
+    Explanation,
     Picked,
     Pixels,
     view_of_bounds,
@@ -74,7 +76,7 @@ class LoadedAsset(AbstractLoadedAsset):
         from drgs.deform.pose_scene import pose_scene
 
         scene = pose_scene(self.asset, edits, self._environments, environments=self._environment, confine=True)
-        return Pose(scene, self._tracer(scene, previous))
+        return Pose(self.asset, scene, self._tracer(scene, previous))
 
     def _tracer(self, scene: "PosedScene", previous: AbstractPose | None) -> "AbstractTracer":
         from drgs.render.trace_rays import build_tracer
@@ -110,8 +112,20 @@ class LoadedAsset(AbstractLoadedAsset):
 class Pose(AbstractPose):
     """Final."""
 
+    asset: "Asset"
     scene: "PosedScene"
     tracer: "AbstractTracer"
+
+    def region_at(self, position_world: "Tensor") -> int:
+        """Selections refer to the object at rest, whose vertices have the numbers of the moved ones."""
+        vertex = int((self.scene.mesh.vertices - position_world).square().sum(-1).argmin())
+        return int(self._regions[vertex])
+
+    @cached_property
+    def _regions(self) -> "Tensor":
+        from drgs.scene.select_vertices import mesh_regions
+
+        return mesh_regions(self.asset.mesh)
 
     def begin(self, camera: CameraMessage, settings: Settings, width: int, height: int, previous: AbstractPicture | None) -> "Picture":
         from drgs.render.accumulate import start_frame
@@ -186,7 +200,15 @@ class Picture(AbstractPicture):
             albedo=tuple(maps.albedo[row, column].clamp(0, 1).tolist()),
             roughness=float(maps.roughness[row, column]),
             metallic=float(maps.metallic[row, column]),
+            region=self.pose.region_at(maps.position_world[row, column]),
         )
+
+    def explain(self) -> Explanation:
+        from drgs.render.accumulate import resolve_frame
+
+        seconds = resolve_frame(self._state).metadata["seconds"]
+        skips = tuple((skip.what, skip.why, skip.bound) for skip in self._state.plan.skips)
+        return Explanation({step: float(value) for step, value in seconds.items()}, skips)
 
 
 def _samples_a_pass(state: "FrameState") -> int:

@@ -160,8 +160,24 @@ class PickMessage(_Message):
     """Share of the height from the top."""
 
 
+class ExplainMessage(_Message):
+    """What the newest picture cost, and what was left out of it, and why."""
+
+    type: Literal["explain"]
+    id: Number
+
+
 ClientMessage = Annotated[
-    ClientHello | CameraMessage | EditMessage | UndoMessage | RedoMessage | AckMessage | SettingsMessage | VisibilityMessage | PickMessage,
+    ClientHello
+    | CameraMessage
+    | EditMessage
+    | UndoMessage
+    | RedoMessage
+    | AckMessage
+    | SettingsMessage
+    | VisibilityMessage
+    | PickMessage
+    | ExplainMessage,
     Field(discriminator="type"),
 ]
 client_message = TypeAdapter(ClientMessage)
@@ -255,6 +271,31 @@ class PickedMessage(_Answer):
     albedo: Vector | None = None
     roughness: float | None = None
     metallic: float | None = None
+    region: int | None = None
+    """What a selection's `region` says for the patch of material here."""
+
+
+class SkippedWork(_Answer):
+    what: str
+    why: str
+    bound: str
+    """Of the difference it makes."""
+
+
+class ExplainedMessage(_Answer):
+    type: Literal["explained"] = "explained"
+    id: Number
+    revision: Number | None
+    """Of the log that the picture shows; None while there is no picture, and then nothing else says anything."""
+    samples: int
+    samples_target: int
+    seconds: dict[str, float]
+    """Spent on each step of the picture."""
+    skipped: list[SkippedWork]
+    frames_sent: int
+    frames_in_flight: int
+    round_trip_ms: float | None
+    """From a frame's sending to its acknowledgement, mean of the last ones."""
 
 
 class ErrorMessage(_Answer):
@@ -266,7 +307,7 @@ class ErrorMessage(_Answer):
 
 
 ServerMessage = Annotated[
-    ServerHello | StateMessage | AcceptedMessage | RejectedMessage | StatusMessage | PickedMessage | ErrorMessage,
+    ServerHello | StateMessage | AcceptedMessage | RejectedMessage | StatusMessage | PickedMessage | ExplainedMessage | ErrorMessage,
     Field(discriminator="type"),
 ]
 server_message = TypeAdapter(ServerMessage)

@@ -36,6 +36,18 @@ class Picked:
     albedo: tuple[float, float, float]
     roughness: float
     metallic: float
+    region: int | None = None
+    """Patch of material, as selections number them."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Of a picture."""
+
+    seconds: dict[str, float]
+    """Spent on each step."""
+    skipped: tuple[tuple[str, str, str], ...]
+    """What was left out, why, and a bound of the difference it makes."""
 
 
 class AbstractPicture(ABC):
@@ -60,6 +72,10 @@ class AbstractPicture(ABC):
     @abstractmethod
     def pick(self, x: float, y: float) -> Picked | None:
         """At shares of width and height; None where nothing is hit."""
+
+    @abstractmethod
+    def explain(self) -> Explanation:
+        """What it cost, and what was left out."""
 
 
 class AbstractPose(ABC):

@@ -22,12 +22,15 @@ from server.messages import (
     ClientHello,
     EditMessage,
     ErrorMessage,
+    ExplainedMessage,
+    ExplainMessage,
     PickedMessage,
     PickMessage,
     RedoMessage,
     RejectedMessage,
     ServerHello,
     SettingsMessage,
+    SkippedWork,
     StateMessage,
     StatusMessage,
     UndoMessage,
@@ -233,6 +236,8 @@ class Connection:
                 await self._changes.put(message)
             case PickMessage():
                 await self._pick(message)
+            case ExplainMessage():
+                await self._explain(message)
             case ClientHello():
                 self._say(ErrorMessage(message="`hello` was said already."))
         self._context.render_thread.wake()
@@ -288,5 +293,25 @@ class Connection:
                     albedo=picked.albedo,
                     roughness=picked.roughness,
                     metallic=picked.metallic,
+                    region=picked.region,
                 )
             )
+
+    async def _explain(self, message: ExplainMessage) -> None:
+        revision, picture, statistics = self.viewer.newest()
+        explained = None
+        if picture is not None:
+            explained = await asyncio.wrap_future(self._context.render_thread.call(picture.explain))
+        self._say(
+            ExplainedMessage(
+                id=message.id,
+                revision=revision,
+                samples=picture.samples if picture else 0,
+                samples_target=picture.samples_target if picture else 0,
+                seconds=explained.seconds if explained else {},
+                skipped=[SkippedWork(what=what, why=why, bound=bound) for what, why, bound in explained.skipped] if explained else [],
+                frames_sent=statistics.sent,
+                frames_in_flight=statistics.in_flight,
+                round_trip_ms=statistics.round_trip_ms,
+            )
+        )

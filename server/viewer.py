@@ -34,6 +34,8 @@ MOVING_SECONDS = 0.2
 STILL_FRAME_SECONDS = 0.25
 """Between two frames while samples add up; the first ones come as soon as their samples have doubled."""
 STATUS_SECONDS = 0.2
+ROUND_TRIP_WEIGHT = 0.2
+"""Of the newest measurement."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,15 @@ class Posed:
 
     revision: int
     pose: AbstractPose
+
+
+@dataclass(frozen=True)
+class FrameStatistics:
+    """Of what was sent to one client."""
+
+    sent: int
+    in_flight: int
+    round_trip_ms: float | None
 
 
 @dataclass(frozen=True)
@@ -88,6 +99,9 @@ class Viewer:
         self._input_at = -MOVING_SECONDS
         self._last_frame_id = 0
         self._acked_frame_id = 0
+        self._sent_at: dict[int, float] = {}
+        """Of frames that were not acknowledged yet; as many as may be in flight."""
+        self._round_trip: float | None = None
         self._progress: _Progress | None = None
         self._rendered_seconds = 0.0
         self._frame_seconds = 0.0
@@ -122,7 +136,14 @@ class Viewer:
     def acknowledge(self, frame_id: int) -> None:
         """This frame and those before it were shown or dropped."""
         with self._lock:
-            self._acked_frame_id = max(self._acked_frame_id, min(frame_id, self._last_frame_id))
+            acked = min(frame_id, self._last_frame_id)
+            if acked > self._acked_frame_id and (sent_at := self._sent_at.get(acked)) is not None:
+                trip = self._clock() - sent_at
+                before = self._round_trip
+                self._round_trip = trip if before is None else before + ROUND_TRIP_WEIGHT * (trip - before)
+            for known in [known for known in self._sent_at if known <= acked]:
+                del self._sent_at[known]
+            self._acked_frame_id = max(self._acked_frame_id, acked)
 
     def _touch(self) -> None:
         self._generation += 1
@@ -136,6 +157,17 @@ class Viewer:
     def picture(self) -> AbstractPicture | None:
         """The newest one, for picking; use it on the render thread."""
         return self._progress.picture if self._progress else None
+
+    def newest(self) -> tuple[int | None, AbstractPicture | None, FrameStatistics]:
+        """Revision of the log that the newest picture shows, the picture, and how sending goes."""
+        with self._lock:
+            progress, trip = self._progress, self._round_trip
+            statistics = FrameStatistics(
+                self._last_frame_id, self._last_frame_id - self._acked_frame_id, None if trip is None else 1e3 * trip
+            )
+        if progress is None:
+            return None, None, statistics
+        return progress.inputs.posed.revision, progress.picture, statistics
 
     @property
     def moving(self) -> bool:
@@ -221,6 +253,7 @@ class Viewer:
         with self._lock:
             self._last_frame_id += 1
             frame_id = self._last_frame_id
+            self._sent_at[frame_id] = self._clock()
         header = FrameHeader(
             kind=FRAME_KIND_PICTURE,
             codec=CODEC_PNG if lossless else CODEC_JPEG,

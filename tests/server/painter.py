@@ -15,6 +15,7 @@ from server.render_session import (
     AbstractPose,
     AbstractRenderer,
     Bounds,
+    Explanation,
     Picked,
     Pixels,
     view_of_bounds,
@@ -74,6 +75,9 @@ class Painting(AbstractPicture):
         alpha = 0 if self.settings.background == "transparent" else 255
         pixels[:] = (self.pose.edit_count, int(128 + 10 * self.settings.exposure_stops), min(self.samples, 255), alpha)
         return pixels
+
+    def explain(self) -> Explanation:
+        return Explanation({"paint": 0.25}, (("shadows", "painters do not know them", "none"),))
 
     def pick(self, x: float, y: float) -> Picked | None:
         return Picked((x, y, 0.0), (0.0, 0.0, 1.0), (0.5, 0.5, 0.5), 0.5, 0.0) if x < 0.5 else None

@@ -284,3 +284,44 @@ def test_one_picture_over_rest(service: Service) -> None:
     assert bad.status_code == 422 and "16 numbers" in bad.json()["detail"]
     assert service.client.get(f"{url}/frame.png?width=100000").status_code == 422
     assert service.client.get(f"{url}/frame.png?width=4096&height=4096&spp=60000").status_code == 422
+
+
+def test_a_client_hears_what_its_picture_cost_and_what_was_left_out(service: Service) -> None:
+    with talk(service, service.open_session()) as client:
+        client.send(type="explain", id=1)
+        assert client.text("explained")["revision"] is None
+        client.send(type="settings", settings={"spp_target": 8})
+        client.socket.send_json(camera())
+        client.frame(FLAG_CONVERGED)
+        client.send(type="explain", id=2)
+        said = client.text("explained")
+        assert (said["id"], said["revision"], said["samples"], said["seconds"]) == (2, 0, 8, {"paint": 0.25})
+        assert said["skipped"] == [{"what": "shadows", "why": "painters do not know them", "bound": "none"}]
+        assert said["frames_sent"] == len(client.frames) and said["frames_in_flight"] == 0
+        assert 0 < said["round_trip_ms"] < 1e4
+
+
+def test_an_edit_sent_again_after_the_connection_was_lost_is_applied_once(service: Service) -> None:
+    session = service.open_session()
+    for _ in range(2):
+        with talk(service, session) as client:
+            client.send(type="edit", id=7, edit=material(0.5), key="once")
+            assert client.text("accepted")["revision"] == 1
+    assert service.client.get(f"/api/sessions/{session}").json()["revision"] == 1
+
+
+def test_a_client_that_vanishes_while_its_picture_is_made_leaves_nothing_behind(tmp_path) -> None:
+    service = Service(tmp_path, Painter(pass_seconds=0.3))
+    with service.client:
+        session = service.open_session()
+        for _ in range(3):
+            with talk(service, session) as client:
+                client.text("hello")
+                client.socket.send_json(camera())
+        start = time.monotonic()
+        while service.context.sessions.viewer_count() or service.context.connections:
+            assert time.monotonic() - start < PATIENCE_SECONDS
+            time.sleep(0.02)
+        with talk(service, session) as client:
+            client.socket.send_json(camera())
+            client.frame()

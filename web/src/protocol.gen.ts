@@ -200,6 +200,28 @@ export interface ErrorMessage {
   fatal: boolean;
 }
 
+/** What the newest picture cost, and what was left out of it, and why. */
+export interface ExplainMessage {
+  type: "explain";
+  id: number;
+}
+
+export interface ExplainedMessage {
+  type: "explained";
+  id: number;
+  /** Of the log that the picture shows; None while there is no picture, and then nothing else says anything. */
+  revision: number | null;
+  samples: number;
+  samples_target: number;
+  /** Spent on each step of the picture. */
+  seconds: Record<string, unknown>;
+  skipped: SkippedWork[];
+  frames_sent: number;
+  frames_in_flight: number;
+  /** From a frame's sending to its acknowledgement, mean of the last ones. */
+  round_trip_ms: number | null;
+}
+
 /** Files for other programs, kept with the job until it is deleted. */
 export interface ExportRequest {
   /** Shown in lists. */
@@ -335,6 +357,8 @@ export interface PickedMessage {
   albedo: [number, number, number] | null;
   roughness: number | null;
   metallic: number | null;
+  /** What a selection's `region` says for the patch of material here. */
+  region: number | null;
 }
 
 export interface PoseEdit {
@@ -526,6 +550,13 @@ export interface SimulateRequest {
   scene?: Record<string, unknown>;
 }
 
+export interface SkippedWork {
+  what: string;
+  why: string;
+  /** Of the difference it makes. */
+  bound: string;
+}
+
 export interface SnapshotInfo {
   name: string;
   created_at: string;
@@ -617,7 +648,8 @@ export type ClientMessage =
   | AckMessage
   | SettingsMessage
   | VisibilityMessage
-  | PickMessage;
+  | PickMessage
+  | ExplainMessage;
 
 export type ServerMessage =
   | ServerHello
@@ -626,6 +658,7 @@ export type ServerMessage =
   | RejectedMessage
   | StatusMessage
   | PickedMessage
+  | ExplainedMessage
   | ErrorMessage;
 
 export type Edit =

@@ -1,0 +1,51 @@
+"""Saving a session as a new version of its asset, and what a full disk leaves behind."""
+
+import json
+import resource
+from pathlib import Path
+
+from conftest import Service
+
+from drgs.scene.asset import load_asset
+
+TETRAHEDRON = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def opened(service: Service) -> tuple[str, str]:
+    """Ids of a real asset and of a session on it with one edit."""
+    asset = service.client.post("/api/assets", files={"file": ("four.obj", TETRAHEDRON)}).json()["id"]
+    session = service.client.post("/api/sessions", json={"asset": asset}).json()["id"]
+    edit = {"op": "material", "select": {"all": True}, "set": {"roughness": 0.25}}
+    assert service.client.post(f"/api/sessions/{session}/edits", json={"edit": edit}).status_code == 200
+    return asset, session
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_saved_session_is_a_new_version_with_its_edits_and_a_full_disk_leaves_all_as_it_was(service: Service) -> None:
+    asset, session = opened(service)
+    folder = service.context.directory.asset(asset)
+    before = files_of(folder)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))  # the tool inherits it: no file of it can grow further
+    try:
+        full = service.client.post(f"/api/sessions/{session}/save", json={"name": "never"})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert full.status_code in (422, 503) and " " in full.json()["detail"], full.text
+    assert files_of(folder) == before and service.client.get("/api/assets").json()["total"] == 1
+    assert list(service.context.directory.uploads.iterdir()) == []
+    assert [path.name for path in service.context.directory.assets.iterdir()] == [asset]
+
+    saved = service.client.post(f"/api/sessions/{session}/save").json()
+    assert (saved["name"], saved["version"], saved["parent_id"], saved["source"]) == ("four", 2, asset, "session")
+    assert saved["edits"][0]["set"]["roughness"] == 0.25 and saved["has_thumbnail"]
+    assert files_of(folder) == before
+    version = load_asset(service.context.directory.asset(saved["id"]))
+    assert float(version.mesh.roughness.max()) == 0.25
+    assert json.dumps(version.provenance["versions"][0]["edits"]) == json.dumps(
+        [{"op": "material", "select": {"all": True}, "set": {"roughness": 0.25}, "mode": "absolute"}]
+    )
+    assert service.client.get(f"/api/sessions/{session}").json()["revision"] == 1  # goes on as it was
