@@ -206,9 +206,9 @@ class Picture(AbstractPicture):
     def explain(self) -> Explanation:
         from drgs.render.accumulate import resolve_frame
 
-        seconds = resolve_frame(self._state).metadata["seconds"]
+        spent = resolve_frame(self._state).metadata["milliseconds"]
         skips = tuple((skip.what, skip.why, skip.bound) for skip in self._state.plan.skips)
-        return Explanation({step: float(value) for step, value in seconds.items()}, skips)
+        return Explanation({step: value / 1000 for step, value in spent.items()}, skips)
 
 
 def _samples_a_pass(state: "FrameState") -> int:
