@@ -141,7 +141,8 @@ def _comment(text: str, indent: str) -> str:
 
 
 def _interface(name: str, schema: dict) -> str:
-    required = set(schema.get("required", ()))
+    # x-optional: came later than the rest, so that pages may make such a message without it.
+    required = {field for field in schema.get("required", ()) if not schema["properties"][field].get("x-optional")}
     text = _comment(schema["description"], "") if "description" in schema else ""
     text += f"export interface {name} {{\n"
     for field, node in schema.get("properties", {}).items():

@@ -271,7 +271,7 @@ class PickedMessage(_Answer):
     albedo: Vector | None = None
     roughness: float | None = None
     metallic: float | None = None
-    region: int | None = None
+    region: Annotated[int | None, Field(json_schema_extra={"x-optional": True})] = None
     """What a selection's `region` says for the patch of material here."""
 
 

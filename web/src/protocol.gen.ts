@@ -358,7 +358,7 @@ export interface PickedMessage {
   roughness: number | null;
   metallic: number | null;
   /** What a selection's `region` says for the patch of material here. */
-  region: number | null;
+  region?: number | null;
 }
 
 export interface PoseEdit {
