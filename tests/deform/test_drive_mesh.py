@@ -42,6 +42,32 @@ def test_the_printed_rule_does_not_turn_the_offset_from_the_mesh_and_ours_does(a
     assert 0.9 * bound < float(error.max()) <= bound * 1.001
 
 
+def test_similarities_are_reproduced_and_the_offset_grows_with_the_object():
+    turn = rotation_from_quat_wxyz(torch.tensor([0.3, -0.5, 0.2, 0.8]))
+    vertices, _, _, centers, tangents = ball()
+    position, moved_tangents = driven(1.7 * vertices @ turn.T + 2.0, "corrected")
+    assert torch.allclose(position, 1.7 * centers @ turn.T + 2.0, atol=5e-6)
+    assert torch.allclose(moved_tangents, 1.7 * turn @ tangents, atol=2e-6)
+
+
+def test_affine_maps_of_a_flat_mesh_are_exact_for_surfels_in_its_plane():
+    steps = torch.linspace(-1, 1, 5)
+    x, y = (values.reshape(-1) for values in torch.meshgrid(steps, steps, indexing="ij"))
+    vertices = torch.stack([x, y, 0 * x], -1)
+    corner = torch.tensor([5 * i + j for i in range(4) for j in range(4)])
+    faces = torch.cat([torch.stack([corner, corner + 5, corner + 6], -1), torch.stack([corner, corner + 6, corner + 1], -1)]).int()
+    weights = torch.nn.functional.normalize(torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(0)), p=1, dim=-1)
+    binding = Binding(torch.arange(len(faces), dtype=torch.int32), weights, torch.zeros(len(faces)))
+    centers = (vertices[faces.long()] * weights[..., None]).sum(1)
+    tangents = torch.zeros(len(faces), 3, 2)
+    tangents[:, :2] = torch.tensor([[0.3, -0.1], [0.1, 0.2]])
+    affine = torch.tensor([[1.2, 0.7, 0.1], [-0.3, 0.8, 0.4], [0.5, 0.2, 1.1]])
+    moved = vertices @ affine.T
+    gradients = vertex_gradients(vertices, moved, faces)
+    position, moved_tangents = drive_surfels(vertices, moved, faces, gradients, binding, centers, tangents)
+    assert torch.allclose(position, centers @ affine.T, atol=1e-6) and torch.allclose(moved_tangents, affine @ tangents, atol=1e-6)
+
+
 def test_the_printed_rule_shrinks_surfels_where_rotations_differ():
     vertices = ball()[0]
     turn = 2.5 * vertices[:, 2]
