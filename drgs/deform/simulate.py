@@ -12,14 +12,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
 from drgs.deform.clip import ClipFrame, blend_frames, save_clip
+from drgs.deform.drive_mesh import vertex_gradients
 from drgs.deform.fill_particles import FillSettings, Particles, fill_particles
 from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate
 from drgs.deform.measure_solid import distances_from_solid
 from drgs.deform.mpm import (
+    LAWS,
     Box,
     Condition,
     GridSettings,
@@ -40,6 +43,8 @@ from drgs.scene.gaussians import surfel_tangents
 
 LARGEST_STRETCH = 10.0
 """Of a surfel; and 1/10 the least. Matter may stretch further, its picture would only smear."""
+LARGEST_LOOSE_STRETCH = 3.0
+"""The same of surfels on sand and fluids: where those part, the mesh between them is drawn out and would pull needles."""
 STILL = 1e-4
 """Cells a frame: below it, matter is at rest."""
 STILL_FRAMES = 3
@@ -99,6 +104,11 @@ class Simulation:
             points = torch.cat([local, centers])
         gmls = GmlsSettings(isolated=3 * self.model.grid.dx, variant="paper_centred" if scene.variant == "paper" else "taylor")
         self._weights: Weights = build_weights(self.model.rest, points, gmls, (local, mesh.faces))
+        # Sand and fluids mix: what their particles have turned says nothing about the surface, which the moved mesh still tells.
+        mixes = (self.model.laws == LAWS.index("drucker_prager")) | (self.model.laws == LAWS.index("fluid"))
+        self._loose = mixes[self._weights.neighbours[:, 0].long()]
+        _, nearest = cKDTree(local.cpu().numpy()).query(points.cpu().numpy()) if bool(self._loose.any()) else (None, [])
+        self._nearest_vertex = torch.as_tensor(nearest, device=local.device)
         self._state = _first_state(self.model, scene)
         self._totals = {"substeps": 0, "retries": 0, "frozen": 0, "sleeping": 0, "wall": False}
         self._still = 0
@@ -157,6 +167,10 @@ class Simulation:
     def _carry(self, state: State) -> ClipFrame:
         mesh, vertices = self._asset.mesh, len(self._asset.mesh.vertices)
         positions, gradients = interpolate(self._weights, state.positions, state.total)
+        if bool(self._loose.any()):
+            of_mesh = vertex_gradients(mesh.vertices, positions[:vertices], mesh.faces)
+            of_mesh = limit_stretch(of_mesh, LARGEST_LOOSE_STRETCH)
+            gradients = torch.where(self._loose[:, None, None], of_mesh[self._nearest_vertex], gradients)
         positions = (positions.double() + self._center.to(positions.device)).float()
         gradients = limit_stretch(gradients)
         normals = carry_normals(mesh.normals, gradients[:vertices])

@@ -14,7 +14,7 @@ from drgs.deform.simulation_scene import make_material, parse_simulation_scene
 from drgs.scene.asset import Asset
 from drgs.scene.edits import parse_edits
 from drgs.scene.environment import Environment
-from drgs.scene.gaussians import Gaussians
+from drgs.scene.gaussians import Gaussians, surfel_tangents
 from drgs.scene.mesh import TriangleMesh
 
 CENTER = (2.0, -1.0, 5.0)
@@ -233,3 +233,19 @@ def test_a_body_that_came_to_rest_sleeps_until_something_acts():
     awake, report = simulate(ball_asset(), drifting.model_copy(update={"acts": parse_simulation_scene({"acts": [push]}).acts}))
     assert report.sleeping_frames == 0  # it is known that something will act
     assert float((awake[-1].vertices - frames[-1].vertices)[:, 2].mean()) > 1e-4
+
+
+@pytest.mark.parametrize("preset", ["sand", "honey"])
+def test_normals_of_matter_that_flows_are_those_of_the_surface_that_it_has_become(preset):
+    frame = Simulation(ball_asset(), scene(matter={"preset": preset}, particles=800)).at(0.4)
+    faces = ball_asset().mesh.faces.long()
+    assert float(frame.vertices[:, 2].max()) < 5.4  # it has slumped
+    a, b, c = frame.vertices[faces].unbind(1)
+    flat = torch.linalg.cross(b - a, c - a)
+    shading = frame.normals[faces].mean(1)
+    agree = torch.nn.functional.cosine_similarity(flat, shading)
+    area = flat.norm(dim=-1)
+    assert float((agree > 0.9).float().mul(area).sum() / area.sum()) > 0.95
+    # No surfel is drawn into a needle.
+    asset_lengths = torch.linalg.svdvals(surfel_tangents(ball_asset().gaussians))
+    assert float((torch.linalg.svdvals(frame.tangents) / asset_lengths).max()) < 3.01
