@@ -1,0 +1,86 @@
+"""The real builder driven stage by stage, each in a run of its own as after a crash, and the re-decoupling of what it made."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from drgs.build.build_asset import PRESETS, Preset
+from drgs.build.densify import DensifySettings
+from drgs.build.extract_mesh import MeshSettings
+from drgs.build.fit_gaussians import FitSettings
+from drgs.build.fit_materials import MaterialSettings
+from drgs.render.sample_rays import SampleCounts
+from drgs.scene.asset import load_asset
+from tests.build.tiny_capture import write_nerf_synthetic
+from worker.builders import build_with_drgs
+from worker.data_directory import DataDirectory, open_data_directory
+from worker.database import AssetRow, open_database
+from worker.job_build import BuildRun, RedecoupleRun
+from worker.job_run import JobContext
+
+TINY = Preset(
+    points=600,
+    image_side=72,
+    fit=FitSettings(iterations=12, densify=DensifySettings(every=5, budget=700)),
+    mesh=MeshSettings(resolution=48, face_limit=2000),
+    materials=MaterialSettings(iterations=4, points_a_step=64, samples=SampleCounts(4, 2, 2)),
+)
+MORE = Preset(
+    TINY.points, TINY.image_side, TINY.fit, TINY.mesh, MaterialSettings(iterations=8, points_a_step=64, samples=SampleCounts(4, 2, 2))
+)
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DataDirectory]:
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setitem(PRESETS, "more", MORE)
+    write_nerf_synthetic(tmp_path)
+    yield open_data_directory(tmp_path / "data")
+
+
+def context(directory: DataDirectory, job_id: str, said: list[str], **parameters: object) -> JobContext:
+    engine = open_database(directory)
+    directory.job(job_id).mkdir(exist_ok=True)
+    given = {"preset": "tiny", "seed": 0} | parameters
+    capture = directory.root.parent
+    return JobContext(
+        job_id, "sphere", given, capture, directory, engine, build_with_drgs, "cpu", lambda made: said.append(made.stage), lambda: False
+    )
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Files of an asset, without how long its stages took."""
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    manifest = json.loads(files.pop("asset.json"))
+    del manifest["provenance"]["seconds"]
+    return files | {"asset.json": json.dumps(manifest).encode()}
+
+
+def test_a_build_that_begins_anew_after_every_stage_makes_the_same_asset_and_can_be_re_decoupled(directory: DataDirectory) -> None:
+    whole: list[str] = []
+    run = BuildRun(context(directory, "a" * 32, whole))
+    for step in run.steps:
+        run.run(step)
+    parts: list[str] = []
+    for step in BuildRun.steps:
+        before = len(parts)
+        BuildRun(context(directory, "b" * 32, parts)).run(step)
+        if step == "materials":
+            assert "fit" not in parts[before:]  # nothing but the capture is worked on again
+    assert contents(directory.asset("a" * 32)) == contents(directory.asset("b" * 32))
+    assert list(dict.fromkeys(whole)) == ["read", "fit", "mesh", "materials", "pack"]
+
+    said: list[str] = []
+    again = RedecoupleRun(context(directory, "c" * 32, said, asset="a" * 32, preset="more", built_preset="tiny", built_seed=0))
+    for step in again.steps:
+        again.run(step)
+    assert "fit" not in said and "materials" in said
+    first, second = (load_asset(directory.asset(letter * 32)) for letter in "ac")
+    assert first.mesh.vertices.equal(second.mesh.vertices) and not first.mesh.albedo.equal(second.mesh.albedo)
+    assert (first.provenance["materials"], second.provenance["materials"]) == ("tiny", "more")
+    from sqlalchemy.orm import Session
+
+    with Session(open_database(directory)) as session:
+        assert session.query(AssetRow).count() == 3
