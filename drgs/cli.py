@@ -281,10 +281,17 @@ def serve(
 
 
 @app.command()
-def worker(data: DataFolder = None, device: Annotated[DeviceName | None, typer.Option(show_default="auto")] = None) -> None:
+def worker(
+    data: DataFolder = None,
+    device: Annotated[DeviceName | None, typer.Option(show_default="auto")] = None,
+    requeue: Annotated[str | None, typer.Option(metavar="WORKER", help="Give this dead worker's jobs to the others, and end.")] = None,
+) -> None:
     """Run queued jobs without serving pages, for example on another machine."""
-    from worker.run import run_worker
+    from worker.run import requeue_worker, run_worker
 
+    if requeue is not None:
+        print(json.dumps(requeue_worker(data, requeue)))
+        return
     raise typer.Exit(run_worker(data, device.value if device else None))
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from sqlalchemy import Engine, delete, select
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session as DatabaseSession
 
 from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, PoseEdit, parse_edits
@@ -161,7 +162,10 @@ class SessionRegistry:
                 there = select(SessionRow.id).join(AssetRow, AssetRow.id == SessionRow.asset_id).where(AssetRow.deleted_at.is_(None))
                 return list(database.scalars(there.order_by(SessionRow.created_at.desc()).limit(100)))
 
-        return [await self.get(session_id) for session_id in await asyncio.to_thread(ids)]
+        # Replayed ones are not kept: they may live in another server, whose changes would not arrive here.
+        return [
+            self._live.get(session_id) or await asyncio.to_thread(self._replay, session_id) for session_id in await asyncio.to_thread(ids)
+        ]
 
     async def remove(self, session_id: str) -> None:
         """
@@ -277,7 +281,11 @@ class SessionRegistry:
             loaded = session.loaded
             assert loaded is not None
             pose = await self._call(lambda: loaded.pose(log.done, posed.pose))
-            await asyncio.to_thread(self._store, session.id, log.revision, kind, change, key)
+            try:
+                await asyncio.to_thread(self._store, session.id, log.revision, kind, change, key)
+            except IntegrityError as error:
+                self._live.pop(session.id, None)
+                raise ProblemError(409, "Another server changed this session meanwhile; open it again.") from error
             if key is not None:
                 session.keys[key] = log.revision
             session.log, session.posed = log, Posed(log.revision, pose)

@@ -158,6 +158,24 @@ class JobQueue:
             self._client.resume_workflow(row.workflow_id, queue_name=QUEUE_NAME)
         return [row.workflow_id for row in rows]
 
+    def requeue_worker(self, worker_id: str) -> list[str]:
+        """Hand over the jobs of a worker of which an operator knows that it will not come back. Returns their ids.
+
+        Raises:
+            ValueError: its process runs on this machine, or nobody has heard of it.
+        """
+        with Session(self._engine) as session:
+            row = session.get(WorkerRow, worker_id)
+            if row is None:
+                known = ", ".join(session.scalars(select(WorkerRow.id).order_by(WorkerRow.id))) or "none"
+                raise ValueError(f"no worker is called {worker_id!r}; known ones: {known}")
+        if worker_id.rpartition("-")[0] == socket.gethostname() and is_alive(row):
+            raise ValueError(f"worker {worker_id} runs on this machine (process {row.pid}); stop it instead")
+        rows = self._client.list_workflows(status="PENDING", executor_id=worker_id, load_input=False, load_output=False)
+        for found in rows:
+            self._client.resume_workflow(found.workflow_id, queue_name=QUEUE_NAME)
+        return [found.workflow_id for found in rows]
+
     def active_count(self) -> int:
         """Jobs that wait or run."""
         return len(self._client.list_workflows(status=["ENQUEUED", "DELAYED", "PENDING"], load_input=False, load_output=False))

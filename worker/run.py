@@ -22,7 +22,7 @@ from worker.data_directory import DataDirectory, open_data_directory, try_lock_f
 from worker.database import WorkerRow, now, open_database
 from worker.jobs import WorkerContext, set_context
 from worker.logs import set_up_logging
-from worker.queue import APPLICATION_NAME, HEARTBEAT_SECONDS, JOBS_VERSION, QUEUE_NAME, migrate_queue, refuse_pickled_rows
+from worker.queue import APPLICATION_NAME, HEARTBEAT_SECONDS, JOBS_VERSION, QUEUE_NAME, JobQueue, migrate_queue, refuse_pickled_rows
 from worker.settings import read_settings
 
 SHUTDOWN_SECONDS = 30
@@ -86,6 +86,23 @@ def run_worker(data: Path | None = None, device: str | None = None, parent_pid: 
     engine.dispose()
     os.close(slot_lock)
     return 0
+
+
+def requeue_worker(data: Path | None, worker_id: str) -> list[str]:
+    """Give the jobs of a worker that will not come back to the others. Returns their ids.
+
+    Raises:
+        ValueError: a setting is wrong, nobody has heard of the worker, or it runs on this machine.
+    """
+    settings = read_settings(data=data)
+    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
+    engine = open_database(directory)
+    queue = JobQueue(directory, engine)
+    try:
+        return queue.requeue_worker(worker_id)
+    finally:
+        queue.close()
+        engine.dispose()
 
 
 def _claim_slot(directory: DataDirectory) -> tuple[str, int]:

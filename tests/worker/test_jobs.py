@@ -227,7 +227,14 @@ def test_another_worker_takes_over_what_a_dead_one_left(bench: Bench) -> None:
         bench.queue.resume(job)
     first.kill()
     first.wait()
-    assert bench.queue.requeue_dead() == [job]
+    dead = bench.row(job).worker_id
+    assert dead is not None
+    with pytest.raises(ValueError, match=f"known ones: .*{dead}"):
+        bench.queue.requeue_worker("nobody-0")
+    with pytest.raises(ValueError, match="runs on this machine"):
+        bench.queue.requeue_worker(next(name for name in bench.queue.alive_workers() if name != dead))
+    assert bench.queue.requeue_worker(dead) == [job]
+    assert bench.queue.requeue_dead() in ([], [job])
     bench.wait_for(job, "done")
     assert bench.iterations_run(job)[-1][0] == second.pid
 
