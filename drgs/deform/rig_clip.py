@@ -14,10 +14,11 @@ from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals
 from drgs.deform.clip import ClipFrame
-from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
+from drgs.deform.drive_mesh import drive_surfels
 from drgs.deform.proxy import ProxyBinding, bind_to_proxy, carry_points, closest_faces
 from drgs.deform.simulate import limit_stretch
 from drgs.deform.skeleton import RigPose, pose_rig, rig_gradients
+from drgs.deform.surface_gradients import SurfaceAtRest, prepare_surface, surface_gradients
 from drgs.exchange.gltf_rig import Rig, RigAnimation, read_gltf_rig
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.scene.asset import Asset
@@ -54,8 +55,8 @@ class BoundRig:
     binding: ProxyBinding
     """Of the object's vertices to the rig's mesh."""
     rest: ClipFrame
-    faces: Tensor
-    """(face, 3) of the object's mesh."""
+    surface: SurfaceAtRest
+    """The object's mesh."""
     surfels: Binding | None
     """Of the object's surfels to its mesh."""
     loop: bool
@@ -71,12 +72,12 @@ class BoundRig:
         rest = self.rest
         # float64 up to the gradients: edges are short, and their ends' rounding would turn normals.
         vertices = carry_points(self.binding, moved.vertices, rig_gradients(self.alignment.place(self.rest_pose), moved))
-        gradient = limit_stretch(vertex_gradients(rest.vertices.double(), vertices, self.faces), LARGEST_STRETCH).to(rest.vertices.dtype)
+        gradient = limit_stretch(surface_gradients(self.surface, vertices), LARGEST_STRETCH).to(rest.vertices.dtype)
         vertices = vertices.to(rest.vertices.dtype)
         normals = carry_normals(rest.normals, gradient)
         if rest.centers is None or rest.tangents is None or self.surfels is None:
             return ClipFrame(vertices, normals, None, None)
-        surfels = drive_surfels(rest.vertices, vertices, self.faces, gradient, self.surfels, rest.centers, rest.tangents)
+        surfels = drive_surfels(rest.vertices, vertices, self.surface.faces, gradient, self.surfels, rest.centers, rest.tangents)
         return ClipFrame(vertices, normals, *surfels)
 
 
@@ -113,7 +114,7 @@ def bind_rig(path: Path, animation: str, asset: Asset, rest: ClipFrame, binding:
         mesh, centers = asset.mesh, rest.centers
         face, barycentric = closest_faces(mesh.vertices.double(), mesh.faces.long(), centers, torch.zeros_like(centers))
         surfels = Binding(face.int(), barycentric.float(), torch.zeros(len(centers), device=centers.device))
-    return BoundRig(rig, clip, alignment, rest_pose, bound, rest, asset.mesh.faces, surfels, options.loop)
+    return BoundRig(rig, clip, alignment, rest_pose, bound, rest, prepare_surface(rest.vertices, asset.mesh.faces), surfels, options.loop)
 
 
 def find_animation(rig: Rig, name: str) -> RigAnimation:
