@@ -35,18 +35,20 @@ LIMITS = """
 ### Limits of light transport
 - **Roughness** below 0.03 is rendered as 0.03; at 0.03 the mirror's peak still has four correct digits.
 - **White dielectrics**: the contract's BRDF adds specular light to a diffuse part that lost none. Each part alone returns no more than
-  what comes; together, an albedo above 0.96 returns more (at roughness 0 and 89.99° 1.94 for an albedo of 1). Pictures of photographed
-  things stay below; a measured albedo of 1 does not exist.
+  what comes; together, an albedo above 0.96 returns more (at roughness 0 and 89.99° 1.94 for an albedo of 1). Real paints lie
+  below; nothing is refused.
 - **Environments**: texels from 0 to 1e12, finite; others are refused (files: negative values become 0 with a warning). Brightness itself
   costs no digits: the sampling table knows ratios only.
 - **Size**: the mesh's box must measure 1e-5 to 1e9 world units; squared areas leave float32 beyond.
-- **Distance**: the mesh may lie up to 1e5 times its own span from the origin; further is refused. Vertices are float32: at a distance of
-  1e3 spans shape and shadows are off by a thousandth of the span at most, at 1e5 spans a silhouette moves by pixels, as the table shows.
+- **Distance**: the mesh may lie up to 1e5 times its own span from the origin; further is refused. Vertices are float32, and rays start the
+  further off the surface the further the mesh is away: at 1e3 spans shadows of what is nearer than 1e-3 of the span are lost, at 1e5 spans
+  of what is nearer than a tenth, and outlines move by 6e-3 of it. Keep things near the origin.
 - **Triangles without area, doubled or sharing edges with more than one other** change nothing. Two triangles at one place that face opposite
   ways do: the ray meets either, and a back is black. `drgs import` warns of them; give such sheets a thickness.
 - **Normals**: where a vertex normal faces away from the camera on a triangle that faces it, the point is black, as in any path tracer.
 - **Pictures** of no area are refused.
-- **Surfels** of no area are not drawn. Opacity is cut at 0.99, below 1/255 nothing is drawn.
+- **Surfels** of no area are not drawn, nor what is nearer to the camera than 1 % of half the surfels' span. Opacity is cut at 0.99, below
+  1/255 nothing is drawn.
 """
 
 
