@@ -13,6 +13,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import statistics
 import sys
 import tempfile
@@ -31,6 +32,7 @@ from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, 
 from drgs.scene.asset import Asset, load_asset
 from drgs.scene.camera import Camera, camera_from_opengl
 from drgs.warp_torch import device_from_name
+from server.messages import AcceptedMessage
 
 EDITS = 8
 IDLE_SECONDS = 4.0
@@ -119,7 +121,8 @@ def served(asset: Path, size: int, device: str) -> Iterator[tuple[psutil.Process
         assert process.stdout is not None
         try:
             with Client(process.stdout.readline().strip()) as client:
-                session = client.open_session(client.upload_asset(asset).id)
+                zipped = asset if asset.is_file() else Path(shutil.make_archive(f"{folder}/asset", "zip", asset))
+                session = client.open_session(client.upload_asset(zipped).id)
                 with session.stream() as stream:
                     stream.look(size, size)
                     yield psutil.Process(process.pid), client, stream
@@ -140,8 +143,8 @@ def edits(client: Client, stream: Stream, size: int) -> dict:
         revision = None
         while True:
             frame = stream.receive(60)
-            if frame is None and getattr(stream.messages[-1], "type", "") == "accepted":
-                revision = stream.messages[-1].state_rev
+            if frame is None and isinstance(stream.messages[-1], AcceptedMessage):
+                revision = stream.messages[-1].revision
             if frame is not None and revision is not None and frame[0].state_rev >= revision:
                 break
         waits.append(1000 * (time.perf_counter() - started))

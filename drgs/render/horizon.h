@@ -1,7 +1,7 @@
 // raise_horizons of horizon.py for one face against 16 triangles at a time, CPU only. Body of a Warp native function; horizon.py
 // prepends the rasteriser's tile_vector.h and the constants. A test keeps both equal.
 //
-// in   f (face), lanes (group, 9, 16: corners by coordinate), boxes of groups and of groups of groups, group_count, corners, lift
+// in   f (face), lanes (group, 9, 16: corners by coordinate), group_boxes (group of groups, 6, 16), super_boxes (16 of those, 6, 16), corners, lift
 // out  tangent_out[f]
 struct P3 { float x, y, z; };
 const auto dot = [](P3 a, P3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; };
@@ -36,16 +36,23 @@ h[10] = unit(cross(minus(a, c), n));
 for (int k = 0; k < DIRECTIONS; ++k) support[k] = largest(largest(dot(h[k], a), dot(h[k], b)), dot(h[k], c));
 float tangent = 0.0f;
 const auto absolute = [](float x) { return x < 0.0f ? -x : x; };
-const auto box_above = [&](P3 low, P3 high) {
-    const P3 middle = {0.5f * (low.x + high.x), 0.5f * (low.y + high.y), 0.5f * (low.z + high.z)};
-    const P3 half = {0.5f * (high.x - low.x), 0.5f * (high.y - low.y), 0.5f * (high.z - low.z)};
-    const float above = dot(n, middle) + absolute(n.x) * half.x + absolute(n.y) * half.y + absolute(n.z) * half.z - base;
-    if (above <= 0.0f) return false;
-    for (int k = 0; k < DIRECTIONS; ++k) {
-        const float beyond = dot(h[k], middle) - absolute(h[k].x) * half.x - absolute(h[k].y) * half.y - absolute(h[k].z) * half.z - support[k];
-        if (beyond > 0.0f && above <= tangent * beyond) return false;
+// Which of 16 boxes, (6, 16): lowest and highest corners by coordinate, may hold something above the tangent found so far.
+const auto boxes_above = [&](const float* boxes) -> i16 {
+    v16 middle[3], half[3];
+    for (int k = 0; k < 3; ++k) {
+        const v16 low = load16(boxes + 16 * k), high = load16(boxes + 48 + 16 * k);
+        middle[k] = 0.5f * (low + high);
+        half[k] = 0.5f * (high - low);
     }
-    return true;
+    const auto along = [&](P3 d) -> v16 { return d.x * middle[0] + d.y * middle[1] + d.z * middle[2]; };
+    const auto across = [&](P3 d) -> v16 { return absolute(d.x) * half[0] + absolute(d.y) * half[1] + absolute(d.z) * half[2]; };
+    const v16 above = along(n) + across(n) - base;
+    i16 open = above > 0.0f;
+    for (int k = 0; k < DIRECTIONS && any(open); ++k) {
+        const v16 beyond = along(h[k]) - across(h[k]) - support[k];
+        open &= ~((beyond > 0.0f) & (above <= tangent * beyond));
+    }
+    return open;
 };
 const auto against = [&](const float* lane) {
     v16 x[3], y[3], z[3], above[3];
@@ -83,16 +90,20 @@ const auto against = [&](const float* lane) {
     store16(found, select(open, lowest, v16(0.0f)));
     for (int lane_index = 0; lane_index < 16; ++lane_index) tangent = largest(tangent, found[lane_index]);
 };
-const P3* const low = (const P3*)group_low.data;
-const P3* const high = (const P3*)group_high.data;
-const P3* const super_low_of = (const P3*)super_low.data;
-const P3* const super_high_of = (const P3*)super_high.data;
-const int supers = (group_count + SUPER - 1) / SUPER, own = f / (GROUP * SUPER);
-for (int step = 0; step < supers && tangent < STEEPEST; ++step) {
-    const int s = own + step < supers ? own + step : own + step - supers;
-    if (!box_above(super_low_of[s], super_high_of[s])) continue;
-    const int last = min_int((s + 1) * SUPER, group_count);
-    for (int g = s * SUPER; g < last && tangent < STEEPEST; ++g)
-        if (box_above(low[g], high[g])) against((const float*)lanes.data + (long)g * 144);
+const auto look_into = [&](int super) {
+    alignas(64) int open[16];
+    *(i16*)open = boxes_above(group_boxes.data + 96 * (long)super);
+    for (int k = 0; k < 16 && tangent < STEEPEST; ++k)
+        if (open[k] != 0) against((const float*)lanes.data + 144 * (16 * (long)super + k));
+};
+// The face's own neighbourhood first: it is what most often shows that there is nothing to gain.
+const int blocks = super_boxes.shape[0] / 96, own = f / 256;
+look_into(own);
+for (int step = 0; step < blocks && tangent < STEEPEST; ++step) {
+    const int block = (own / 16 + step) % blocks;
+    alignas(64) int open[16];
+    *(i16*)open = boxes_above(super_boxes.data + 96 * (long)block);
+    for (int k = 0; k < 16 && tangent < STEEPEST; ++k)
+        if (open[k] != 0 && 16 * block + k != own) look_into(16 * block + k);
 }
 tangent_out.data[f] = tangent;

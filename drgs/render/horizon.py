@@ -159,19 +159,16 @@ def raise_horizons(
 
 
 def _source_of_face_horizon() -> str:
+    assert int(GROUP) == int(SUPER) == 16  # the lanes of a vector
     folder = Path(__file__).parent
-    constants = "".join(
-        f"constexpr int {name} = {int(value)};\n" for name, value in (("GROUP", GROUP), ("SUPER", SUPER), ("DIRECTIONS", DIRECTIONS))
-    )
-    vectors = (folder / "rasterize_gbuffer" / "tile_vector.h").read_text()
-    return f"{constants}constexpr float STEEPEST = {float(STEEPEST)}f;\n" + vectors + (folder / "horizon.h").read_text()
+    constants = f"constexpr int DIRECTIONS = {int(DIRECTIONS)};\nconstexpr float STEEPEST = {float(STEEPEST)}f;\n"
+    return constants + (folder / "rasterize_gbuffer" / "tile_vector.h").read_text() + (folder / "horizon.h").read_text()
 
 
 @wp.func_native(_source_of_face_horizon())
 def face_horizon(
-    f: int, corners: wp.array(dtype=wp.vec3), lanes: wp.array(dtype=float), group_count: int,
-    group_low: wp.array(dtype=wp.vec3), group_high: wp.array(dtype=wp.vec3),
-    super_low: wp.array(dtype=wp.vec3), super_high: wp.array(dtype=wp.vec3), lift: float, tangent_out: wp.array(dtype=float),
+    f: int, corners: wp.array(dtype=wp.vec3), lanes: wp.array(dtype=float), group_boxes: wp.array(dtype=float),
+    super_boxes: wp.array(dtype=float), lift: float, tangent_out: wp.array(dtype=float),
 ): ...  # fmt: skip
 
 
@@ -181,17 +178,14 @@ def raise_horizons_simd(
     which: wp.array[int],
     corners: wp.array[wp.vec3],
     lanes: wp.array[float],
-    group_count: int,
-    group_low: wp.array[wp.vec3],
-    group_high: wp.array[wp.vec3],
-    super_low: wp.array[wp.vec3],
-    super_high: wp.array[wp.vec3],
+    group_boxes: wp.array[float],
+    super_boxes: wp.array[float],
     lift: float,
     # outputs
     tangent_out: wp.array[float],
 ):
     """raise_horizons on the CPU."""
-    face_horizon(which[first + wp.tid()], corners, lanes, group_count, group_low, group_high, super_low, super_high, lift, tangent_out)
+    face_horizon(which[first + wp.tid()], corners, lanes, group_boxes, super_boxes, lift, tangent_out)
 
 
 def _curve_order(points: Tensor) -> Tensor:
@@ -210,6 +204,14 @@ def _boxes(corners: Tensor, size: int) -> tuple[Tensor, Tensor]:
     missing = -len(corners) % size
     padded = torch.cat([corners, corners[-1:].expand(missing, 3, 3)]).reshape(-1, 3 * size, 3)
     return padded.amin(1), padded.amax(1)
+
+
+def _box_lanes(low: Tensor, high: Tensor) -> Tensor:
+    """(box / 16, 6, 16) of boxes (box, 3); what is missing in the last lanes is empty and lies below everything."""
+    missing = -len(low) % 16
+    low = torch.cat([low, low.new_full((missing, 3), 1e30)])
+    high = torch.cat([high, high.new_full((missing, 3), -1e30)])
+    return torch.cat([low, high], 1).view(-1, 16, 6).transpose(1, 2).contiguous()
 
 
 class Horizons:
@@ -243,7 +245,7 @@ class Horizons:
         self._place = torch.empty_like(self._order)
         self._place[self._order] = torch.arange(count, device=corners.device)
         self._boxes: tuple[Tensor, ...] = ()
-        self._lanes = corners[:0]
+        self._lanes: tuple[Tensor, ...] = ()
 
     @property
     def faces(self) -> int:
@@ -296,15 +298,16 @@ class Horizons:
         if not self._boxes:
             self._boxes = (*_boxes(self._corners, group), *_boxes(self._corners, group * int(SUPER)))
             padded = torch.cat([self._corners, self._corners[-1:].expand(-count % group, 3, 3)])
-            self._lanes = padded.view(-1, group, 9).transpose(1, 2).contiguous()  # the last triangle repeated changes nothing
+            triangles = padded.view(-1, group, 9).transpose(1, 2).contiguous()  # the last triangle repeated changes nothing
+            self._lanes = (triangles, _box_lanes(*self._boxes[:2]), _box_lanes(*self._boxes[2:]))
         tangent = torch.empty(count, device=self.sine.device)
         boxes = [warp_array(box, wp.vec3) for box in self._boxes]
         corners, device = [warp_array(which), warp_array(self._corners.view(-1, 3), wp.vec3)], warp_device(tangent)
         if tangent.is_cuda:
             launch(raise_horizons, len(which), [*corners, count, *boxes, self._lift], [warp_array(tangent)], device)
         else:
-            groups = [warp_array(self._lanes.view(-1)), len(self._lanes)]
-            launch(raise_horizons_simd, len(which), [*corners, *groups, *boxes, self._lift], [warp_array(tangent)], device)
+            lanes = [warp_array(values.view(-1)) for values in self._lanes]
+            launch(raise_horizons_simd, len(which), [*corners, *lanes, self._lift], [warp_array(tangent)], device)
         tangent = tangent[which.long()]
         sine = tangent / torch.sqrt(1 + tangent.square().clamp(max=1e12)) + MARGIN
         self.sine[self._order[which.long()]] = torch.where(tangent < float(STEEPEST), sine, BLOCKED)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 import trimesh
+import warp as wp
 
 from drgs.render import horizon as horizon_module
 from drgs.render.horizon import BLOCKED, RAYS_A_FACE, RAYS_A_FACE_AHEAD, TRIAL, Horizons, find_horizons, usable_horizons
@@ -81,7 +82,9 @@ def test_sixteen_triangles_at_once_are_the_triangles_one_by_one(name: str, monke
     launch, plain = horizon_module.launch, horizon_module.raise_horizons
 
     def launch_plain(kernel, count, inputs, outputs, device):
-        which, corners, _, _, *boxes, lift = inputs
+        which, corners, *_, lift = inputs
+        in_order = wp.to_torch(corners).view(-1, 3, 3)
+        boxes = [warp_array(box, wp.vec3) for size in (16, 256) for box in horizon_module._boxes(in_order, size)]
         launch(plain, count, [which, corners, len(mesh.faces), *boxes, lift], outputs, device)
 
     monkeypatch.setattr(horizon_module, "launch", launch_plain)
