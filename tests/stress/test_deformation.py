@@ -60,7 +60,13 @@ def test_targets_that_no_shape_can_follow_leave_it_finite():
 
 @pytest.mark.parametrize("law", LAWS)
 def test_matter_that_starts_with_any_gradient_does_not_leave_the_numbers(law):
-    assert_contained(sweeps.strained_rows(64, 0.01, laws=[law]))
+    assert_contained(sweeps.strained_rows(64, 0.005, determinants=(-1.0, 0.0, 1e-6, 1.0, 1e3), laws=[law]))
+
+
+def test_matter_that_bursts_is_contained_and_not_refused_half_way():
+    rows = sweeps.strained_rows(512, 0.02, determinants=(1e3,), laws=("neo_hookean",))
+    assert_contained(rows)
+    assert rows[0].refused is None and rows[0].values["retries"] > 0
 
 
 def test_matter_of_every_stiffness_lands():

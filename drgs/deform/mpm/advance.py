@@ -31,6 +31,8 @@ BATCH = 16
 """Substeps between two looks at the fastest particle."""
 SURGE = 1.25
 """The factor by which speeds may grow within a batch, beside gravity, before the state is taken back."""
+BLAST = 10.0
+"""The factor by which speeds may exceed the first and that of waves; more is no motion but a time step that failed."""
 MOVING = ("positions", "velocities", "affine", "total", "elastic", "stress", "plastic", "frozen")
 FIXED = ("masses", "volumes", "laws", "parameters")
 
@@ -73,7 +75,8 @@ def advance(model: Model, state: State, seconds: float, settings: MpmSettings | 
     scale, retries, start = 1.0, 0, state
     while True:
         try:
-            after, report = _run(model, start, seconds, settings, scale)
+            # When somebody is about to be stopped, every step is looked at: after a batch, all around them have failed as well.
+            after, report = _run(model, start, seconds, settings, scale, BATCH if retries < settings.retries else 1)
             return after, replace(report, retries=retries)
         except _Failed as failure:
             retries += 1
@@ -108,7 +111,7 @@ class _Work:
     """Cells that some particle may have moved since the last sort."""
 
 
-def _run(model: Model, state: State, seconds: float, settings: MpmSettings, scale: float) -> tuple[State, AdvanceReport]:
+def _run(model: Model, state: State, seconds: float, settings: MpmSettings, scale: float, batch: int) -> tuple[State, AdvanceReport]:
     lattice = make_lattice(model.grid)
     device = model.rest.device
     conditions = pack_conditions(model.conditions, device)
@@ -117,12 +120,16 @@ def _run(model: Model, state: State, seconds: float, settings: MpmSettings, scal
     gravity = math.sqrt(sum(g * g for g in model.gravity))
     pull = gravity + sum(math.sqrt(sum(a * a for a in c.velocity)) for c in model.conditions if c.effect == "push")
     own_speeds = [_speed(c) for c in model.conditions if c.effect != "push"]
-    done, substeps, smallest = 0.0, 0, math.inf
+    done, substeps, smallest, blast = 0.0, 0, math.inf, math.inf
     while done < seconds:
         speed = float(work.arrays["velocities"].norm(dim=-1).max())
         if not math.isfinite(speed):
             raise _Failed(_culprits(work))
         speed = max([speed, *own_speeds])
+        if done == 0:
+            blast = BLAST * (speed + model.wave_speed + pull * seconds)
+        elif speed > blast:
+            raise _Failed(_culprits(work, blast))
         # A batch's speeds: gravity may add to them, and a blow of any wave may, too.
         dt = scale * settings.courant * lattice.dx / (model.wave_speed + speed)
         speed = SURGE * (speed + pull * BATCH * dt) + 0.01 * model.wave_speed
@@ -138,7 +145,7 @@ def _run(model: Model, state: State, seconds: float, settings: MpmSettings, scal
         step_drift = speed * dt / lattice.dx
         if work.drift + step_drift > DRIFT:
             work = _sort(model, work.arrays, work.order, lattice, work.grid)
-        count = max(1, min(BATCH, left, int((DRIFT - work.drift) / step_drift)))
+        count = max(1, min(batch, left, int((DRIFT - work.drift) / step_drift)))
         _batch(work, count, dt, state.time + done, model, conditions, settings, flags)
         work.drift += count * step_drift
         substeps, smallest = substeps + count, min(smallest, dt)
