@@ -164,7 +164,7 @@ def _measure_edits_and_local(browser: Browser, server: RunningServer, mesh: Path
 def _measure_traced(browser: Browser, server: RunningServer) -> dict[str, float]:
     page = _open(browser, server, 400, 400, local=False)
     page.locator(".asset").first.click()
-    page.locator("#slider-roughness, .hud").first.wait_for(timeout=WAIT_MS)
+    page.locator(".hud").wait_for(timeout=WAIT_MS)
     page.keyboard.press("l")
     page.keyboard.press("i")
     _wait(page, "Number(document.querySelector('.stage').dataset.samples ?? 0) > 8")

@@ -18,6 +18,7 @@ import trimesh
 
 ROOT = Path(__file__).resolve().parents[2]
 START_SECONDS = 60
+STOP_SECONDS = 40
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox",
     "--use-gl=angle",
@@ -65,7 +66,10 @@ class RunningServer:
     def stop(self) -> None:
         if self.process and self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-            self.process.wait(20)
+            try:
+                self.process.wait(STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
 
     @property
     def address(self) -> str:

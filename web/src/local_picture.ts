@@ -300,8 +300,8 @@ function completeVertexMaterials(geometry: BufferGeometry, authored: MeshStandar
   return count;
 }
 
-/** Of selected parts, as GLSL. */
-const HIGHLIGHT = 'vec3(1.0, 0.62, 0.15)';
+/** Of selected parts, as GLSL: a blue that few captured things have. */
+const HIGHLIGHT = 'vec3(0.1, 0.65, 1.0)';
 
 /** Radiance 1 from everywhere: the light of an asset that was imported without any. */
 function constantEnvironment(): DataTexture {

@@ -9,6 +9,8 @@ import { Stream } from './stream';
 
 /** Edits of one drag go out at most this often; the server makes one undo step of those that share a key. */
 const DRAG_INTERVAL_MS = 40;
+/** Well below what the server calls one drag (500 ms): messages take their time. */
+const COALESCE_MS = 350;
 
 let stream: Stream | null = null;
 let helloListener: ((hello: ServerHello) => void) | null = null;
@@ -221,9 +223,16 @@ export function useCapturedLight(): void {
 
 export const isTwin = (edit: Edit) => (other: Edit) => edit.op === 'deform' && other.op === 'deform' && edit.map != null && edit.map.type === other.map?.type;
 
-/** Another moment of what moves: each says where everything is, whatever came before. */
+let timeEditedAt = -Infinity;
+
+/** Another moment of what moves, in place of the last one: a film is one step of the log however slowly it plays. */
 export function editTime(edit: Edit): void {
-  sendFlowing(`time.${edit.op}`, edit);
+  const now = performance.now();
+  const flows = now - timeEditedAt < COALESCE_MS && log.value.edits.at(-1)?.op === edit.op;
+  timeEditedAt = now;
+  if (flows) return sendFlowing(`time.${edit.op}`, edit);
+  if (rewrite) return;
+  replaceEdits(withReplaced(edits.value, edit, (other) => other.op === edit.op), false);
 }
 
 // ---- edits that take an earlier one's place ------------------------------------------------------------------------------

@@ -143,6 +143,7 @@ export class Viewport {
 
   private onFrame = (header: FrameHeader, picture: ImageBitmap, cameraNumber: number) => {
     this.newestFrame = header.frameId;
+    if (draft.value) return picture.close(); // of a log that is being changed: neither what was nor what will be
     const shown =
       cameraNumber === this.cameraNumber &&
       header.stateRev >= log.value.revision &&
@@ -213,7 +214,7 @@ export class Viewport {
     });
     effect(() => {
       if (selectionWeights.value) this.local?.setHighlighted(selectionWeights.value);
-      if (flash.value > 0) this.flashedAt = performance.now();
+      if (flash.value > 0) this.flashedAt = NaN; // from the next picture on, however late that is
     });
     effect(() => {
       this.stage.dataset.before = String(before.value);
@@ -306,6 +307,7 @@ export class Viewport {
 
   private drawLocal(now: number, moved: boolean): void {
     if (!this.local?.hasMesh) return;
+    if (Number.isNaN(this.flashedAt)) this.flashedAt = now;
     const since = now - this.flashedAt;
     const flashing = since < FLASH_MS;
     const strength = !flashing ? 0 : this.stillMotion ? 0.5 : 0.85 * Math.sin((2 * Math.PI * since) / FLASH_MS) ** 2;
