@@ -12,12 +12,15 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
+from server.settle_memory import settle_memory
 from server.viewer import Viewer
 
 T = TypeVar("T")
 
 LONGEST_WAIT_SECONDS = 1.0
 PAUSE_AFTER_ERROR_SECONDS = 2.0
+SETTLE_AFTER_SLICES = (1, 30)
+"""The first pictures load kernels and all that they need."""
 
 
 class RenderThread:
@@ -29,6 +32,7 @@ class RenderThread:
         self._viewers: list[Viewer] = []
         self._failed_until: dict[Viewer, float] = {}
         self._stopping = False
+        self._slices = 0
         self._on_error = on_error
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
 
@@ -113,6 +117,9 @@ class RenderThread:
     def _serve(self, viewer: Viewer) -> None:
         try:
             viewer.work()
+            self._slices += 1
+            if self._slices in SETTLE_AFTER_SLICES:
+                settle_memory()
         except Exception as error:
             # One viewer's failure is told to it and must not end the others'.
             logging.getLogger(__name__).exception("rendering failed")

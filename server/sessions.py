@@ -27,6 +27,7 @@ from server.problems import ProblemError
 from server.render_session import AbstractLoadedAsset, AbstractRenderer
 from server.render_thread import RenderThread
 from server.settings import Limits
+from server.settle_memory import settle_memory
 from server.viewer import Posed, Viewer
 from worker.asset_folder import folder_bytes
 from worker.data_directory import DataDirectory
@@ -219,7 +220,13 @@ class SessionRegistry:
         async with self._loading:
             if session.asset_id not in self._loaded:
                 folder, environments = self._directory.asset(session.asset_id), self._directory.environments
-                self._loaded[session.asset_id] = await self._call(lambda: self._renderer.load(folder, environments))
+
+                def load() -> AbstractLoadedAsset:
+                    loaded = self._renderer.load(folder, environments)
+                    settle_memory()
+                    return loaded
+
+                self._loaded[session.asset_id] = await self._call(load)
             loaded = self._loaded[session.asset_id]
             self._loaded.move_to_end(session.asset_id)
             self._unload_some()
