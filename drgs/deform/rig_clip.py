@@ -72,7 +72,7 @@ class BoundRig:
         rest = self.rest
         # float64 up to the gradients: edges are short, and their ends' rounding would turn normals.
         vertices = carry_points(self.binding, moved.vertices, rig_gradients(self.alignment.place(self.rest_pose), moved))
-        gradient = limit_stretch(surface_gradients(self.surface, vertices), LARGEST_STRETCH).to(rest.vertices.dtype)
+        gradient = limit_stretch(surface_gradients(self.surface, vertices).to(rest.vertices.dtype), LARGEST_STRETCH)
         vertices = vertices.to(rest.vertices.dtype)
         normals = carry_normals(rest.normals, gradient)
         if rest.centers is None or rest.tangents is None or self.surfels is None:

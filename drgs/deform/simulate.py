@@ -216,7 +216,8 @@ def limit_stretch(gradients: Tensor, largest: float = LARGEST_STRETCH) -> Tensor
     """(n, 3, 3) with singular values from 1 / largest to largest; matrices that have such values are returned as they were."""
     # sigma_1 <= |F|, and sigma_3 >= J / sigma_1^2.
     size = gradients.flatten(1).norm(dim=1)
-    suspect = (size > largest) | (torch.linalg.det(gradients) < size.square() / largest)
+    volume = (torch.linalg.cross(gradients[..., 0], gradients[..., 1]) * gradients[..., 2]).sum(-1)
+    suspect = (size > largest) | (volume < size.square() / largest)
     if not bool(suspect.any()):
         return gradients
     u, s, vt = torch.linalg.svd(gradients[suspect].double())
