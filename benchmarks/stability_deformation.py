@@ -19,7 +19,7 @@ NOTES = {
     "meshes": "A ball whose vertices a file moves: F from its faces, and surfels of length 1 on its vertices.",
     "handles": "A bar of length 4 held at both ends. `missed`: mean distance of held vertices from their targets, as surfels see it.",
     "neighbourhoods": "Points carried by particles; errors in spacings of the particles, for a rigid and an affine motion.",
-    "strained matter": "A cube falling at 1 m/s, let go with such an elastic F in the particles of a corner (3 %; see surfels), at rest elsewhere.",
+    "strained matter": "A cube falling at 1 m/s, let go with such an elastic F in the particles of a corner (5 %; see surfels), at rest elsewhere.",
     "stiffness": "The cube hits the floor at 3 m/s; stiff ones for a shorter time.",
     "incompressibility": "The same at E = 1e5 Pa.",
     "speed": "The same at 10 m/s, every law.",
@@ -38,8 +38,8 @@ LIMITS = """
 - **Poisson's ratio** up to 0.49, **C** up to 0.9; more is refused. Past that, up to twice the limit, nothing becomes NaN, but what happens is
   not right: energy grows by two orders of magnitude, unless a failure makes the step smaller.
 - **Strained matter**: where four halvings of the time step do not help, what failed is frozen where it is, up to three times more, then
-  everything; the report counts it. Stretches of 30 in a few particles do that to the elastic laws; squeezed to a thousandth they may gain
-  energy. Sand, clay and snow yield instead. A fluid squeezed to a twentieth takes hundreds of times more steps than one at rest.
+  everything; the report counts it. Stretches of 10 to 30 in some particles do that to the elastic laws and their neighbours, a compression to
+  a twentieth to fluids. Sand, clay and snow yield instead.
 - **Speed**: a hundred m/s into a wall is right; ten thousand, a thousand times faster than its waves, end in a corner, finite and meaningless.
 - **Substeps**: 2000 a call by default; more are refused with a sentence that names wave speed and cell size.
 - **Particles** cannot leave the room; one that starts outside is refused.
