@@ -167,6 +167,27 @@ class Client:
             last = found
             time.sleep(interval_seconds)
 
+    def wait(self, job: JobInfo | str, bar: bool = True) -> JobInfo:
+        """The job once it is done, with a progress bar on stderr meanwhile where that is a terminal.
+
+        Raises:
+            ServerError: it failed or was cancelled; the text is its reason.
+        """
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        found: JobInfo | None = None
+        with Progress(*columns, console=console, disable=not (bar and console.is_terminal), transient=True) as progress:
+            task = progress.add_task("queued", total=1.0)
+            for found in self.watch(job):
+                progress.update(task, completed=found.fraction, description=f"{found.name}: {found.stage or found.state} {found.message}")
+        assert found is not None
+        if found.state != "done":
+            raise ServerError(409, found.error or f"The job {found.name} was {found.state}.")
+        return found
+
     # ---- assets and environments ------------------------------------------------------------------------------------
 
     def assets(self, limit: int = 50, offset: int = 0, search: str | None = None) -> AssetList:

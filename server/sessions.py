@@ -163,10 +163,12 @@ class SessionRegistry:
                 there = select(SessionRow.id).join(AssetRow, AssetRow.id == SessionRow.asset_id).where(AssetRow.deleted_at.is_(None))
                 return list(database.scalars(there.order_by(SessionRow.created_at.desc()).limit(100)))
 
-        # Replayed ones are not kept: they may live in another server, whose changes would not arrive here.
-        return [
-            self._live.get(session_id) or await asyncio.to_thread(self._replay, session_id) for session_id in await asyncio.to_thread(ids)
-        ]
+        found: list[LiveSession] = []
+        for session_id in await asyncio.to_thread(ids):
+            live = self._live.get(session_id)
+            # Replayed ones are not kept: they may live in another server, whose changes would not arrive here.
+            found.append(live if live is not None else await asyncio.to_thread(self._replay, session_id))
+        return found
 
     async def remove(self, session_id: str) -> None:
         """

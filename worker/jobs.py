@@ -120,7 +120,7 @@ def _job_context(job_id: str) -> JobContext:
     """Also counts the attempt."""
     worker, row = _worker(), _read_job(job_id)
     _update_job(job_id, attempts=JobRow.attempts + 1)
-    parameters = {"preset": row.preset, "seed": row.seed} | row.parameters
+    parameters = row.parameters if row.kind != "build" else {"preset": row.preset, "seed": row.seed} | row.parameters
     limits = JobLimits.model_validate(parameters.get("limits", {}))
     return JobContext(
         job_id=job_id,

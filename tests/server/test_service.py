@@ -15,6 +15,7 @@ import psutil
 import pytest
 
 from drgs.client import Client, ServerError
+from examples import turntable, variants_sheet
 from server.run import serve
 from worker.builders import BUILDER_VARIABLE
 
@@ -130,6 +131,27 @@ def test_acknowledged_edits_are_there_after_kill_9_of_the_server(running: ServeP
     assert frames[-1][0].state_rev == 6 and frames[-1][0].spp >= 16 and frames[-1][1].startswith(b"\x89PNG")
     with pytest.raises(ServerError, match="No session"):
         client.session("0" * 32)
+    address = f"{client.address}/#token={client._headers['Authorization'].removeprefix('Bearer ')}"
+    turntable.main(
+        [
+            address,
+            asset.id,
+            str(tmp_path / "turn.mp4"),
+            "--frames",
+            "2",
+            "--size",
+            "32x32",
+            "--spp",
+            "4",
+            "--environment",
+            client.environments()[0].name,
+        ]
+    )
+    assert b"ftyp" in (tmp_path / "turn.mp4").read_bytes()[:12]
+    variants_sheet.main([address, asset.id, str(tmp_path / "sheet.png"), "--side", "16", "--steps", "2", "--spp", "4"])
+    assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(ServerError, match="No environment"):
+        turntable.main([address, asset.id, str(tmp_path / "none.mp4"), "--environment", "none.exr"])
 
 
 def test_the_server_refuses_to_listen_to_the_world(tmp_path: Path) -> None:
