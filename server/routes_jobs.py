@@ -118,7 +118,7 @@ def _parse_request(body: bytes) -> JobRequest:
     except (ValueError, RecursionError) as error:
         raise ProblemError(422, f"body: expected a JSON object; {error}") from error
     kind = document.get("kind", "build") if isinstance(document, dict) else "build"
-    if kind not in JOB_REQUESTS:
+    if not isinstance(kind, str) or kind not in JOB_REQUESTS:
         raise ProblemError(422, f"kind: expected one of {', '.join(JOB_REQUESTS)}; found {str(kind)[:40]!r}")
     try:
         return JOB_REQUESTS[kind].model_validate_json(body)

@@ -1,0 +1,90 @@
+"""Jobs of every kind as they are asked for: what is stored is what a worker can read, and wrong ones are refused with a sentence."""
+
+import threading
+from pathlib import Path
+
+import pytest
+from conftest import Service
+from test_rest import is_problem
+
+from worker import jobs
+from worker.builders import build_with_drgs
+
+ASSET = "a" * 32
+RENDER = {"kind": "render", "asset": ASSET}
+
+
+def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: Service, tmp_path: Path) -> None:
+    service.add_asset(ASSET)
+    built = service.client.post("/api/jobs", json={"dataset": "sample", "preset": "draft"}).json()
+    context = jobs.WorkerContext(service.context.directory, service.context.engine, "w", build_with_drgs, "cpu", threading.Event())
+    jobs.set_context(context)
+    service.add_asset(built["id"], "built")
+    requests = [
+        {"kind": "redecouple", "asset": built["id"]},
+        {"kind": "simulate", "asset": ASSET, "scene": {"particles": 100}, "name": "fall"},
+        RENDER | {"turntable": {"frames": 2}, "video_fps": 10, "priority": 3},
+        {"kind": "export", "asset": ASSET, "formats": ["glb", "ply"]},
+    ]
+    found = [service.client.post("/api/jobs", json=request) for request in requests]
+    assert [response.status_code for response in found] == [202] * 4, [response.text for response in found]
+    infos = [built, *(response.json() for response in found)]
+    assert [info["kind"] for info in infos] == ["build", "redecouple", "simulate", "render", "export"]
+    assert [info["source_asset"] for info in infos] == [None, built["id"], ASSET, ASSET, ASSET]
+    assert (infos[2]["name"], infos[3]["name"], infos[3]["priority"]) == ("fall", "ball", 3)
+    steps = {info["kind"]: jobs._RUNS[info["kind"]](jobs._job_context(info["id"])).steps for info in infos}
+    assert steps["build"] == ("read", "fit", "mesh", "materials", "pack", "register")
+    assert steps["redecouple"] == ("copy", *steps["build"])
+    assert (steps["simulate"], steps["export"]) == (("simulate",), ("export glb", "export ply"))
+    assert steps["render"] == ("render asset ",)
+    redecoupled = jobs._job_context(infos[1]["id"])
+    assert redecoupled.parameters["built_preset"] == "draft" and redecoupled.dataset == service.settings.sample_capture.resolve()
+
+
+CAMERA = {"name": "a", "world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+
+
+@pytest.mark.parametrize(
+    ("request_", "status", "words"),
+    [
+        ({"kind": "launch"}, 422, "expected one of build"),
+        ({"kind": ["build"]}, 422, "expected one of build"),
+        (RENDER | {"asset": "b" * 32}, 404, "No asset"),
+        ({"kind": "redecouple", "asset": ASSET}, 409, "built here"),
+        ({"kind": "simulate", "asset": ASSET, "scene": {"gravity": "much"}}, 422, "gravity"),
+        ({"kind": "export", "asset": ASSET, "formats": ["glb", "glb"]}, 422, "once"),
+        (RENDER | {"environments": ["none.exr"]}, 422, "No environment"),
+        (RENDER | {"environments": ["../token"]}, 422, "environments"),
+        (RENDER | {"cameras": [CAMERA], "turntable": {}}, 422, "both"),
+        (RENDER | {"cameras": [CAMERA, CAMERA | {"name": "A"}]}, 422, "same name"),
+        (RENDER | {"cameras": [CAMERA | {"name": "../a"}]}, 422, "name"),
+        (RENDER | {"width": 4096, "height": 4096, "spp": 60000}, 422, "fewer pixels"),
+        (RENDER | {"clip": "clips/" + "0" * 32}, 422, "no clip"),
+        (RENDER | {"variants": [{"name": "v", "edits": [{"op": "deform", "vertices": "/etc/passwd"}]}]}, 422, "vertices"),
+        (RENDER | {"variants": [{"name": "v", "edits": [{"op": "pose", "clip": "../x", "time": 0}]}]}, 422, "no clip"),
+        (RENDER | {"limits": {"memory_bytes": 1}}, 422, "memory_bytes"),
+    ],
+)
+def test_a_wrong_request_is_refused(service: Service, request_: dict, status: int, words: str) -> None:
+    service.add_asset(ASSET)
+    assert words in is_problem(service.client.post("/api/jobs", json=request_), status)
+    assert service.client.get("/api/jobs").json()["total"] == 0
+
+
+def test_results_are_listed_downloaded_in_ranges_and_deleted_with_their_job(service: Service) -> None:
+    service.add_asset(ASSET)
+    job = service.client.post("/api/jobs", json=RENDER).json()["id"]
+    url, folder = f"/api/jobs/{job}", service.context.directory.job_files(job)
+    assert service.client.get(f"{url}/files").json() == {"files": []} and service.client.get(f"{url}/log").text == ""
+    folder.mkdir(parents=True)
+    (folder / "a.png").write_bytes(b"0123456789")
+    (folder / "b.part").write_bytes(b"half")
+    assert service.client.get(f"{url}/files").json()["files"] == [{"name": "a.png", "bytes": 10, "media_type": "image/png"}]
+    part = service.client.get(f"{url}/files/a.png", headers={"Range": "bytes=2-4"})
+    assert (part.status_code, part.content) == (206, b"234") and "attachment" in part.headers["content-disposition"]
+    for name in ("..%2F..%2Ftoken", "none.png", ".lock"):
+        assert service.client.get(f"{url}/files/{name}").status_code == 404
+    assert "cancel it first" in is_problem(service.client.delete(url), 409)
+    service.client.post(f"{url}/cancel")
+    assert service.client.delete(url).status_code == 204
+    assert not folder.exists() and service.client.get(url).status_code == 404
