@@ -153,12 +153,12 @@ def test_kill_9_in_any_stage_repeats_no_finished_one_and_gives_the_same_asset(be
         assert sum(step.startswith(f"{name}: finished") for step in steps) == 1, steps
 
 
-def test_a_job_beyond_its_limits_ends_with_a_sentence_and_keeps_its_checkpoint(bench: Bench) -> None:
+def test_a_job_beyond_its_limits_ends_with_a_sentence(bench: Bench) -> None:
     job = bench.submit(iterations=200, seconds=0.05, limits={"seconds": 0.5})
     bench.start_worker()
     bench.wait_for(job, "failed")
     assert bench.row(job).error == "The job took longer than its limit of 0.5 s."
-    assert (bench.directory.job(job) / "asset.build" / "checkpoint.json").exists()
+    assert not bench.directory.asset(job).exists()
 
 
 def test_jobs_of_lower_number_run_first(bench: Bench) -> None:
@@ -218,13 +218,13 @@ def test_a_failed_job_says_why_and_can_be_retried(bench: Bench) -> None:
 
 
 def test_another_worker_takes_over_what_a_dead_one_left(bench: Bench) -> None:
-    job = bench.submit(iterations=30, seconds=0.05)
-    first = bench.start_worker()
-    bench.wait(lambda: bench.row(job).iteration >= 2)
-    second = bench.start_worker()
+    workers = {worker.pid: worker for worker in (bench.start_worker(), bench.start_worker())}
     bench.wait(lambda: len(bench.queue.alive_workers()) == 2)
+    job = bench.submit(iterations=30, seconds=0.05)
+    bench.wait(lambda: bench.row(job).iteration >= 2)
     with pytest.raises(JobNotInState, match="worker is alive"):
         bench.queue.resume(job)
+    first = workers.pop(bench.iterations_run(job)[0][0])
     first.kill()
     first.wait()
     dead = bench.row(job).worker_id
@@ -236,7 +236,7 @@ def test_another_worker_takes_over_what_a_dead_one_left(bench: Bench) -> None:
     assert bench.queue.requeue_worker(dead) == [job]
     assert bench.queue.requeue_dead() in ([], [job])
     bench.wait_for(job, "done")
-    assert bench.iterations_run(job)[-1][0] == second.pid
+    assert bench.iterations_run(job)[-1][0] in workers
 
 
 def test_an_unknown_job_is_not_done(bench: Bench) -> None:
