@@ -132,4 +132,7 @@ def ball(viewer: Viewer, ball_file: Path) -> Viewer:
     expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=120_000)
     viewer.page.get_by_role("button", name="Library").click()
     viewer.settle()
+    # The object may have come before or after the panel went: frame it in what is free now.
+    viewer.page.keyboard.press("Shift+F")
+    viewer.settle()
     return viewer

@@ -98,7 +98,8 @@ function events(asset: string): ConstructorParameters<typeof Stream>[1] {
           takeLog(log.value);
           return continueRewrite();
         case 'rejected':
-          rewrite = draft.value = null;
+          rewrite = null; // first: who hears of the draft's end must find no rewrite
+          draft.value = null;
           later = [];
           pending.value = pending.value.filter((waiting) => waiting.id !== message.id);
           return notify(message.reason);
@@ -284,7 +285,8 @@ function continueRewrite(): void {
   const { after } = rewrite;
   const now = log.value.edits;
   if (sameEdits(now, after) || rewrite.attempts-- === 0) {
-    rewrite = draft.value = null;
+    rewrite = null; // first: who hears of the draft's end must find no rewrite
+    draft.value = null;
     while (!rewrite && later.length) later.shift()!();
     return;
   }
@@ -293,6 +295,9 @@ function continueRewrite(): void {
   for (let steps = now.length - same; steps > 0; steps--) stream.undo();
   for (const edit of after.slice(same)) stream.sendEdit(edit, null);
 }
+
+/** Whether the server's log is between what was and what will be. */
+export const isRewriting = () => rewrite !== null;
 
 export function undo(): void {
   if (rewrite) return void later.push(undo);

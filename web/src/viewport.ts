@@ -5,7 +5,7 @@
  * picture is hidden and a fresh one fades in; without it the newest traced picture always stays.
  */
 
-import { effect } from '@preact/signals';
+import { effect, untracked } from '@preact/signals';
 import CameraControls from 'camera-controls';
 import { Box3, Matrix4, MOUSE, PerspectiveCamera, Quaternion, Raycaster, Sphere, Spherical, Vector2, Vector3, Vector4 } from 'three';
 import * as api from './api';
@@ -14,7 +14,8 @@ import { frameBox } from './framing';
 import { LocalPace } from './local_pace';
 import { LocalPicture } from './local_picture';
 import { FLAG_CONVERGED, FLAG_MOVING, MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from './protocol.gen';
-import { editLight, listen, pick, sendCamera } from './session';
+import { isRewriting, listen, pick, sendCamera } from './session';
+import { listenToPointers } from './pointers';
 import { paint, selectAt } from './selecting';
 import { viewNow, type Row, type View } from './viewpoint';
 import { deformPoints, isAnalytic } from './shape';
@@ -22,10 +23,6 @@ import { balls, ballsWanted, before, capturedLight, draft, edits, flash, flying,
 
 CameraControls.install({ THREE: { MOUSE, Vector2, Vector3, Vector4, Quaternion, Matrix4, Spherical, Box3, Sphere, Raycaster } });
 
-const DEGREES_PER_PIXEL = 0.4;
-/** A press that moves less and is let go sooner is a click [pixels, ms]. */
-const CLICK_PIXELS = 4;
-const CLICK_MS = 500;
 const BALL_PIXELS = 72;
 const SKY_PIXELS = 160;
 /** How long a selection shows, in two pulses. */
@@ -52,14 +49,14 @@ export class Viewport {
   /** Set by changes that no camera number or revision tells: settings. Frames up to this id may still show the old ones. */
   private staleUpTo = 0;
   private fresh = false;
+  /** Of the picture on the traced canvas. */
+  private drawn = { revision: -1, camera: -1, frame: 0, enough: false };
+  private held: { header: FrameHeader; picture: ImageBitmap; cameraNumber: number } | null = null;
   private localDirty = true;
   private readonly localPace = new LocalPace();
   private localSharp = true;
   private localMesh = '';
   private localEnvironment = '';
-  private turning: { pointer: number; x: number; rotation: number } | null = null;
-  private pressed: { pointer: number; x: number; y: number; at: number } | null = null;
-  private painting: number | null = null;
   private flashedAt = -Infinity;
   private readonly stillMotion = matchMedia('(prefers-reduced-motion: reduce)').matches;
   private readonly flight: Flight;
@@ -84,7 +81,11 @@ export class Viewport {
     }
     this.flight = new Flight(this.camera, this.controls, this.bounds);
     listen(this.onHello, this.onFrame);
-    this.listenToPointers();
+    listenToPointers(stage, this.controls, {
+      select: (event) => this.selectAt(event),
+      paint: (event) => this.paintAt(event),
+      focus: (event) => this.focusAt(event),
+    });
     new ResizeObserver(this.onResize).observe(stage);
     this.followState();
     requestAnimationFrame(this.tick);
@@ -143,13 +144,15 @@ export class Viewport {
 
   private onFrame = (header: FrameHeader, picture: ImageBitmap, cameraNumber: number) => {
     this.newestFrame = header.frameId;
-    if (draft.value) return picture.close(); // of a log that is being changed: neither what was nor what will be
-    const shown =
-      cameraNumber === this.cameraNumber &&
-      header.stateRev >= log.value.revision &&
-      pending.value.length === 0 &&
-      draft.value === null &&
-      (header.frameId > this.staleUpTo || (header.flags & FLAG_CONVERGED) !== 0);
+    this.held?.picture.close();
+    this.held = null;
+    if (isRewriting()) {
+      // Of neither what was nor what will be, unless it is the last one: then it is wanted.
+      this.held = { header, picture, cameraNumber };
+      return;
+    }
+    const asSet = header.frameId > this.staleUpTo || (header.flags & FLAG_CONVERGED) !== 0;
+    const shown = asSet && cameraNumber === this.cameraNumber && header.stateRev >= log.value.revision && pending.value.length === 0 && draft.value === null;
     const enough = header.spp >= Math.min(settings.value.denoise ? SHOW_FROM_SAMPLES.denoised : SHOW_FROM_SAMPLES.raw, header.sppTarget) && !(header.flags & FLAG_MOVING);
     if (this.tracedCanvas.width !== header.width || this.tracedCanvas.height !== header.height) {
       this.tracedCanvas.width = header.width;
@@ -160,6 +163,7 @@ export class Viewport {
     this.stage.dataset.tracedFrames = String(Number(this.stage.dataset.tracedFrames ?? 0) + 1);
     this.stage.dataset.samples = String(header.spp);
     this.stage.dataset.revision = String(header.stateRev);
+    this.drawn = { revision: header.stateRev, camera: cameraNumber, frame: header.frameId, enough };
     this.setFresh(shown && (enough || this.fresh));
   };
 
@@ -191,6 +195,16 @@ export class Viewport {
         last = now;
         this.setFresh(false);
       }
+    });
+    effect(() => {
+      // A picture may come before the news that it shows the newest edits; a slider put back where it was asks for no new one.
+      const settled = draft.value === null && pending.value.length === 0;
+      const { revision } = log.value;
+      if (!settled) return;
+      const { held, drawn } = this;
+      this.held = null;
+      if (held) untracked(() => this.onFrame(held.header, held.picture, held.cameraNumber));
+      else if (drawn.revision === revision && drawn.camera === this.cameraNumber && drawn.enough && drawn.frame > this.staleUpTo) this.setFresh(true);
     });
     effect(() => {
       localPicture.value;
@@ -362,73 +376,6 @@ export class Viewport {
   };
 
   // ---- pointers ----------------------------------------------------------------------------------------------------------
-
-  private listenToPointers(): void {
-    const { stage, controls } = this;
-    const { ACTION } = CameraControls;
-    stage.addEventListener(
-      'pointerdown',
-      (event) => {
-        const turns = (event.button === 0 && event.altKey) || (event.button === 2 && event.shiftKey);
-        this.pressed = event.button === 0 && event.isPrimary ? { pointer: event.pointerId, x: event.clientX, y: event.clientY, at: event.timeStamp } : null;
-        if (event.button === 0 && tool.value === 'brush' && !turns && this.paintAt(event)) this.painting = event.pointerId;
-        controls.enabled = !turns && this.painting === null;
-        if (this.painting !== null) stage.setPointerCapture(event.pointerId);
-        controls.mouseButtons.middle = event.shiftKey ? ACTION.TRUCK : event.ctrlKey ? ACTION.DOLLY : ACTION.ROTATE;
-        if (!turns) return;
-        this.turning = { pointer: event.pointerId, x: event.clientX, rotation: light.value.rotation };
-        stage.setPointerCapture(event.pointerId);
-        event.preventDefault();
-      },
-      { capture: true },
-    );
-    stage.addEventListener('pointermove', (event) => {
-      const { turning } = this;
-      if (event.pointerId === this.painting) this.paintAt(event);
-      if (!turning || event.pointerId !== turning.pointer) return;
-      const degrees = turning.rotation + (event.clientX - turning.x) * DEGREES_PER_PIXEL;
-      editLight({ rotation: Math.round((((degrees % 360) + 360) % 360) * 10) / 10 });
-    });
-    const release = () => {
-      this.turning = this.painting = this.pressed = null;
-      controls.enabled = true;
-    };
-    stage.addEventListener('pointerup', (event) => {
-      const { pressed } = this;
-      const isClick = pressed?.pointer === event.pointerId && Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) < CLICK_PIXELS && event.timeStamp - pressed.at < CLICK_MS;
-      if (isClick && !event.altKey && tool.value !== 'all' && tool.value !== 'brush') this.selectAt(event);
-      release();
-    });
-    stage.addEventListener('pointercancel', release);
-    stage.addEventListener('contextmenu', (event) => event.preventDefault());
-    stage.addEventListener('dblclick', (event) => {
-      this.focusAt(event);
-    });
-    // A second tap soon after the first, near it: what a double-click is to a mouse.
-    let tap = { at: -Infinity, x: 0, y: 0 };
-    stage.addEventListener('pointerup', (event) => {
-      if (event.pointerType !== 'touch' || !event.isPrimary) return;
-      const again = event.timeStamp - tap.at < 300 && Math.hypot(event.clientX - tap.x, event.clientY - tap.y) < 24;
-      tap = { at: again ? -Infinity : event.timeStamp, x: event.clientX, y: event.clientY };
-      if (again) this.focusAt(event);
-    });
-    // Arrow keys orbit and + - zoom while the picture has the focus: the camera works without a mouse too.
-    stage.addEventListener('keydown', (event) => {
-      const step = Math.PI / 36;
-      const moves: Record<string, () => void> = {
-        ArrowLeft: () => void controls.rotate(-step, 0, true),
-        ArrowRight: () => void controls.rotate(step, 0, true),
-        ArrowUp: () => void controls.rotate(0, -step, true),
-        ArrowDown: () => void controls.rotate(0, step, true),
-        '+': () => void controls.dolly(0.1 * controls.distance, true),
-        '-': () => void controls.dolly(-0.1 * controls.distance, true),
-      };
-      const move = event.target === stage && !flying.value && !event.ctrlKey && !event.metaKey ? moves[event.key] : undefined;
-      if (!move) return;
-      event.preventDefault();
-      move();
-    });
-  }
 
   /** Share of the picture's width and height at a pointer. */
   private shareAt(event: MouseEvent): [number, number] {

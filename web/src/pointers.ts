@@ -1,0 +1,86 @@
+/** What mouse, pen, fingers and arrow keys do to the picture, beside what camera-controls does by itself. */
+
+import CameraControls from 'camera-controls';
+import { editLight } from './session';
+import { flying, light, tool } from './state';
+
+const DEGREES_PER_PIXEL = 0.4;
+/** A press that moves less and is let go sooner is a click [pixels, ms]. */
+const CLICK_PIXELS = 4;
+const CLICK_MS = 500;
+/** A second tap this soon after the first, this near it, is what a double-click is to a mouse. */
+const TAP_MS = 300;
+const TAP_PIXELS = 24;
+
+export interface PointerActions {
+  select(event: PointerEvent): void;
+  /** False where the brush met nothing: the drag then is the camera's. */
+  paint(event: PointerEvent): boolean;
+  focus(event: MouseEvent): void;
+}
+
+export function listenToPointers(stage: HTMLElement, controls: CameraControls, on: PointerActions): void {
+  const { ACTION } = CameraControls;
+  let turning: { pointer: number; x: number; rotation: number } | null = null;
+  let pressed: { pointer: number; x: number; y: number; at: number } | null = null;
+  let painting: number | null = null;
+  stage.addEventListener(
+    'pointerdown',
+    (event) => {
+      const turns = (event.button === 0 && event.altKey) || (event.button === 2 && event.shiftKey);
+      pressed = event.button === 0 && event.isPrimary ? { pointer: event.pointerId, x: event.clientX, y: event.clientY, at: event.timeStamp } : null;
+      if (event.button === 0 && tool.value === 'brush' && !turns && on.paint(event)) painting = event.pointerId;
+      controls.enabled = !turns && painting === null;
+      if (painting !== null) stage.setPointerCapture(event.pointerId);
+      controls.mouseButtons.middle = event.shiftKey ? ACTION.TRUCK : event.ctrlKey ? ACTION.DOLLY : ACTION.ROTATE;
+      if (!turns) return;
+      turning = { pointer: event.pointerId, x: event.clientX, rotation: light.value.rotation };
+      stage.setPointerCapture(event.pointerId);
+      event.preventDefault();
+    },
+    { capture: true },
+  );
+  stage.addEventListener('pointermove', (event) => {
+    if (event.pointerId === painting) on.paint(event);
+    if (!turning || event.pointerId !== turning.pointer) return;
+    const degrees = turning.rotation + (event.clientX - turning.x) * DEGREES_PER_PIXEL;
+    editLight({ rotation: Math.round((((degrees % 360) + 360) % 360) * 10) / 10 });
+  });
+  const release = () => {
+    turning = painting = pressed = null;
+    controls.enabled = true;
+  };
+  stage.addEventListener('pointerup', (event) => {
+    const isClick = pressed?.pointer === event.pointerId && Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) < CLICK_PIXELS && event.timeStamp - pressed.at < CLICK_MS;
+    if (isClick && !event.altKey && tool.value !== 'all' && tool.value !== 'brush') on.select(event);
+    release();
+  });
+  stage.addEventListener('pointercancel', release);
+  stage.addEventListener('contextmenu', (event) => event.preventDefault());
+  stage.addEventListener('dblclick', (event) => {
+    on.focus(event);
+  });
+  let tap = { at: -Infinity, x: 0, y: 0 };
+  stage.addEventListener('pointerup', (event) => {
+    if (event.pointerType !== 'touch' || !event.isPrimary) return;
+    const again = event.timeStamp - tap.at < TAP_MS && Math.hypot(event.clientX - tap.x, event.clientY - tap.y) < TAP_PIXELS;
+    tap = { at: again ? -Infinity : event.timeStamp, x: event.clientX, y: event.clientY };
+    if (again) on.focus(event);
+  });
+  // Arrow keys orbit and + - zoom while the picture has the focus: the camera works without a mouse too.
+  stage.addEventListener('keydown', (event) => {
+    const step = Math.PI / 36;
+    const moves: Record<string, () => void> = {
+      ArrowLeft: () => void controls.rotate(-step, 0, true),
+      ArrowRight: () => void controls.rotate(step, 0, true),
+      ArrowUp: () => void controls.rotate(0, -step, true),
+      ArrowDown: () => void controls.rotate(0, step, true),
+      '+': () => void controls.dolly(0.1 * controls.distance, true),
+      '-': () => void controls.dolly(-0.1 * controls.distance, true),
+    };
+    const move = event.target === stage && !flying.value && !event.ctrlKey && !event.metaKey ? moves[event.key] : undefined;
+    if (!move) return;
+    event.preventDefault();
+    move();
+  });
+}
