@@ -20,6 +20,7 @@ from drgs.build.bind_gaussians import bind_gaussians
 from drgs.build.checkpoint import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.build.densify import DensifySettings, Pull
 from drgs.build.extract_mesh import FAST_MESH, FULL_MESH, DepthMap, MeshSettings, clean_mesh, extract_mesh, mesh_report
+from drgs.build.find_masks import find_masks, with_drawn_masks
 from drgs.build.fit_gaussians import (
     FitReport,
     FitSettings,
@@ -109,6 +110,8 @@ class Preset:
 
 
 BINDINGS = ("particles", "mesh")
+MASKS = "masks.safetensors"
+"""Of a capture that has none of its own."""
 CHECKPOINTS = ("stage1.safetensors", "mesh.safetensors", "stage2.safetensors", "mesh_surfels.safetensors", "stage2_mesh.safetensors")
 """In the order of the stages, first those of either binding and of particles."""
 PRESETS = {
@@ -252,16 +255,21 @@ def build_stages(
     reporter.report("read", 0.0, "reading the capture")
     views = load_views(dataset, max_side=preset.image_side)
     points = initial_points(views, preset.points, settings.seed)
-    timed("read", started)
     identity = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
-    yield "read", None
     if not settings.resume:
-        for stale in CHECKPOINTS:  # else a later --resume would take them for this build's
+        for stale in (MASKS, *CHECKPOINTS):  # else a later --resume would take them for this build's
             (work / stale).unlink(missing_ok=True)
+    fit_settings = replace(preset.fit, seed=settings.seed)
+    if not views.has_masks:
+        masked = _found_masks(views, points, fit_settings, device, work, identity, settings.resume, reporter, stop_now)
+        points = _points_of_found_masks(masked, points, preset.points, settings.seed)
+    timed("read", started)
+    yield "read", None
 
     started = time.monotonic()
-    fit_settings = replace(preset.fit, seed=settings.seed)
     fit = _stage_one(views, points, fit_settings, device, work, identity, settings.resume, reporter, stop_now)
+    if not views.has_masks:
+        views = with_drawn_masks(views, gaussians_from_state(fit), 0.01 * points.bounds_radius)
     timed("fit", started)
     yield "fit", None
 
@@ -346,10 +354,36 @@ def capture_digest(views: Views) -> str:
     return digest.hexdigest()[:16]
 
 
+def _found_masks(views, points, fit_settings, device, work, identity, resume, reporter, stop_now) -> Views:
+    """find_masks, kept in `work`."""
+    path = work / MASKS
+    if resume and path.exists():
+        tensors, facts = read_tensors(path, torch.device("cpu"))
+        _same_build(facts, identity, path)
+        return replace(views, coverage=tensors["coverage"], has_masks=True)
+
+    def report(r: FitReport, _state: FitState) -> None:
+        reporter.report("read", r.iteration / r.iterations, "no masks: looking for the object", r)
+
+    masked = find_masks(views, points, fit_settings, device, report, stop_now)
+    if masked is None:
+        raise BuildStopped
+    write_tensors(path, {"coverage": masked.coverage}, identity)
+    return masked
+
+
+def _points_of_found_masks(masked: Views, points: InitialPoints, count: int, seed: int) -> InitialPoints:
+    """Points on the found masks' hull; the given ones where the masks have none."""
+    try:
+        return initial_points(masked, count, seed)
+    except ValueError:  # a first guess may be wrong where the user's own masks may not: the fit then starts from random points
+        return points
+
+
 def _stage_one(views, points, fit_settings, device, work, identity, resume, reporter, stop_now) -> FitState:
     """fit_gaussians with checkpoints in `work`."""
     path = work / "stage1.safetensors"
-    state = start_fit(points, fit_settings, device)
+    state = start_fit(points, fit_settings, device, views.has_masks)
     if resume and path.exists():
         tensors, facts = read_tensors(path, device)
         _same_build(facts, identity, path)

@@ -132,7 +132,7 @@ def _masks(views: Views, points: InitialPoints) -> _Section:
     if not views.has_masks:
         finding = Finding(
             "warning",
-            "There are no masks: the background becomes part of the object.",
+            "There are no masks: the build looks for the object itself, and what stands close to it becomes part of it.",
             "Save pictures with an alpha channel, or put masks of the same names (white object, black background) in masks/.",
         )
         return {"present": False, "mean_coverage": None, "touching_border": [], "empty": [], "disagreeing": []}, [finding]
@@ -334,7 +334,7 @@ def _points(views: Views, points: InitialPoints) -> _Section:
         findings.append(
             Finding(
                 "warning",
-                "There are neither masks nor sparse points: the build starts from random points.",
+                "There are neither masks nor sparse points: the build looks for the object from random points.",
                 "Add masks, or run COLMAP and pass its folder.",
             )
         )

@@ -35,10 +35,12 @@ from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.render.rasterize_gbuffer import RasterSettings, face_camera, facing_normals, rasterize
 from drgs.scene.camera import Camera, pixel_rays_world
-from drgs.scene.environment import Environment
+from drgs.scene.environment import Environment, uv_from_direction
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.views import Views
 
+BACKGROUND_ROWS = 64
+"""Of the picture of the surroundings that captures without masks are given, by direction alone."""
 ENVIRONMENT_PYRAMID = (8, 32, 128)
 """Rows of the tables whose upsampled sum is the log of the environment: coarse light settles first."""
 
@@ -57,6 +59,8 @@ class FitSettings:
     """Share of the iterations before the residual may depend on the view (one degree each tenth after)."""
     weight_dissimilarity: float = 0.2
     weight_mask: float = 0.1
+    weight_coverage: float = 0.02
+    """Without masks: the mean coverage costs this much, so that what the background shows as well is not the object's."""
     weight_normal: float = 0.05
     weight_normal_smooth: float = 0.02
     weight_residual: float = 0.1
@@ -89,12 +93,14 @@ class FitState:
     generator: torch.Generator
 
 
-def start_fit(points: InitialPoints, settings: FitSettings, device: torch.device) -> FitState:
-    """Surfels on the initial points under a uniform light."""
+def start_fit(points: InitialPoints, settings: FitSettings, device: torch.device, has_masks: bool = True) -> FitState:
+    """Surfels on the initial points under a uniform light; without masks, before a grey background."""
     parameters = initial_parameters(points, device, settings.seed)
     for rows in ENVIRONMENT_PYRAMID:
         value = math.log(INITIAL_LIGHT) if rows == ENVIRONMENT_PYRAMID[0] else 0.0
         parameters[f"environment_{rows}"] = torch.full((1, 3, rows, 2 * rows), value, device=device, requires_grad=True)
+    if not has_masks:
+        parameters["background"] = torch.zeros(1, 3, BACKGROUND_ROWS, 2 * BACKGROUND_ROWS, device=device, requires_grad=True)
     optimizer = make_optimizer(parameters, settings.rates, points.bounds_radius)
     generator = torch.Generator().manual_seed(settings.seed)
     return FitState(parameters, optimizer, Pull.zeros(len(points.points_world), device), 0, generator)
@@ -161,6 +167,17 @@ def scaled_camera(camera: Camera, factor: float) -> Camera:
     width, height = round(camera.width * factor), round(camera.height * factor)
     scale = torch.diag(torch.tensor([width / camera.width, height / camera.height, 1.0], device=camera.intrinsics.device))
     return Camera(camera.camera_from_world, scale @ camera.intrinsics, width, height, camera.name)
+
+
+def background_image(background: Tensor, camera: Camera) -> Tensor:
+    """(height, width, 3) sRGB of the surroundings, from their logits (1, 3, rows, 2 rows) in the environment's layout; differentiable."""
+    uv = uv_from_direction(pixel_rays_world(camera)[1])
+    wrapped = torch.cat([background[..., -1:], background, background[..., :1]], -1)
+    columns = wrapped.shape[-1]
+    x = (uv[..., 0] * (columns - 2) + 1) / columns
+    grid = torch.stack([2 * x - 1, 2 * uv[..., 1] - 1], -1)[None]
+    sampled = torch.nn.functional.grid_sample(wrapped, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    return torch.sigmoid(sampled[0]).permute(1, 2, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,12 +263,16 @@ def fit_gaussians(
         box = pick_box(target)
         image = display_image(maps.radiance_linear[box], maps.coverage[box], target.saturation[box])
         photo = target.photo[box]
+        if not views.has_masks:
+            image = image + (1 - maps.coverage[box])[..., None] * background_image(parameters["background"], target.camera)[box]
         weight = settings.weight_dissimilarity
         loss = (1 - weight) * (image - photo).abs().mean()
         if weight > 0:
             loss = loss + weight * structural_dissimilarity(image, photo)
         if views.has_masks:
             loss = loss + settings.weight_mask * mask_loss(maps.coverage, target.mask)
+        else:
+            loss = loss + settings.weight_coverage * maps.coverage.mean()
         if progress > 0.02:
             normal_term = normal_consistency(maps.normal_world, maps.depth, maps.coverage, target.camera)
             loss = loss + settings.weight_normal * min(1.0, (progress - 0.02) * 10) * normal_term

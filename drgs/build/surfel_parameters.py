@@ -81,7 +81,8 @@ def make_optimizer(parameters: dict[str, Tensor], rates: LearningRates, radius: 
     """One group a name, in the order of `parameters`."""
     groups = []
     for name, value in parameters.items():
-        rate = getattr(rates, "environment" if name.startswith("environment") else name) * (radius if name == "centers" else 1.0)
+        light = name.startswith("environment") or name == "background"
+        rate = getattr(rates, "environment" if light else name) * (radius if name == "centers" else 1.0)
         groups.append({"params": [value], "lr": rate, "name": name})
     return torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
 
