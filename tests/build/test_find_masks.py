@@ -55,7 +55,7 @@ def unmasked(folder: Path) -> Views:
 
 
 def test_the_object_is_found_before_its_surroundings(unmasked: Views, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(find_masks_module, "ITERATIONS", 100)
+    monkeypatch.setattr(find_masks_module, "ITERATIONS", 150)
     assert not unmasked.has_masks
     settings = FitSettings(densify=DensifySettings(every=40))
     found = find_masks(unmasked, initial_points(unmasked, 1500, seed=0), settings, CPU)
@@ -89,7 +89,7 @@ def test_smaller_views_keep_the_mean_and_the_rays(unmasked: Views) -> None:
 
 def test_a_build_without_masks_stops_while_it_looks_and_resumes(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "tiny", TINY)
-    monkeypatch.setattr(find_masks_module, "ITERATIONS", 12)
+    monkeypatch.setattr(find_masks_module, "ITERATIONS", 40)
     settings, heard = BuildSettings(preset="tiny", device="cpu"), []
     whole = asset_tensors(build_asset(folder, tmp_path / "whole", settings, heard.append))
     assert any(isinstance(line, Progress) and "looking for the object" in line.message for line in heard)
@@ -97,7 +97,7 @@ def test_a_build_without_masks_stops_while_it_looks_and_resumes(folder: Path, tm
         build_asset(folder, tmp_path / "stopped", settings, should_stop=lambda: True)
     asked = iter(range(10**6))
     with pytest.raises(BuildStopped):  # between two steps of stage 1, after the search
-        build_asset(folder, tmp_path / "stopped", settings, should_stop=lambda: next(asked) > 20)
+        build_asset(folder, tmp_path / "stopped", settings, should_stop=lambda: next(asked) > 50)
     resumed = asset_tensors(build_asset(folder, tmp_path / "stopped", dataclasses.replace(settings, resume=True)))
     assert whole.keys() == resumed.keys()
     exact = [name for name, value in whole.items() if torch.equal(value, resumed[name])]
