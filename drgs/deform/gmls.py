@@ -67,6 +67,21 @@ class Weights:
 
 
 @wp.kernel
+def mark_still(
+    first: int,
+    motion: wp.array[Motion],
+    # outputs
+    still: wp.array[wp.bool],
+):
+    i = first + wp.tid()
+    largest = float(0.0)
+    for k in range(12):
+        if motion[i][k] != 0.0:  # NaN is no rest
+            largest = 1.0
+    still[i] = largest == 0.0
+
+
+@wp.kernel
 def gather_motion(
     first: int,
     motion: wp.array[Motion],
@@ -221,10 +236,12 @@ def polar_rotation(gradient: Tensor) -> Tensor:
 def _gather(weights: Weights, psi: Tensor, shift: Tensor, matrix: Tensor, base: Tensor, diagonal: float) -> tuple[Tensor, Tensor, Tensor]:
     """Positions (point, 3), gradients (point, 3, 3) and their determinants (point,)."""
     motion = torch.cat([shift, matrix.reshape(-1, 9)], 1).float().contiguous()
+    still = torch.empty(len(motion), dtype=torch.bool, device=base.device)
+    launch(mark_still, len(motion), [wp.from_torch(motion, dtype=Motion)], [warp_array(still)], warp_device(base), 1)
     position = torch.empty_like(base)
     gradient = torch.empty(len(base), 3, 3, device=base.device)
     inputs = [
-        wp.from_torch(motion, dtype=Motion), warp_array((motion == 0).all(1)), warp_array(weights.neighbours), warp_array(psi), warp_array(weights.lever, wp.vec3),
+        wp.from_torch(motion, dtype=Motion), warp_array(still), warp_array(weights.neighbours), warp_array(psi), warp_array(weights.lever, wp.vec3),
         warp_array(base, wp.vec3), diagonal,
     ]  # fmt: skip
     volume = torch.empty(len(base), device=base.device)
