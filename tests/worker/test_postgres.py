@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,7 +38,7 @@ class PostgresBench(Bench):
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[PostgresBench]:
     # A socket's path has at most 107 characters, so the cluster cannot live deep in pytest's folder.
-    folder = Path(os.path.realpath("/tmp")) / f"drgs-pg-{os.getpid()}"
+    folder = Path(tempfile.gettempdir()) / f"drgs-pg-{os.getpid()}"
     server = pgserver.get_server(folder, cleanup_mode="delete")
     try:
         server.psql("create database drgs;")
