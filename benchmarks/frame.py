@@ -65,10 +65,15 @@ def main(arguments: list[str]) -> None:
 
 
 def orbit(asset: Asset, size: int) -> Iterator[Camera]:
-    """Cameras around the asset's middle, a degree apart, at a distance of four times its radius, as captures have it."""
-    low, high = (asset.mesh.vertices.cpu().double().amin(0), asset.mesh.vertices.cpu().double().amax(0))
-    middle, radius = (low + high) / 2, float((high - low).norm()) / 2
-    focal = size / (2 * math.tan(0.275))
+    """Cameras around the asset's middle, a degree apart, that show it as large as the asset's own cameras do."""
+    vertices = asset.mesh.vertices.cpu().double()
+    middle = (vertices.amin(0) + vertices.amax(0)) / 2
+    radius = float((vertices - middle).norm(dim=-1).max())
+    distance, field = 4 * radius, 0.55  # of an imported mesh, which has none
+    if asset.cameras:
+        distance = statistics.median(float((camera.center_world.double() - middle).norm()) for camera in asset.cameras)
+        field = statistics.median(2 * math.atan(0.5 * camera.width / float(camera.intrinsics[0, 0])) for camera in asset.cameras)
+    focal = size / (2 * math.tan(field / 2))
     intrinsics = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     degrees = 0
     while True:
@@ -77,7 +82,7 @@ def orbit(asset: Asset, size: int) -> Iterator[Camera]:
         right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 0, 1], dtype=torch.float64), back), dim=0)
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = torch.stack([right, torch.linalg.cross(back, right), back], -1)
-        pose[:3, 3] = middle + 4 * radius * back
+        pose[:3, 3] = middle + distance * back
         yield camera_from_opengl(pose, intrinsics, size, size)
         degrees += 1
 

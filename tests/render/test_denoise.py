@@ -7,7 +7,7 @@ import torch
 
 from drgs.reference import denoise as reference
 from drgs.render.accumulate import RenderSettings
-from drgs.render.denoise import LEVELS, denoise, denoise_svgf, filter_maps, filter_maps_simd, reflectances
+from drgs.render.denoise import denoise, denoise_svgf, filter_maps, filter_maps_simd, levels_for, reflectances
 from drgs.render.records import GBuffer, Radiance
 from drgs.render.render_frame import render_frame
 from drgs.render.trace_primary import trace_primary
@@ -37,7 +37,7 @@ def test_kernel_filters_as_the_reference_does(device: str) -> None:
     exact = GBuffer(**{f.name: getattr(gbuffer, f.name).double() for f in dataclasses.fields(gbuffer)})
     parts = (noisy.diffuse.double() / factors[0], noisy.specular.double() / factors[1])
     variance = torch.full((40, 40, 2), 0.3**2, dtype=torch.float64)
-    for level in range(LEVELS):
+    for level in range(levels_for(moved.samples)):
         parts, variance = reference.filter_level(parts, variance, exact, 1 / float(CAMERA.intrinsics[0, 0]), 1 << level)
     covered = gbuffer.coverage > 0
     torch.testing.assert_close(ours.diffuse.cpu()[covered].double(), (parts[0] * factors[0])[covered], atol=1e-4, rtol=1e-3)
@@ -51,7 +51,7 @@ def test_sixteen_pixels_at_once_are_the_pixels_one_by_one(size: int) -> None:
     maps = (torch.rand(size, size, 3), torch.rand(size, size, 3), 0.1 * torch.rand(size, size, 2))
     covered = gbuffer.coverage > 0
     footprint = 1 / float(camera.intrinsics[0, 0])
-    for one, other in zip(filter_maps(maps, gbuffer, footprint), filter_maps_simd(maps, gbuffer, footprint), strict=True):
+    for one, other in zip(filter_maps(maps, gbuffer, footprint, 5), filter_maps_simd(maps, gbuffer, footprint, 5), strict=True):
         torch.testing.assert_close(one[covered], other[covered], atol=1e-5, rtol=1e-4)
 
 
@@ -111,3 +111,8 @@ def test_a_denoiser_that_is_not_there_is_named() -> None:
     gbuffer = trace_primary(sphere_mesh(1), CAMERA)
     with pytest.raises(ValueError, match="oidn"):
         denoise(noisy_radiance(gbuffer, 0.1), gbuffer, CAMERA, "oidn")
+
+
+def test_fewer_rounds_are_run_the_more_is_known() -> None:
+    rounds = [levels_for(samples) for samples in (1, 8, 32, 64, 4096)]
+    assert rounds == sorted(rounds, reverse=True) and rounds[0] > rounds[2] > rounds[3] >= 1
