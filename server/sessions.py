@@ -392,7 +392,7 @@ class SessionRegistry:
             raise ProblemError(422, f"No environment is called {edit.file[:100]!r}; GET /api/environments lists them.")
         if isinstance(edit, DeformEdit) and edit.vertices is not None:
             raise ProblemError(
-                422, "A deform edit over the network has a `map`; `vertices` names a file and works with `drgs render` only."
+                422, "A deform edit over the network has a `map` or `handles`; `vertices` names a file and works with `drgs render` only."
             )
         if isinstance(edit, PoseEdit) and not (
             _CLIP.fullmatch(edit.clip) and (self._directory.environments / edit.clip / "clip.json").is_file()
