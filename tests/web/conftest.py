@@ -29,9 +29,13 @@ class Viewer:
 
     def edits(self) -> list[dict]:
         """The open session's edits as the server has them."""
+        return self.session()["edits"]
+
+    def session(self) -> dict:
+        """What the server says of the open session."""
         asset = self.page.evaluate("new URLSearchParams(location.hash.slice(1)).get('asset')")
         session = self.page.evaluate(f"localStorage.getItem('drgs.session.{asset}')")
-        return self.server.ask(f"/api/sessions/{session}")["edits"]
+        return self.server.ask(f"/api/sessions/{session}")
 
     def open_tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()
@@ -49,9 +53,15 @@ class Viewer:
         return wait_until(lambda: len(found := self.edits()) == count and [found], f"{count} edits in the server's log")[0]
 
     def settle(self) -> None:
-        """Wait for a traced picture of the newest edits and the newest camera."""
+        """Wait for a traced picture of the newest camera and of the newest edits that the server, not only the page, knows of."""
+
+        def is_settled() -> bool:
+            revision = self.session()["revision"]
+            shown = self.stage()
+            return shown.get("moving") == "false" and shown.get("fresh") == "true" and int(shown.get("revision", -1)) >= revision
+
         wait_until(
-            lambda: self.stage().get("moving") == "false" and self.stage().get("fresh") == "true",
+            is_settled,
             lambda: f"a fresh traced picture; the page says: {self.page.locator('.hud, .notices').all_inner_texts()}",
         )
 

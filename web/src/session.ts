@@ -228,11 +228,11 @@ let timeEditedAt = -Infinity;
 
 /** Another moment of what moves, in place of the last one: a film is one step of the log however slowly it plays. */
 export function editTime(edit: Edit): void {
+  if (rewrite) return void later.push(() => editTime(edit));
   const now = performance.now();
   const flows = now - timeEditedAt < COALESCE_MS && log.value.edits.at(-1)?.op === edit.op;
   timeEditedAt = now;
   if (flows) return sendFlowing(`time.${edit.op}`, edit);
-  if (rewrite) return;
   replaceEdits(withReplaced(edits.value, edit, (other) => other.op === edit.op), false);
 }
 

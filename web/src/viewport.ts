@@ -151,9 +151,12 @@ export class Viewport {
       this.held = { header, picture, cameraNumber };
       return;
     }
-    const asSet = header.frameId > this.staleUpTo || (header.flags & FLAG_CONVERGED) !== 0;
+    // The first answer to a change counts as moving, yet may have all its samples from before; nothing follows then.
+    const converged = (header.flags & FLAG_CONVERGED) !== 0;
+    const asSet = converged || header.frameId > this.staleUpTo;
     const shown = asSet && cameraNumber === this.cameraNumber && header.stateRev >= log.value.revision && pending.value.length === 0 && draft.value === null;
-    const enough = header.spp >= Math.min(settings.value.denoise ? SHOW_FROM_SAMPLES.denoised : SHOW_FROM_SAMPLES.raw, header.sppTarget) && !(header.flags & FLAG_MOVING);
+    const few = Math.min(settings.value.denoise ? SHOW_FROM_SAMPLES.denoised : SHOW_FROM_SAMPLES.raw, header.sppTarget);
+    const enough = converged || (header.spp >= few && !(header.flags & FLAG_MOVING));
     if (this.tracedCanvas.width !== header.width || this.tracedCanvas.height !== header.height) {
       this.tracedCanvas.width = header.width;
       this.tracedCanvas.height = header.height;
