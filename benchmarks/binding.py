@@ -6,8 +6,8 @@
 SOURCE is a capture, or the OUT of an earlier `drgs build` whose checkpoints are still beside it (then name its --dataset).
 `static`: test views as the fit itself draws them (split sum), PSNR of the surfels as fitted (particles), rebuilt on the mesh, and rebuilt
 without a part: the ablations of drgs2026, Fig. 9 (offset, opacity), and Alg. 1 as printed. `--iterations 0` leaves this table out.
-`deform`: finished assets of both bindings under the capture's own deformations, given as a map, and as moved vertices by the corrected and
-by the printed Eq. 8, traced and scored like `drgs eval`.
+`deform`: finished assets of both bindings under the capture's own deformations, given as a map (surfels by the exact rule and by Eq. 7), and as
+moved vertices by the corrected and by the printed Eq. 8, traced and scored like `drgs eval`.
 """
 
 import argparse
@@ -32,6 +32,7 @@ from drgs.build.initial_points import initial_points
 from drgs.build.load_views import load_cameras, load_views
 from drgs.build.mesh_surfels import mesh_surfels
 from drgs.build.split_sum import filter_environment
+from drgs.deform.carry_gaussians import carry_tangents
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.maps import evaluate_map
 from drgs.deform.pose_scene import pose_scene
@@ -52,7 +53,7 @@ VARIANTS = {
     "mesh_paper": {"variant": "paper"},
 }
 """Settings that differ from MeshFitSettings."""
-DRIVERS = ("map", "vertices", "vertices_paper")
+DRIVERS = ("map", "map_paper", "vertices", "vertices_paper")
 
 
 def main(arguments: list[str]) -> None:
@@ -179,6 +180,12 @@ def driven(asset: Asset, analytic_map: dict, driver: str, light: list[Edit], fol
     if driver == "map":
         return pose_scene(asset, [edit, *light])
     assert isinstance(edit, DeformEdit) and edit.map is not None
+    if driver == "map_paper":
+        scene, gaussians = pose_scene(asset, [edit, *light]), asset.gaussians
+        assert gaussians is not None and scene.surfels is not None
+        _, gradients = evaluate_map(edit.map, gaussians.centers)
+        tangents = carry_tangents(surfel_tangents(gaussians), gradients, "paper")
+        return replace(scene, surfels=replace(scene.surfels, tangents=tangents))
     vertices, _ = evaluate_map(edit.map, asset.mesh.vertices)
     path = (folder / "moved.npz").resolve()
     np.savez(path, vertices=vertices.cpu().numpy())
