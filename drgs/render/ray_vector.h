@@ -86,7 +86,7 @@ const auto split_at = [&](const auto& samples, const auto& points, int point, in
     split[0] = min_int((int)((float)samples.cosine * share + 0.5f), count - 1);
     const float clamped = 1.0f - 4.0f * points.roughness.data[point];
     const float mirror = (1.0f - share) * (clamped > 0.0f ? (clamped < 1.0f ? clamped : 1.0f) : 0.0f);
-    split[2] = (int)((float)samples.environment * (1.0f - mirror) + 0.5f);
+    split[2] = min_int(max_int((int)((float)samples.environment * (1.0f - mirror) + 0.5f), 1), samples.environment);
     split[1] = count - split[0] - split[2];
 };
 // strategy_of of sample_rays.py: a sample's strategy, and its number in the sequence of that strategy

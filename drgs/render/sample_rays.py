@@ -111,7 +111,8 @@ def split_at(samples: SampleSet, points: PointArrays, point: int) -> wp.vec3i:
     share = diffuse / wp.max(diffuse + specular, 1.0e-6)
     cosine = wp.min(int(float(samples.cosine) * share + 0.5), total - 1)
     mirror = (1.0 - share) * wp.clamp(1.0 - 4.0 * points.roughness[point], 0.0, 1.0)
-    environment = int(float(samples.environment) * (1.0 - mirror) + 0.5)
+    # One stays wherever there are any: it alone finds light in the lobe's far tail, and without it the variance would not show that it is missed.
+    environment = wp.min(wp.max(int(float(samples.environment) * (1.0 - mirror) + 0.5), 1), samples.environment)
     return wp.vec3i(cosine, total - cosine - environment, environment)
 
 

@@ -90,6 +90,21 @@ def test_sharing_samples_out_by_material_keeps_the_mean(metallic: float, roughne
     assert abs(float(means[0].mean() - means[1].mean())) < 4 * error + 1e-5
 
 
+def test_a_mirror_keeps_a_sample_of_the_environment() -> None:
+    """A smooth metal in a pass of four samples: light that only the lobe's far tail reflects is found, or at least known to be missing."""
+    points = points_seen_at([40.0], roughness=0.1, metallic=1.0, copies=400)
+    sky = torch.zeros(32, 64, 3)
+    sky[3, 40] = 1e3  # far from the mirror direction
+    light = environment_light(Environment(sky), build_environment_table(Environment(sky)))
+    starts = RayStarts(points.position_world + 100 * points.normal_world, points.normal_world)
+    tracer = build_tracer(sphere_mesh(1, radius=1e-3))
+    means = [
+        float(shade(points, starts, light, tracer, SampleCounts(*counts), 0, 0, by_material=True).specular.mean())
+        for counts in ((0, 3, 1), (0, 3, 61))
+    ]
+    assert means[1] > 0 and abs(means[0] / means[1] - 1) < 0.2
+
+
 def test_sharing_samples_out_by_material_lowers_the_error_on_metal() -> None:
     points = points_seen_at([40.0], roughness=0.2, metallic=1.0, copies=400)
     sky = sunny_sky(sun=5.0)
