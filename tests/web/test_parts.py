@@ -95,6 +95,7 @@ def test_multiplying_keeps_what_was_captured_apart(ball: Viewer) -> None:
     type_number(ball, "Roughness", "0.5")
     (edit,) = ball.wait_for_edits(1)
     assert edit["mode"] == "multiply" and edit["set"]["roughness"] == 0.5
+    ball.settle()  # the page has heard of the first
     # Another factor takes the first one's place instead of multiplying it.
     type_number(ball, "Roughness", "0.25")
     wait_until(lambda: [edit["set"].get("roughness") for edit in ball.edits()] == [0.25], "one edit with the new factor")
