@@ -1,10 +1,9 @@
 """Time the material point method: a cube of 1 m falls onto a floor; one frame is 1/24 s.
 
-    python -m benchmarks simulate [--particles 20000] [--law fixed_corotated] [--young 1e5] [--frames 6] [--json] [--sweep | --stability]
+    python -m benchmarks simulate [--particles 20000] [--law fixed_corotated] [--young 1e5] [--frames 6] [--json] [--sweep]
 
 --sweep runs the same fall with time steps from half the default to twice it, and prints how much of the energy is left and how far the
-particles end from where the smallest step leads. --stability runs extremes of stiffness, incompressibility, speed and number, and says
-what became of each: docs/stability.md.
+particles end from where the smallest step leads. For extremes see `stability_deformation`.
 """
 
 import argparse
@@ -44,13 +43,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--dx", type=float, help="Cell size [m]; by default eight particles a cell.")
     parser.add_argument("--sweep", action="store_true")
-    parser.add_argument("--stability", action="store_true")
     given = parser.parse_args(arguments)
     if given.particles < 1 or given.frames < 1:
         raise ValueError(f"--particles and --frames are {given.particles} and {given.frames}; expected at least 1 of each")
-    if given.stability:
-        print(json.dumps(stability(), indent=None if given.json else 1))
-        return
     material = Material(given.law, young_modulus=given.young, bulk_modulus=given.young, yield_stress=1e3)
     model = falling_cube(given.particles, material, given.device, dx=given.dx)
     result = sweep(model) if given.sweep else measure(model, given.frames)
@@ -115,52 +110,6 @@ def sweep(model: Model, seconds: float = 0.25) -> dict:
             }
         )
     return {"particles": len(model.rest), "sweep": rows}
-
-
-def stability() -> list[dict]:
-    """One row for each extreme: what was done, and what became of it."""
-    rows = []
-
-    def attempt(
-        what: str, model: Model, settings: MpmSettings | None = None, seconds: float = 0.1, velocity: tuple = (0.0, 0.0, -3.0)
-    ) -> None:
-        start = rest_state(model, velocity)
-        before = measure_balance(model, start)
-        row = {"case": what, "particles": len(model.rest)}
-        clock = time.perf_counter()
-        try:
-            state, report = advance(model, start, seconds, settings or MpmSettings(max_substeps=20_000))
-        except ValueError as error:
-            rows.append(row | {"result": f"refused: {error}"})
-            return
-        finite = all(bool(torch.isfinite(value).all()) for value in (state.positions, state.velocities, state.total))
-        row |= {
-            "substeps": report.substeps,
-            "retries": report.retries,
-            "frozen": report.frozen,
-            "finite": finite,
-            "at_wall": report.at_wall,
-        }
-        row |= {
-            "energy_left": round(measure_balance(model, state).energy / before.energy, 4),
-            "seconds": round(time.perf_counter() - clock, 2),
-        }
-        rows.append(row | {"result": f"fastest {float(state.velocities.norm(dim=-1).max()):.2f} m/s"})
-
-    for exponent in range(2, 10):
-        attempt(f"E = 1e{exponent} Pa", falling_cube(512, Material(young_modulus=10.0**exponent)), seconds=0.1 if exponent < 8 else 0.02)
-    for ratio in (0.0, 0.45, 0.49):
-        for law in ("fixed_corotated", "neo_hookean"):
-            attempt(f"nu = {ratio}, {law}", falling_cube(512, Material(law, young_modulus=1e5, poisson_ratio=ratio)))
-    for law in LAWS:
-        attempt(f"{law}, 10 m/s", falling_cube(512, Material(law, yield_stress=1e3)), velocity=(0.0, 0.0, -10.0))
-    for courant in (0.2, 0.4, 0.8, 0.9):
-        attempt(f"C = {courant}", falling_cube(4096, Material()), MpmSettings(courant=courant, max_substeps=20_000))
-    for count in (1, 8, 1000, 100_000):
-        attempt(f"{count} particles", falling_cube(count, Material(young_modulus=1e4)), seconds=0.05)
-    attempt("out of the room at 100 m/s", falling_cube(512, Material()), velocity=(100.0, 60.0, 80.0))
-    attempt("2000 substeps allowed, E = 1e9 Pa", falling_cube(4096, Material(young_modulus=1e9)), MpmSettings(), seconds=FRAME * 4)
-    return rows
 
 
 if __name__ == "__main__":

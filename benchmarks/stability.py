@@ -1,9 +1,9 @@
-"""Light transport at its extremes: float32 against the float64 twins, energy, and what is refused. Rewrites docs/stability.md.
+"""Light transport at its extremes: float32 against the float64 twins, energy, and what is refused. Rewrites its section of docs/stability.md.
 
     python -m benchmarks stability [--json] [--page FILE] [--largest-sky 4096]
 
-The section between the two markers of the page is replaced by what was measured; the rest of the page stays (its table of matter is
-`python -m benchmarks simulate --stability`). About a minute on two cores; the largest sky takes 4 GB, half the height a quarter.
+Deformation and matter have theirs from `stability_deformation`. About a minute on two cores; the largest sky takes 4 GB, half the height a
+quarter.
 """
 
 import argparse
@@ -13,10 +13,9 @@ from pathlib import Path
 
 from benchmarks import _light_sweeps as sweeps
 from benchmarks._light_sweeps import Row
+from benchmarks._stability_page import PAGE, markers, rewritten
 
-PAGE = Path(__file__).parent.parent / "docs" / "stability.md"
-START = "<!-- light transport: written by python -m benchmarks stability -->"
-END = "<!-- light transport: end -->"
+BETWEEN = markers("light transport", "stability")
 
 INTRODUCTION = """
 ## Light transport
@@ -90,17 +89,6 @@ def number(value: float | None) -> str:
     return "–" if value is None else "0" if value == 0 else f"{value:.1e}"
 
 
-def rewritten(page: str, text: str) -> str:
-    """The page with its section replaced.
-
-    Raises:
-        ValueError: the page lacks the markers.
-    """
-    if page.count(START) != 1 or page.count(END) != 1:
-        raise ValueError(f"the page holds its markers {page.count(START)} and {page.count(END)} times; expected once each: {START} {END}")
-    return page[: page.index(START) + len(START)] + "\n" + text + page[page.index(END) :]
-
-
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks stability", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -110,9 +98,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--largest-sky", type=int, default=4096, help="height [texels]")
     given = parser.parse_args(arguments)
     page = given.page.read_text()
-    rewritten(page, "")  # complain before measuring
+    rewritten(page, BETWEEN, "")  # complain before measuring
     found = measure(given.largest_sky)
-    given.page.write_text(rewritten(page, section(found)))
+    given.page.write_text(rewritten(page, BETWEEN, section(found)))
     if given.json:
         print(json.dumps({name: [asdict(row) for row in rows] for name, rows in found.items()}))
 

@@ -103,11 +103,11 @@ def test_nobody_leaves_the_room_and_who_starts_outside_is_refused():
     assert "more than 2000" in refused(rows)["E = 1e9 Pa, 4096 particles, 1/6 s in one call"]
 
 
-def test_the_page_has_every_section_and_every_refusal():
+def test_the_page_has_every_sweep_and_every_refusal():
     rows = [Row("a case", {"energy_left": 0.5}), Row("another", refused="no")]
-    text = stability_deformation.page(dict.fromkeys(stability_deformation.NOTES, rows))
+    text = stability_deformation.section(dict.fromkeys(stability_deformation.NOTES, rows))
     assert text.count("| a case | 0.5 | 0 |") == text.count("- another: refused: no") == len(stability_deformation.NOTES)
-    assert "## Limits" in text
+    assert "### Limits" in text
     bad = Row("bad", not_finite=sweeps.count_not_finite(torch.tensor([1.0, torch.nan, torch.inf])))
     with pytest.raises(AssertionError):
         assert_contained([bad])

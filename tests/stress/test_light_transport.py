@@ -1,11 +1,14 @@
 """Light transport at its extremes: small sweeps of what `python -m benchmarks stability` measures at length (docs/stability.md)."""
 
+import re
+
 import pytest
 import torch
 
 from benchmarks import _light_sweeps as sweeps
+from benchmarks import stability, stability_deformation
 from benchmarks._light_sweeps import Row
-from benchmarks.stability import END, START, rewritten
+from benchmarks._stability_page import PAGE, rewritten
 from drgs.render.environment_table import MAX_RADIANCE, build_environment_table
 from drgs.render.sample_rays import SampleCounts
 from drgs.render.trace_rays import build_tracer
@@ -117,7 +120,17 @@ def test_surfels_at_their_extremes_follow_float64_and_give_finite_frames() -> No
 
 
 def test_the_page_is_rewritten_between_its_markers_only() -> None:
-    page = f"before\n{START}\nold\n{END}\nafter\n"
-    assert rewritten(page, "new\n") == f"before\n{START}\nnew\n{END}\nafter\n"
+    start, end = stability.BETWEEN
+    page = f"before\n{start}\nold\n{end}\nafter\n"
+    assert rewritten(page, stability.BETWEEN, "new\n") == f"before\n{start}\nnew\n{end}\nafter\n"
     with pytest.raises(ValueError, match="markers 0 and 1 times"):
-        rewritten(page.replace(START, ""), "new")
+        rewritten(page.replace(start, ""), stability.BETWEEN, "new")
+
+
+@pytest.mark.parametrize("benchmark", [stability, stability_deformation], ids=["light", "matter"])
+def test_the_page_has_what_each_benchmark_writes(benchmark) -> None:
+    start, end = benchmark.BETWEEN
+    page = PAGE.read_text()
+    section = page[page.index(start) : page.index(end)]
+    assert benchmark.INTRODUCTION in section and benchmark.LIMITS in section
+    assert re.findall("^### (.*)", section, re.MULTILINE)[:-1] == [name.capitalize() for name in benchmark.NOTES]
