@@ -6,8 +6,9 @@ digits.
 """
 
 import math
+import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.checkpoint_simulation import read_progress, save_progress
 from drgs.deform.clip import ClipFrame, blend_frames, save_clip
 from drgs.deform.drive_mesh import vertex_gradients
 from drgs.deform.fill_particles import FillSettings, Particles, fill_particles
@@ -37,6 +39,7 @@ from drgs.deform.mpm import (
     make_model,
     rest_state,
 )
+from drgs.deform.simulation_progress import SimulationProgress
 from drgs.deform.simulation_scene import Files, SimulationScene, make_condition, make_material, make_shape, refuse_files
 from drgs.scene.asset import Asset
 from drgs.scene.gaussians import surfel_tangents
@@ -110,7 +113,7 @@ class Simulation:
         _, nearest = cKDTree(local.cpu().numpy()).query(points.cpu().numpy()) if bool(self._loose.any()) else (None, [])
         self._nearest_vertex = torch.as_tensor(nearest, device=local.device)
         self._state = _first_state(self.model, scene)
-        self._totals = {"substeps": 0, "retries": 0, "frozen": 0, "sleeping": 0, "wall": False}
+        self._totals: dict[str, int | bool] = {"substeps": 0, "retries": 0, "frozen": 0, "sleeping": 0, "wall": False}
         self._still = 0
         tangents = None if asset.gaussians is None else surfel_tangents(asset.gaussians)
         self._rest_tangents = tangents
@@ -129,6 +132,18 @@ class Simulation:
     def state(self) -> State:
         """Matter at the last frame computed, about the object's centre."""
         return self._state
+
+    @property
+    def progress(self) -> SimulationProgress:
+        """What was computed so far."""
+        with self._lock:
+            return SimulationProgress(tuple(self._frames), self._state, dict(self._totals), self._still)
+
+    def go_on_from(self, progress: SimulationProgress) -> None:
+        """As if what another run of the same asset and scene had made had been computed here."""
+        with self._lock:
+            self._frames, self._state = list(progress.frames), progress.state
+            self._totals, self._still = dict(progress.totals), progress.still
 
     def frame(self, index: int) -> ClipFrame:
         """Frame `index`, or the last of the scene if it has fewer; computed now if need be."""
@@ -186,29 +201,36 @@ def simulate(
     out: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     find: Files = refuse_files,
+    checkpoint: Path | None = None,
 ) -> tuple[list[ClipFrame], SimulationReport]:
     """Simulate a whole scene, and write it as a clip if `out` says where.
 
     Args:
         progress: told of each finished frame and of how many there will be.
         find: the files that the scene names.
+        checkpoint: folder that keeps every finished frame, and from which an interrupted run goes on, to the same clip; removed in the end.
 
     Raises:
         ValueError: one sentence: the mesh encloses nothing, the scene does not fit, or `out` is taken.
     """
     simulation = Simulation(asset, scene, find)
-
-    def frames() -> Iterator[ClipFrame]:
-        for index in range(simulation.frame_count):
-            yield simulation.frame(index)
-            if progress is not None:
-                progress(index + 1, simulation.frame_count)
-
-    if out is None:
-        return list(frames()), simulation.report
-    kept = list(frames())
-    details = {"scene": scene.model_dump(mode="json"), "report": vars(simulation.report) | {"warnings": list(simulation.report.warnings)}}
-    save_clip(out, kept, scene.fps, details)
+    if checkpoint is not None:
+        simulation.go_on_from(read_progress(checkpoint, simulation.progress, scene.model_dump_json()))
+    found, kept = len(simulation.progress.frames), []
+    for index in range(simulation.frame_count):
+        kept.append(simulation.frame(index))
+        if checkpoint is not None and index >= found:
+            save_progress(checkpoint, simulation.progress, scene.model_dump_json())
+        if progress is not None and index >= found - 1:  # those that a killed run had told are not news
+            progress(index + 1, simulation.frame_count)
+    if out is not None:
+        details = {
+            "scene": scene.model_dump(mode="json"),
+            "report": vars(simulation.report) | {"warnings": list(simulation.report.warnings)},
+        }
+        save_clip(out, kept, scene.fps, details)
+    if checkpoint is not None:
+        shutil.rmtree(checkpoint, ignore_errors=True)
     return kept, simulation.report
 
 
