@@ -28,7 +28,9 @@ from server.rest_records import Health, TokenRequest
 from server.security import COOKIE_NAME, Gatekeeper, GateMiddleware
 from server.sessions import SessionRegistry
 from server.settings import ServerSettings
+from server.shared_renderer import SharedRenderer
 from server.viewer import Viewer
+from worker.artifact_store import ArtifactError
 from worker.data_directory import open_data_directory, read_token
 from worker.database import open_database
 from worker.queue import JobQueue
@@ -48,14 +50,16 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     Raises:
         ValueError: the data directory cannot be used.
     """
-    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
+    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url, settings.artifact_url)
     engine = open_database(directory)
-    environments = EnvironmentStore(directory.environments)
+    environments = EnvironmentStore(directory)
     environments.add_bundled(settings.bundled_environments)
     if renderer is None:
         from server.drgs_renderer import DrgsRenderer
 
         renderer = DrgsRenderer(settings.device)
+    if directory.store is not None:
+        renderer = SharedRenderer(renderer, directory)
     connections: dict[Viewer, stream.Connection] = {}
 
     def tell(viewer: Viewer, sentence: str) -> None:
@@ -72,7 +76,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
         environments=environments,
         render_thread=thread,
         sessions=SessionRegistry(directory, engine, renderer, thread, environments, settings.limits, metrics),
-        gatekeeper=Gatekeeper(read_token(directory), settings.host_names),
+        gatekeeper=Gatekeeper(settings.token.get_secret_value() if settings.token else read_token(directory), settings.host_names),
         connections=connections,
         metrics=metrics,
     )
@@ -133,7 +137,7 @@ async def _remove_deleted_assets(context: ServerContext) -> None:
     while True:
         try:
             await asyncio.to_thread(routes_assets.remove_deleted_assets, context)
-        except SQLAlchemyError as error:
+        except (SQLAlchemyError, ArtifactError) as error:
             logging.getLogger(__name__).warning("deleted assets were not removed: %s", error)
         await asyncio.sleep(REMOVAL_SECONDS)
 

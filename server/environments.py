@@ -1,5 +1,6 @@
 """The stored environments: EXR files in one folder, each with a small tone-mapped picture beside it."""
 
+import logging
 import re
 import shutil
 import struct
@@ -10,16 +11,21 @@ import numpy as np
 import simplejpeg
 
 from server.rest_records import EnvironmentInfo
+from worker.artifact_store import ArtifactMissing, StoreAway
+from worker.artifacts import bring_environment, keep
+from worker.data_directory import DataDirectory
 
 THUMBNAIL_SIZE = (256, 128)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,79}\.exr")
 
 
 class EnvironmentStore:
-    """Final. Names are file names of this folder and of the form `letters-digits.exr`; nothing else is ever joined to a path."""
+    """Final. Names are file names of this folder and of the form `letters-digits.exr`; nothing else is ever joined to a path. What is not here
+    is looked for in the store that machines share, if there is one, and fetched; each method may then raise ArtifactError."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, directory: DataDirectory) -> None:
+        self._directory = directory
+        self._folder = directory.environments
         self._sizes: dict[str, tuple[int, int]] = {}
         self._making = threading.Lock()
 
@@ -30,9 +36,28 @@ class EnvironmentStore:
                 draft = self._folder / f".{path.name}.new"
                 shutil.copyfile(path, draft)
                 draft.rename(self._folder / path.name)
+        try:
+            shared = set(self._directory.store.list("environments")) if self._directory.store is not None else set()
+            for path in sorted(source.glob("*.exr")) if source.is_dir() else ():
+                if _NAME.fullmatch(path.name) and path.name not in shared:
+                    keep(self._directory, "environments", path.name, self._folder / path.name)
+        except StoreAway as error:  # the next start shares them
+            logging.getLogger(__name__).warning("%s", error)
+
+    def add(self, draft: Path, wanted: str) -> EnvironmentInfo:
+        """Take a readable EXR under a free name like the wanted one, shared before it is seen."""
+        name = self._free_name(wanted)
+        keep(self._directory, "environments", name, draft)
+        draft.rename(self._folder / name)
+        return self.info(name)
 
     def has(self, name: str) -> bool:
-        return _NAME.fullmatch(name) is not None and (self._folder / name).is_file()
+        if _NAME.fullmatch(name) is None:
+            return False
+        try:
+            return bring_environment(self._directory, name).is_file()
+        except ArtifactMissing:
+            return False
 
     def path(self, name: str) -> Path:
         """
@@ -46,12 +71,14 @@ class EnvironmentStore:
     def all(self) -> list[EnvironmentInfo]:
         """By name; files that are no readable environments are left out."""
         found = []
-        for path in sorted(self._folder.glob("*.exr")):
-            if _NAME.fullmatch(path.name):
-                try:
-                    found.append(self.info(path.name))
-                except ValueError:
-                    continue
+        names = {path.name for path in self._folder.glob("*.exr")}
+        if self._directory.store is not None:
+            names |= set(self._directory.store.list("environments"))
+        for name in sorted(names):
+            try:
+                found.append(self.info(name))
+            except (KeyError, ValueError):  # no name of ours, or not readable
+                continue
         return found
 
     def info(self, name: str) -> EnvironmentInfo:
@@ -66,11 +93,11 @@ class EnvironmentStore:
         width, height = self._sizes[name]
         return EnvironmentInfo(name=name, title=path.stem.replace("_", " ").replace("-", " ").capitalize(), width=width, height=height)
 
-    def free_name(self, wanted: str) -> str:
+    def _free_name(self, wanted: str) -> str:
         """A name of the wanted kind that no file has."""
         stem = re.sub(r"[^A-Za-z0-9_-]+", "-", wanted).strip("-_")[:60] or "environment"
         candidates = (f"{stem}.exr", *(f"{stem}-{k}.exr" for k in range(2, 10_000)))
-        return next(name for name in candidates if not (self._folder / name).exists())
+        return next(name for name in candidates if not self.has(name))
 
     def thumbnail(self, name: str) -> Path:
         """The small picture, made when it is first asked for.

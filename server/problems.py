@@ -10,6 +10,7 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from server.rest_records import Problem
+from worker.artifact_store import ArtifactError, ArtifactMissing, StoreAway
 
 
 class ProblemError(Exception):
@@ -20,6 +21,11 @@ class ProblemError(Exception):
         self.detail = detail if detail.endswith((".", "?", "!")) else detail + "."
         self.status = status
         super().__init__(self.detail)
+
+
+def artifact_problem(error: ArtifactError) -> ProblemError:
+    """503 while the store is away, 404 for what it does not have, 502 for what came back damaged."""
+    return ProblemError(503 if isinstance(error, StoreAway) else 404 if isinstance(error, ArtifactMissing) else 502, str(error))
 
 
 def problem_response(status: int, detail: str, headers: dict[str, str] | None = None) -> JSONResponse:
@@ -55,6 +61,12 @@ def add_problem_handlers(app: FastAPI) -> None:
         logging.getLogger(__name__).error("%s %s failed", request.method, request.url.path, exc_info=error)
         sentence = "The database does not answer, or its disk is full; nothing was changed. Try again in a moment."
         return problem_response(503, sentence, {"retry-after": "2"})
+
+    @app.exception_handler(ArtifactError)
+    async def _artifacts(request: Request, error: ArtifactError) -> JSONResponse:
+        logging.getLogger(__name__).error("%s %s failed: %s", request.method, request.url.path, error)
+        problem = artifact_problem(error)
+        return problem_response(problem.status, problem.detail, {"retry-after": "2"} if problem.status == 503 else None)
 
     @app.exception_handler(Exception)
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, Response
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 from starlette.background import BackgroundTask
@@ -20,6 +20,8 @@ from server.problems import ProblemError
 from server.rest_records import AssetInfo, AssetList, EnvironmentInfo, EnvironmentList
 from server.sessions import LiveSession
 from server.uploads import receive_upload
+from worker.artifact_store import ArtifactError
+from worker.artifacts import bring_asset, bring_edit_files, clear_cache, drop
 from worker.database import AssetRow, SessionEventRow, SessionRow, SnapshotRow, now
 from worker.file_tool import FileToolError, run_file_tool
 from worker.register_asset import register_asset
@@ -52,7 +54,7 @@ def list_assets(
     with Session(context.engine) as session:
         rows = session.scalars(which.order_by(AssetRow.created_at.desc(), AssetRow.id).limit(limit).offset(offset)).all()
         total = session.scalar(select(func.count()).select_from(which.subquery())) or 0
-    return AssetList(assets=[asset_info(row, context.directory.asset(row.id)) for row in rows], total=total)
+    return AssetList(assets=[_info(context, row) for row in rows], total=total)
 
 
 @router.post("/assets", status_code=201)
@@ -91,7 +93,7 @@ def _register(
     place = context.directory.asset(asset_id)
     draft.rename(place)
     try:
-        row = register_asset(context.engine, asset_id, name, "session" if parent else "upload", place, parent, edits)
+        row = register_asset(context.directory, context.engine, asset_id, name, "session" if parent else "upload", parent, edits)
     except BaseException:
         shutil.rmtree(place, ignore_errors=True)
         raise
@@ -109,7 +111,9 @@ async def save_version(context: ServerContext, session: LiveSession, name: str |
     with tempfile.TemporaryDirectory(prefix=".version-", dir=context.directory.uploads) as folder:
         listed, draft = Path(folder) / "edits.json", Path(folder) / "asset"
         listed.write_text(json.dumps(edits))
-        source, environments = context.directory.asset(parent.id), context.directory.environments
+        source = await run_in_threadpool(bring_asset, context.directory, parent.id)
+        await run_in_threadpool(bring_edit_files, context.directory, session.log.done)
+        environments = context.directory.environments
         await _run_tool("version", str(source), str(draft), str(listed), str(environments), str(parent.version + 1))
         return await run_in_threadpool(_register, context, uuid.uuid4().hex, name or parent.name, draft, parent, edits)
 
@@ -124,19 +128,30 @@ def _read_row(context: ServerContext, asset_id: str, deleted: bool = False) -> A
 
 @router.get("/assets/{asset_id}")
 def read_asset(asset_id: str, context: Context) -> AssetInfo:
-    row = _read_row(context, asset_id)
-    return asset_info(row, context.directory.asset(row.id))
+    return _info(context, _read_row(context, asset_id))
+
+
+def _info(context: ServerContext, row: AssetRow) -> AssetInfo:
+    folder = context.directory.asset(row.id)
+    info = asset_info(row, folder)
+    if context.directory.store is None or folder.is_dir():
+        return info
+    # Assets that the service makes have one; a list of them is no reason to fetch them all.
+    return info.model_copy(update={"has_thumbnail": True})
 
 
 def _asset_file(context: ServerContext, asset_id: str, name: str, media_type: str) -> FileResponse:
-    path = context.directory.asset(_read_row(context, asset_id).id) / name
+    path = bring_asset(context.directory, _read_row(context, asset_id).id) / name
     if not path.is_file():
         raise ProblemError(404, f"This asset has no {name}.")
     return FileResponse(path, media_type=media_type)
 
 
 @router.get("/assets/{asset_id}/thumb.jpg")
-def read_thumbnail(asset_id: str, context: Context) -> FileResponse:
+def read_thumbnail(asset_id: str, context: Context) -> Response:
+    store, folder = context.directory.store, context.directory.asset(_read_row(context, asset_id).id)
+    if store is not None and not folder.is_dir():
+        return Response(store.get_file("assets", folder.name, "thumb.jpg"), media_type="image/jpeg")
     return _asset_file(context, asset_id, "thumb.jpg", "image/jpeg")
 
 
@@ -159,8 +174,9 @@ async def export_asset(asset_id: str, format: ExportFormat, context: Context) ->
     folder = Path(tempfile.mkdtemp(prefix=".export-", dir=context.directory.uploads))
     out = folder / f"asset{_EXPORT_SUFFIXES[format]}"
     try:
-        await _run_tool("export", str(context.directory.asset(row.id)), str(out), format)
-    except ProblemError:
+        asset = await run_in_threadpool(bring_asset, context.directory, row.id)
+        await _run_tool("export", str(asset), str(out), format)
+    except (ProblemError, ArtifactError):
         shutil.rmtree(folder, ignore_errors=True)
         raise
     title = "".join(c if c.isalnum() or c in "-_ " else "-" for c in row.name).strip() or "asset"
@@ -201,12 +217,16 @@ def remove_deleted_assets(context: ServerContext) -> int:
     with Session(context.engine) as session, session.begin():
         gone = list(session.scalars(select(AssetRow.id).where(AssetRow.deleted_at < before)))
         sessions = select(SessionRow.id).where(SessionRow.asset_id.in_(gone))
+        for asset_id in gone:
+            drop(context.directory, "assets", asset_id)
         for table in (SessionEventRow, SnapshotRow):
             session.execute(delete(table).where(table.session_id.in_(sessions)))
         session.execute(delete(SessionRow).where(SessionRow.asset_id.in_(gone)))
         session.execute(delete(AssetRow).where(AssetRow.id.in_(gone)))
+        left = set(session.scalars(select(AssetRow.id)))
     for asset_id in gone:
         shutil.rmtree(context.directory.asset(asset_id), ignore_errors=True)
+    clear_cache(context.directory, left)
     return len(gone)
 
 
@@ -224,9 +244,7 @@ async def upload_environment(request: Request, context: Context) -> EnvironmentI
             source, draft = Path(folder) / f"upload{upload.suffix}", Path(folder) / "out.exr"
             await run_in_threadpool(_copy, upload.stream, source)
             await _run_tool("environment", str(source), str(draft))
-            name = context.environments.free_name(upload.field("name") or upload.stem)
-            draft.rename(context.directory.environments / name)
-            return context.environments.info(name)
+            return await run_in_threadpool(context.environments.add, draft, upload.field("name") or upload.stem)
     finally:
         await upload.close()
 

@@ -22,6 +22,8 @@ from server.problems import ProblemError
 from server.rest_records import BuildRequest, JobFile, JobFileList, JobInfo, JobList
 from server.uploads import receive_upload
 from server.zip_guard import single_folder, unpack_zip
+from worker.artifact_store import StoreAway
+from worker.artifacts import drop, has_clip, keep, refresh_job
 from worker.database import AssetRow, JobRow, now
 from worker.queue import JobNotInState
 from worker.requests import JOB_REQUESTS, OWN_LIGHT, JobRequest, RedecoupleRequest, RenderRequest, SimulateRequest
@@ -107,6 +109,7 @@ async def start_job(request: Request, context: Context, idempotency_key: Idempot
         await run_in_threadpool(context.queue.submit, row)
     except IntegrityError:  # the same key, a moment earlier
         shutil.rmtree(context.directory.uploads / job_id, ignore_errors=True)
+        await run_in_threadpool(drop, context.directory, "captures", job_id)
         known = await run_in_threadpool(_job_of_key, context, idempotency_key)
         job_id = known or job_id
     return await run_in_threadpool(_read_job, context, job_id)
@@ -182,7 +185,7 @@ def _check_render(context: ServerContext, asked: RenderRequest) -> None:
     for variant in asked.variants:
         for edit in variant.edits:
             context.sessions.check_edit(edit)
-    if asked.clip is not None and not (context.directory.environments / asked.clip / "clip.json").is_file():
+    if asked.clip is not None and not has_clip(context.directory, asked.clip):
         raise ProblemError(422, f"There is no clip {asked.clip}; a simulate job that is done names its clip.")
 
 
@@ -193,6 +196,11 @@ async def _receive_capture(request: Request, context: ServerContext, job_id: str
         asked = BuildRequest.model_validate(fields)
         target = context.directory.uploads / job_id
         await run_in_threadpool(unpack_zip, upload.stream, target)
+        try:
+            await run_in_threadpool(keep, context.directory, "captures", job_id, target)
+        except StoreAway:
+            shutil.rmtree(target, ignore_errors=True)
+            raise
     except ValidationError as error:
         raise _invalid(error) from error
     except ValueError as error:
@@ -261,6 +269,7 @@ def read_job(job_id: str, context: Context) -> JobInfo:
 def read_preview(job_id: str, context: Context) -> FileResponse:
     """Newest picture of the fit."""
     path = context.directory.preview(_read_row(context, job_id).id)
+    refresh_job(context.directory, job_id)
     if not path.is_file():
         raise ProblemError(404, "This job has no preview yet.")
     return FileResponse(path, media_type="image/jpeg")
@@ -270,6 +279,7 @@ def read_preview(job_id: str, context: Context) -> FileResponse:
 def read_log(job_id: str, context: Context) -> PlainTextResponse:
     """When each step started and finished, a line each."""
     path = context.directory.job_log(_read_row(context, job_id).id)
+    refresh_job(context.directory, job_id)
     return PlainTextResponse(path.read_text() if path.is_file() else "")
 
 
@@ -277,6 +287,7 @@ def read_log(job_id: str, context: Context) -> PlainTextResponse:
 def list_files(job_id: str, context: Context) -> JobFileList:
     """What a render or an export has made so far."""
     folder = context.directory.job_files(_read_row(context, job_id).id)
+    refresh_job(context.directory, job_id)
     found = sorted(path for path in folder.iterdir() if path.suffix != ".part") if folder.is_dir() else []
     found = [path for path in found if not path.name.startswith("draft-")]
     return JobFileList(files=[JobFile(name=path.name, bytes=path.stat().st_size, media_type=_media_type(path.name)) for path in found])
@@ -286,6 +297,7 @@ def list_files(job_id: str, context: Context) -> JobFileList:
 def read_file(job_id: str, name: str, context: Context) -> FileResponse:
     """One of them; ranges are answered."""
     folder = context.directory.job_files(_read_row(context, job_id).id)
+    refresh_job(context.directory, job_id)
     if not _FILE_NAME.fullmatch(name) or not (folder / name).is_file():
         raise ProblemError(404, f"This job has no file {name[:100]!r}.")
     return FileResponse(folder / name, media_type=_media_type(name), filename=name)
@@ -302,6 +314,8 @@ def delete_job(job_id: str, context: Context) -> None:
     state = context.queue.statuses([job_id])[job_id].state
     if state not in ("done", "failed", "cancelled", "unknown"):
         raise ProblemError(409, f"This job is {state}; cancel it first.")
+    for kind in ("jobs", "clips", "captures"):
+        drop(context.directory, kind, row.id)
     with Session(context.engine) as session, session.begin():
         session.execute(delete(JobRow).where(JobRow.id == row.id))
     for folder in (context.directory.job(row.id), context.directory.clip(row.id), context.directory.uploads / row.id):

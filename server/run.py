@@ -55,7 +55,7 @@ def serve(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Python's lock is passed on sooner than after its usual 5 ms: an answer needs it several times while the render thread wants it, too.
     sys.setswitchinterval(SWITCH_SECONDS)
-    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
+    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url, settings.artifact_url)
     app = create_app(settings)
     # ws_per_message_deflate costs a third of the frame rate at 1080p and gains nothing on JPEG.
     config = uvicorn.Config(
@@ -72,7 +72,8 @@ def serve(
         timeout_graceful_shutdown=5,
         limit_concurrency=512,
     )
-    server = _Server(config, lambda bound: _announce(bound, host, read_token(directory), open_browser, ready))
+    token = settings.token.get_secret_value() if settings.token else read_token(directory)
+    server = _Server(config, lambda bound: _announce(bound, host, token, open_browser, ready))
     worker = WorkerProcess(directory.root, settings.device) if settings.worker else None
     if worker:
         worker.start()

@@ -8,6 +8,8 @@ uploads/ID/         captures as they came, unpacked
 jobs/ID/            a job's working folder: checkpoints, preview, log.txt, and in files/ what can be downloaded
 environments/       NAME.exr and NAME.jpg, its small picture; and clips/ID/, since edits name both relative to one folder
 workers/            locks that give each worker of this machine a stable number
+
+Where settings name an artifact store, this folder is a cache of it (worker/artifacts.py), and several machines have one each.
 """
 
 import fcntl
@@ -17,6 +19,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+from worker.artifact_store import ArtifactStore, open_artifact_store
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,8 @@ class DataDirectory:
     """Of assets, jobs, workers and sessions (SQLAlchemy)."""
     queue_url: str
     """Of DBOS's tables."""
+    store: ArtifactStore | None = None
+    """What is shared with other machines; None: this folder is all there is."""
 
     @property
     def token_path(self) -> Path:
@@ -74,15 +80,18 @@ class DataDirectory:
         return self.environments / "clips" / job_id
 
 
-def open_data_directory(root: Path, database_url: str | None = None, queue_url: str | None = None) -> DataDirectory:
+def open_data_directory(
+    root: Path, database_url: str | None = None, queue_url: str | None = None, artifact_url: str | None = None
+) -> DataDirectory:
     """Make what is missing and return the paths.
 
     Args:
         database_url: SQLite in the folder where None.
         queue_url: where None, the database NAME_jobs beside `database_url`'s NAME, or SQLite in the folder.
+        artifact_url: of the store that is shared with other machines, if there is one.
 
     Raises:
-        ValueError: `root` is a file, or cannot be made or entered.
+        ValueError: `root` is a file, or cannot be made or entered; or the store's address is wrong.
     """
     root = root.expanduser().resolve()
     if root.exists() and not root.is_dir():
@@ -96,7 +105,12 @@ def open_data_directory(root: Path, database_url: str | None = None, queue_url: 
         raise ValueError(f"data directory {root}: {error.strerror}; name a folder you may write with --data") from error
     if database_url is not None and queue_url is None and not database_url.startswith("sqlite"):
         queue_url = f"{database_url}_jobs" if "?" not in database_url else database_url.replace("?", "_jobs?", 1)
-    directory = DataDirectory(root, database_url or f"sqlite:///{root / 'app.sqlite'}", queue_url or f"sqlite:///{root / 'jobs.sqlite'}")
+    directory = DataDirectory(
+        root,
+        database_url or f"sqlite:///{root / 'app.sqlite'}",
+        queue_url or f"sqlite:///{root / 'jobs.sqlite'}",
+        open_artifact_store(artifact_url) if artifact_url is not None else None,
+    )
     _ensure_token(directory)
     return directory
 

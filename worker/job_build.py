@@ -2,8 +2,10 @@
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+from worker.artifacts import bring_capture, patiently, refresh_job
 from worker.builders import STAGES, BuildRequest
 from worker.job_run import AbstractJobRun, JobContext
 from worker.register_asset import register_asset
@@ -30,6 +32,8 @@ class BuildRun(AbstractJobRun):
         if request.out.exists():
             return  # packed; the crash came before the step was recorded
         if self._stages is None:
+            dataset = patiently(lambda: bring_capture(job.directory, request.dataset), job.should_stop)
+            request = replace(request, dataset=dataset)
             if not request.dataset.is_dir():
                 raise ValueError(f"The capture {request.dataset.name} is gone; it was removed after the job was made.")
             self._stages = job.builder(request, job.progress, job.should_stop)
@@ -47,7 +51,7 @@ class BuildRun(AbstractJobRun):
         built, place = job.folder / "asset", job.directory.asset(job.job_id)
         if built.exists() and not place.exists():
             built.rename(place)
-        register_asset(job.engine, job.job_id, job.name, "build", place)
+        patiently(lambda: register_asset(job.directory, job.engine, job.job_id, job.name, "build"), job.should_stop)
         work = Path(f"{built}.build")
         for path in work.iterdir() if work.is_dir() else ():
             if path.name not in KEPT_CHECKPOINTS:
@@ -67,6 +71,7 @@ class RedecoupleRun(BuildRun):
 
     def _copy(self) -> None:
         job = self._job
+        patiently(lambda: refresh_job(job.directory, job.parameters["asset"]), job.should_stop)
         source, work = job.directory.job(job.parameters["asset"]) / "asset.build", job.folder / "asset.build"
         work.mkdir(exist_ok=True)
         for name in KEPT_CHECKPOINTS:

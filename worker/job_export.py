@@ -24,7 +24,7 @@ class ExportRun(AbstractJobRun):
         job.files.mkdir(exist_ok=True)
         out = job.files / f"asset-{format}{FILE_SUFFIXES[format]}"  # type: ignore[index]
         draft = out.with_name(f"draft-{out.name}")
-        source = job.directory.asset(self._asked.asset)
+        source = job.bring_asset(self._asked.asset)
         process = subprocess.Popen(
             [sys.executable, "-m", "worker.file_tool", "export", str(source), str(draft), format],
             stdout=subprocess.DEVNULL,

@@ -69,7 +69,7 @@ class RenderRun(AbstractJobRun):
             from drgs.scene.asset import load_asset
             from drgs.warp_torch import device_from_name
 
-            self._asset = load_asset(self._job.directory.asset(self._asked.asset), device_from_name(self._job.device))
+            self._asset = load_asset(self._job.bring_asset(self._asked.asset), device_from_name(self._job.device))
         return self._asset
 
     def _path(self, variant: RenderVariant, environment: str, camera: str) -> Path:
@@ -164,6 +164,7 @@ class _Renderer:
         edits, clip = list(self._edits), self._asked.clip
         if clip is not None:
             edits.append(PoseEdit(op="pose", clip=clip, time=index / (self._asked.video_fps or CLIP_FPS)))
+        self._job.bring_edit_files(edits)
         scene = pose_scene(self._asset, edits, self._job.directory.environments, confine=True)
         made = scene, build_tracer(scene.mesh)
         if clip is None:

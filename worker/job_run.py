@@ -5,12 +5,14 @@ that a crash interrupted must do no harm. What steps share in memory is kept in 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import Engine
 
+from drgs.scene.edits import Edit
+from worker.artifacts import bring_asset, bring_edit_files, patiently
 from worker.builders import Builder, BuildProgress
 from worker.data_directory import DataDirectory
 
@@ -41,6 +43,18 @@ class JobContext:
     def files(self) -> Path:
         """Results that can be downloaded."""
         return self.directory.job_files(self.job_id)
+
+    def bring_asset(self, asset_id: str) -> Path:
+        """Its folder on this machine; waits for a store that is away.
+
+        Raises:
+            BuildStopped, StoreAway, ArtifactMissing, ArtifactDamaged
+        """
+        return patiently(lambda: bring_asset(self.directory, asset_id), self.should_stop)
+
+    def bring_edit_files(self, edits: Sequence[Edit]) -> None:
+        """The same of what edits name."""
+        patiently(lambda: bring_edit_files(self.directory, edits), self.should_stop)
 
 
 class AbstractJobRun(ABC):

@@ -1,5 +1,9 @@
-"""Simulations: an asset's matter moves, and the clip is kept where `pose` edits find it."""
+"""Simulations: an asset's matter moves, and the clip is kept where `pose` edits find it. Every finished frame is on disk: a worker that dies
+costs one frame."""
 
+from pathlib import Path
+
+from worker.artifacts import keep, patiently
 from worker.builders import BuildProgress, BuildStopped
 from worker.job_run import AbstractJobRun, JobContext
 from worker.requests import SimulateRequest
@@ -15,15 +19,19 @@ class SimulateRun(AbstractJobRun):
         self._asked = SimulateRequest.model_validate(job.parameters)
 
     def run(self, step: str) -> None:
+        job, out = self._job, self._job.directory.clip(self._job.job_id)
+        if not out.exists():  # else written whole; the crash came before the step was recorded
+            self._simulate(out)
+        patiently(lambda: keep(job.directory, "clips", job.job_id, out), job.should_stop)
+
+    def _simulate(self, out: Path) -> None:
         from drgs.deform.simulate import simulate
         from drgs.deform.simulation_scene import parse_simulation_scene
         from drgs.scene.asset import load_asset
         from drgs.warp_torch import device_from_name
 
-        job, out = self._job, self._job.directory.clip(self._job.job_id)
-        if out.exists():
-            return  # written whole; the crash came before the step was recorded
-        asset = load_asset(job.directory.asset(self._asked.asset), device_from_name(job.device))
+        job = self._job
+        asset = load_asset(job.bring_asset(self._asked.asset), device_from_name(job.device))
 
         def report(done: int, total: int) -> None:
             job.progress(BuildProgress("simulate", done, total, done / total, message=f"frame {done} of {total}"))
@@ -31,4 +39,4 @@ class SimulateRun(AbstractJobRun):
                 raise BuildStopped
 
         out.parent.mkdir(mode=0o700, exist_ok=True)
-        simulate(asset, parse_simulation_scene(self._asked.scene), out, report)
+        simulate(asset, parse_simulation_scene(self._asked.scene), out, report, checkpoint=job.folder / "frames")

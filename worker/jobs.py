@@ -19,6 +19,8 @@ from dbos import error as dbos_error
 from sqlalchemy import Engine, update
 from sqlalchemy.orm import Session
 
+from worker.artifact_store import ArtifactError
+from worker.artifacts import RUN_LOCK, bring_job, keep_job, patiently
 from worker.builders import Builder, BuildProgress, BuildStopped
 from worker.data_directory import DataDirectory, try_lock_file
 from worker.database import JobRow, now, through_outage
@@ -94,10 +96,12 @@ def _run_step(job: JobContext, run: AbstractJobRun, step: str) -> None:
     with _failures_recorded(job.job_id):
         job.folder.mkdir(mode=0o700, exist_ok=True)
         with _only_run(job.folder, job.should_stop):
+            patiently(lambda: bring_job(job.directory, job.job_id), job.should_stop)
             _log(job, f"{step}: started by {_worker().worker_id}")
             _update_job(job.job_id, worker_id=_worker().worker_id, error=None)
             run.run(step)
             _log(job, f"{step}: finished")
+            patiently(lambda: keep_job(job.directory, job.job_id), job.should_stop)
 
 
 def _finish(job_id: str) -> None:
@@ -160,7 +164,7 @@ def _failures_recorded(job_id: str) -> Iterator[None]:
 def _sentence(error: Exception) -> str:
     """Wrong input explains itself; anything else is named."""
     text = str(error).strip() or "no further words"
-    return text if isinstance(error, ValueError) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, ValueError | ArtifactError) else f"{type(error).__name__}: {text}"
 
 
 def _stop_flag(job_id: str, limits: JobLimits) -> Callable[[], bool]:
@@ -192,7 +196,7 @@ def _stop_flag(job_id: str, limits: JobLimits) -> Callable[[], bool]:
 @contextlib.contextmanager
 def _only_run(folder: Path, should_stop: Callable[[], bool]) -> Iterator[None]:
     """Two executions of one job can meet: a retry while the cancelled run still writes its checkpoint."""
-    while (lock := try_lock_file(folder / ".lock")) is None:
+    while (lock := try_lock_file(folder / RUN_LOCK)) is None:
         if should_stop():
             raise BuildStopped
         time.sleep(0.1)

@@ -1,24 +1,24 @@
 """List a finished asset folder."""
 
-from pathlib import Path
-
 from sqlalchemy import Engine
 from sqlalchemy.orm import Session
 
+from worker.artifacts import keep
 from worker.asset_folder import count_asset_folder, folder_bytes
+from worker.data_directory import DataDirectory
 from worker.database import AssetRow, now
 
 
 def register_asset(
+    directory: DataDirectory,
     engine: Engine,
     asset_id: str,
     name: str,
     source: str,
-    place: Path,
     parent: AssetRow | None = None,
     edits: list[dict] | None = None,
 ) -> AssetRow:
-    """Add its row, or bring it up to date.
+    """Share its folder, and then add its row, or bring it up to date.
 
     Args:
         source: build, upload or session.
@@ -27,7 +27,9 @@ def register_asset(
 
     Raises:
         ValueError: the folder is no asset.
+        StoreAway: it could not be shared; there is no row.
     """
+    place = directory.asset(asset_id)
     counts = count_asset_folder(place)
     row = AssetRow(
         id=asset_id,
@@ -42,5 +44,6 @@ def register_asset(
         version=parent.version + 1 if parent else 1,
         edits=edits or [],
     )
+    keep(directory, "assets", asset_id, place)
     with Session(engine, expire_on_commit=False) as session, session.begin():
         return session.merge(row)

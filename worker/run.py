@@ -41,7 +41,7 @@ def run_worker(data: Path | None = None, device: str | None = None, parent_pid: 
     """
     settings = read_settings(data=data, device=device)
     set_up_logging(settings.log_format)
-    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
+    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url, settings.artifact_url)
     worker_id, slot_lock = _claim_slot(directory)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would otherwise spin beside the server's
     os.nice(10)  # the viewer comes first where both run on one machine
@@ -95,7 +95,7 @@ def requeue_worker(data: Path | None, worker_id: str) -> list[str]:
         ValueError: a setting is wrong, nobody has heard of the worker, or it runs on this machine.
     """
     settings = read_settings(data=data)
-    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url)
+    directory = open_data_directory(settings.data, settings.database_url, settings.queue_url, settings.artifact_url)
     engine = open_database(directory)
     queue = JobQueue(directory, engine)
     try:

@@ -9,12 +9,15 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
+
+from worker.artifact_store import SCHEMES
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 CONFIG_VARIABLE = "DRGS_CONFIG"
 """Environment variable: path of a TOML file."""
+LEAST_TOKEN = 32
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 Positive = Annotated[int, Field(ge=1)]
@@ -70,6 +73,10 @@ class ServiceSettings(BaseSettings):
     """postgresql://USER:PASSWORD@HOST/NAME, for several workers and servers; None: SQLite in the data folder."""
     queue_url: str | None = None
     """Of DBOS's tables; None: NAME_jobs beside database_url's NAME, or SQLite in the data folder."""
+    artifact_url: str | None = None
+    """s3://BUCKET[/PREFIX] or file:///FOLDER: what several machines with a data folder each share; None: the data folder is all there is."""
+    token: SecretStr | None = None
+    """What callers must know; None: the data folder's own. Several servers behind one proxy need the same."""
     log_format: Literal["text", "json"] = "text"
     limits: Limits = Limits()
     sample_capture: Path = REPOSITORY / "examples" / "sample_capture"
@@ -83,6 +90,20 @@ class ServiceSettings(BaseSettings):
     def _is_a_known_database(cls, url: str | None) -> str | None:
         if url is not None and not url.startswith(("postgresql://", "postgresql+psycopg://", "sqlite:///")):
             raise ValueError("expected postgresql://USER:PASSWORD@HOST/NAME or sqlite:///PATH")
+        return url
+
+    @field_validator("token")
+    @classmethod
+    def _is_hard_to_guess(cls, token: SecretStr | None) -> SecretStr | None:
+        if token is not None and len(token.get_secret_value()) < LEAST_TOKEN:
+            raise ValueError(f"expected {LEAST_TOKEN} characters or more, such as `openssl rand -hex 32` makes")
+        return token
+
+    @field_validator("artifact_url")
+    @classmethod
+    def _is_a_known_store(cls, url: str | None) -> str | None:
+        if url is not None and not url.startswith(SCHEMES):
+            raise ValueError(f"expected one of {', '.join(SCHEMES)}")
         return url
 
     @classmethod

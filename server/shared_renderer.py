@@ -1,0 +1,57 @@
+"""A renderer that first fetches, from the store that several machines share, what is not on this one."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from drgs.scene.edits import Edit
+from server.problems import artifact_problem
+from server.render_session import AbstractLoadedAsset, AbstractPose, AbstractRenderer
+from worker.artifact_store import ArtifactError
+from worker.artifacts import bring_asset, bring_edit_files
+from worker.data_directory import DataDirectory
+
+
+class SharedRenderer(AbstractRenderer):
+    """Final. Around another renderer; the folders of assets are called by their ids."""
+
+    def __init__(self, renderer: AbstractRenderer, directory: DataDirectory) -> None:
+        self._renderer = renderer
+        self._directory = directory
+
+    def load(self, folder: Path, environments: Path) -> "SharedAsset":
+        """
+        Raises:
+            ProblemError: the store is away, or what it holds is damaged.
+            ValueError: the folder holds no readable asset.
+        """
+        with _as_problems():
+            bring_asset(self._directory, folder.name)
+        return SharedAsset(self._renderer.load(folder, environments), self._directory)
+
+
+class SharedAsset(AbstractLoadedAsset):
+    """Final."""
+
+    def __init__(self, asset: AbstractLoadedAsset, directory: DataDirectory) -> None:
+        self._asset = asset
+        self._directory = directory
+        self.bounds, self.start_view = asset.bounds, asset.start_view
+
+    def pose(self, edits: Sequence[Edit], previous: AbstractPose | None) -> AbstractPose:
+        """
+        Raises:
+            ProblemError: the store is away, or what it holds is damaged.
+            ValueError: a sentence, when an edit cannot be applied.
+        """
+        with _as_problems():
+            bring_edit_files(self._directory, edits)
+        return self._asset.pose(edits, previous)
+
+
+@contextmanager
+def _as_problems() -> Iterator[None]:
+    try:
+        yield
+    except ArtifactError as error:
+        raise artifact_problem(error) from error
