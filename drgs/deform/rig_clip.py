@@ -1,4 +1,4 @@
-"""An animation in a glTF file as a clip of an object: read, laid over the object at rest, bound, and evaluated at any time.
+"""An animation in a glTF or FBX file as a clip of an object: read, laid over the object at rest, bound, and evaluated at any time.
 
 In: a file, the name of an animation, an asset and a `RigBinding`. Out: `ClipFrame`s. glTF's y up and metres become z up and world units
 first, so that a rig made around an exported object lies where that object is. The rig moves the object's mesh; how far the surface really
@@ -19,7 +19,9 @@ from drgs.deform.proxy import ProxyBinding, bind_to_proxy, carry_points, closest
 from drgs.deform.simulate import limit_stretch
 from drgs.deform.skeleton import RigPose, pose_rig, rig_gradients
 from drgs.deform.surface_gradients import SurfaceAtRest, prepare_surface, surface_gradients
-from drgs.exchange.gltf_rig import Rig, RigAnimation, read_gltf_rig
+from drgs.exchange.fbx_rig import read_fbx_rig
+from drgs.exchange.gltf_rig import read_gltf_rig
+from drgs.exchange.rig import Rig, RigAnimation
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.scene.asset import Asset
 from drgs.scene.binding import Binding
@@ -92,7 +94,7 @@ def bind_rig(path: Path, animation: str, asset: Asset, rest: ClipFrame, binding:
         ValueError: one sentence that names the file: unreadable, no such animation, or a rig that does not lie on the object.
     """
     options = binding or RigBinding()
-    rig = read_gltf_rig(path)
+    rig = read_fbx_rig(path) if path.suffix.lower() == ".fbx" else read_gltf_rig(path)
     try:
         clip = find_animation(rig, animation)
         rest_pose = pose_rig(rig) if options.rest is None else pose_rig(rig, clip, options.rest)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals
 from drgs.deform.drive_mesh import vertex_gradients
-from drgs.exchange.gltf_rig import Rig, RigAnimation, RigChannel, RigMesh, RigNode
+from drgs.exchange.rig import Rig, RigAnimation, RigChannel, RigMesh, RigNode
 
 NEARLY_ALIKE = 1 - 1e-9
 """Cosine of half the angle between rotations above which they are blended straight: the sphere's formula divides by its sine."""

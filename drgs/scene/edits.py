@@ -193,22 +193,22 @@ class RigBinding(_Plain):
 class PoseEdit(_Plain):
     op: Literal["pose"]
     clip: str
-    """A clip folder, or a glTF file and one of its animations: robot.glb#Walk."""
+    """A clip folder, or a glTF or FBX file and one of its animations: robot.glb#Walk."""
     time: Annotated[float, Field(ge=0)]
     """Seconds."""
     rig: RigBinding | None = None
-    """For glTF files only."""
+    """For glTF and FBX files only."""
 
     @model_validator(mode="after")
     def _rig_has_a_file(self) -> "PoseEdit":
         if self.rig is not None and split_rig_clip(self.clip) is None:
-            raise ValueError(f"a pose edit has rig for a .glb or .gltf file only; its clip is {self.clip!r}")
+            raise ValueError(f"a pose edit has rig for a .glb, .gltf or .fbx file only; its clip is {self.clip!r}")
         return self
 
 
 def split_rig_clip(clip: str) -> tuple[str, str] | None:
-    """File and animation ("" if none is named) of a glTF clip; None for a clip folder."""
-    found = re.fullmatch(r"(.+?\.(?:glb|gltf))(?:#(.*))?", clip, re.IGNORECASE | re.DOTALL)
+    """File and animation ("" if none is named) of a glTF or FBX clip; None for a clip folder."""
+    found = re.fullmatch(r"(.+?\.(?:glb|gltf|fbx))(?:#(.*))?", clip, re.IGNORECASE | re.DOTALL)
     return None if found is None else (found[1], found[2] or "")
 
 

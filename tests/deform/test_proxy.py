@@ -276,7 +276,7 @@ def test_an_asset_without_gaussians_follows_a_rig(rig_folder):
         ("../rig.glb#Bend", {}, "outside"),
         ("still.glb", {}, "no animations"),
         ("bad.gltf", {}, r"bad\.gltf: .*JSON"),
-        ("folder", {"fit": True}, "glb or .gltf file only"),
+        ("folder", {"fit": True}, "gltf or .fbx file only"),
         ("rig.glb#Bend", {"scale": 0}, "greater than 0"),
         ("rig.glb#Bend", {"method": "magic"}, "method"),
     ],

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from drgs.deform.skeleton import pose_rig, rig_gradients, rig_normals, sample_channel, slerp
-from drgs.exchange.gltf_rig import RigChannel, read_gltf_rig
+from drgs.exchange.gltf_rig import read_gltf_rig
+from drgs.exchange.rig import RigChannel
 from tests.exchange.write_rig import RigWriter, quat_xyzw, two_bones
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
