@@ -15,7 +15,7 @@ import json
 import tempfile
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -42,7 +42,7 @@ from server.rest_records import (
     SnapshotInfo,
     SnapshotList,
 )
-from worker.requests import ExportRequest, RedecoupleRequest, RenderRequest, SimulateRequest
+from worker.requests import BindingName, ExportRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 
 Model = TypeVar("Model", bound=BaseModel)
 Preset = Literal["draft", "fast", "full"]
@@ -88,20 +88,27 @@ class Client:
     # ---- jobs -------------------------------------------------------------------------------------------------------
 
     def submit_build(
-        self, dataset: Path | str, preset: Preset = "fast", seed: int = 0, name: str | None = None, idempotency_key: str | None = None
+        self,
+        dataset: Path | str,
+        preset: Preset = "fast",
+        seed: int = 0,
+        name: str | None = None,
+        idempotency_key: str | None = None,
+        binding: BindingName = "particles",
     ) -> JobInfo:
         """Start a build.
 
         Args:
             dataset: `sample`, a folder or zip of this machine (uploaded), or `server:PATH`, a folder that the server may read.
+            binding: particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh.
             idempotency_key: the same key gives the same job, however often this is called.
         """
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         if isinstance(dataset, str) and (dataset == "sample" or dataset.startswith("server:")):
-            body = {"dataset": dataset.removeprefix("server:"), "preset": preset, "seed": seed, "name": name}
+            body = {"dataset": dataset.removeprefix("server:"), "preset": preset, "binding": binding, "seed": seed, "name": name}
             return self._call("POST", "/api/jobs", JobInfo, json=body, headers=headers)
         path = Path(dataset)
-        fields = {"preset": preset, "seed": str(seed), "name": name or path.stem}
+        fields = {"preset": preset, "binding": binding, "seed": str(seed), "name": name or path.stem}
         with _as_zip(path) as file:
             upload = {"file": (path.stem + ".zip", file, "application/zip")}
             return self._call("POST", "/api/jobs", JobInfo, data=fields, files=upload, headers=headers)
@@ -286,6 +293,16 @@ class RemoteSession:
         headers = {"Idempotency-Key": key} if key else {}
         values = _edit.dump_python(_edit.validate_python(edit), mode="json", exclude_none=True)
         return self._client._call("POST", f"/api/sessions/{self.id}/edits", EditLog, json={"edit": values}, headers=headers, timeout=600)
+
+    def put_edits(self, edits: Sequence[Edit | dict], revision: int | None = None) -> EditLog:
+        """Put these edits in place of all that are in force; one step of undo.
+
+        Args:
+            revision: of the log that they are meant for; the call fails once there is a newer one.
+        """
+        values = [_edit.dump_python(_edit.validate_python(edit), mode="json", exclude_none=True) for edit in edits]
+        body = {"edits": values, "revision": revision}
+        return self._client._call("PUT", f"/api/sessions/{self.id}/edits", EditLog, json=body, timeout=600)
 
     def undo(self) -> EditLog:
         return self._client._call("POST", f"/api/sessions/{self.id}/undo", EditLog, timeout=600)

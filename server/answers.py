@@ -86,5 +86,7 @@ def session_info(session: LiveSession) -> SessionInfo:
         edits=log.edits,
         can_undo=log.can_undo,
         can_redo=log.can_redo,
+        appended=log.appended,
+        undone=log.undone,
         viewers=len(session.viewers),
     )

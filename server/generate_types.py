@@ -43,6 +43,7 @@ _REQUESTS: tuple[type[BaseModel], ...] = (
     rest_records.ExportRequest,
     rest_records.SessionRequest,
     rest_records.EditRequest,
+    rest_records.EditsRequest,
     rest_records.SaveRequest,
     rest_records.TokenRequest,
 )

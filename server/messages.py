@@ -64,7 +64,8 @@ class CameraMessage(_Message):
 
     type: Literal["camera"]
     number: Number = 0
-    """Chosen by the client; a frame carries the low 8 bits of the number of the camera that it shows."""
+    """Chosen by the client; a frame carries the low 8 bits of the number of the camera that it shows. A new number is answered by a frame
+    even where nothing else is new: sent behind `settings`, it marks the frames that show them."""
     world_from_camera: tuple[Row, Row, Row, Row]
     """OpenGL camera-to-world, rows: the camera looks down -z, y up. World is right-handed, z up."""
     fov_y_degrees: Annotated[float, Field(gt=0.1, lt=175)]
@@ -111,6 +112,25 @@ class UndoMessage(_Message):
 class RedoMessage(_Message):
     type: Literal["redo"]
     id: Number
+    key: ClientKey | None = None
+    """As of an edit."""
+
+
+class SpliceMessage(_Message):
+    """Put edits in the place of some of those in force, as one step of undo."""
+
+    type: Literal["splice"]
+    id: Number
+    revision: Number
+    """Of the log that `start` and `remove` count in; once there is a newer one the answer is `rejected` with `overtaken`."""
+    start: Number
+    """How many edits stay in front."""
+    remove: Number
+    """How many behind them go."""
+    edits: list[Edit]
+    """What comes in their place."""
+    coalesce: Annotated[str, Field(max_length=100)] | None = None
+    """As of an edit: a splice with the key of the one just before it, < 500 ms earlier, is the same step of undo."""
     key: ClientKey | None = None
     """As of an edit."""
 
@@ -171,6 +191,7 @@ ClientMessage = Annotated[
     ClientHello
     | CameraMessage
     | EditMessage
+    | SpliceMessage
     | UndoMessage
     | RedoMessage
     | AckMessage
@@ -197,11 +218,15 @@ class EditLog(_Answer):
     """The session's edits. The same document answers REST calls."""
 
     revision: Number
-    """Rises by one with every edit, undo and redo; never falls."""
+    """Rises by one with every change; never falls."""
     edits: list[Edit]
     """Those in force, in order."""
     can_undo: bool
     can_redo: bool
+    appended: Number
+    """How many of the edits, counted from the last, undo takes away one by one; what lies behind them goes in one step."""
+    undone: list[Edit]
+    """Those that redo brings back one by one, the next one first; empty when the next redo does more than append one."""
 
 
 class ServerHello(_Answer):
@@ -241,6 +266,8 @@ class RejectedMessage(_Answer):
     type: Literal["rejected"] = "rejected"
     id: Number
     reason: str
+    overtaken: bool = False
+    """The log was changed by somebody else meanwhile: count anew and send again."""
 
 
 class StatusMessage(_Answer):

@@ -131,6 +131,9 @@ class SessionInfo(_Body):
     edits: list[Edit]
     can_undo: bool
     can_redo: bool
+    appended: int
+    undone: list[Edit]
+    """This and `appended` as in EditLog."""
     viewers: int
 
 
@@ -140,6 +143,12 @@ class SessionList(_Body):
 
 class EditRequest(_Body):
     edit: Edit
+
+
+class EditsRequest(_Body):
+    edits: list[Edit]
+    revision: Annotated[int, Field(ge=0)] | None = None
+    """Of the log that they are meant for: refused once there is a newer one. Absent: whatever is in force goes."""
 
 
 class SnapshotInfo(_Body):

@@ -19,6 +19,7 @@ from server.render_session import Pixels
 from server.rest_records import (
     AssetInfo,
     EditRequest,
+    EditsRequest,
     SaveRequest,
     SessionInfo,
     SessionList,
@@ -74,6 +75,13 @@ async def undo(session_id: str, context: Context, key: ClientKeyHeader = None) -
 @router.post("/{session_id}/redo")
 async def redo(session_id: str, context: Context, key: ClientKeyHeader = None) -> EditLog:
     return await _apply(context, session_id, "redo", None, key)
+
+
+@router.put("/{session_id}/edits")
+async def replace_edits(session_id: str, body: EditsRequest, context: Context, key: ClientKeyHeader = None) -> EditLog:
+    """Puts these edits in place of all that are in force, as one step of undo."""
+    session = await context.sessions.get(session_id)
+    return (await context.sessions.apply(session, "restore", body.edits, key=key, revision=body.revision)).log
 
 
 async def _apply(context: ServerContext, session_id: str, kind: EventKind, edit: Edit | None, key: str | None) -> EditLog:

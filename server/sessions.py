@@ -9,7 +9,7 @@ import re
 import time
 import uuid
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -20,7 +20,7 @@ from sqlalchemy.orm import Session as DatabaseSession
 
 from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, PoseEdit, parse_edits
 from server import messages
-from server.edit_log import EditLog, EventKind
+from server.edit_log import Change, EditLog, EventKind, Splice
 from server.environments import EnvironmentStore
 from server.metrics import Metrics
 from server.problems import ProblemError
@@ -42,6 +42,13 @@ POSING_THREADS = 4
 _CLIP = re.compile(r"clips/[0-9a-f]{32}")
 COALESCE_SECONDS = 0.5
 """Edits with the same key, closer together than this, are one step of undo."""
+
+
+class Overtaken(ProblemError):
+    """The log was changed since the caller looked at it."""
+
+    def __init__(self, found: int, expected: int) -> None:
+        super().__init__(409, f"This session's edits were changed meanwhile (revision {found}, not {expected}); read them and send again.")
 
 
 @dataclass(frozen=True)
@@ -259,34 +266,39 @@ class SessionRegistry:
         self,
         session: LiveSession,
         kind: EventKind,
-        change: Edit | list[Edit] | None = None,
+        change: Change | None = None,
         coalesce: str | None = None,
         key: str | None = None,
+        revision: int | None = None,
     ) -> Applied:
         """One change of the log: posed, then stored, then shown to all viewers.
 
         Args:
-            change: the edit, or what `restore` brings.
+            change: the edit, the splice, or what `restore` brings.
             key: of the client; a change whose key is known already is not applied again.
+            revision: of the log that the change is meant for; None for whichever there is.
 
         Raises:
+            Overtaken: the log has another revision; it is as before.
             ProblemError: a sentence; the log is as before.
         """
-        for edit in change if isinstance(change, list) else [change] if change is not None else []:
+        for edit in _edits_of(change):
             self.check_edit(edit)
         async with session.lock:
             if key is not None and key in session.keys:
                 return Applied(session.keys[key], session.log.message())
             posed = await self._load(session)
+            if revision is not None and revision != session.log.revision:
+                raise Overtaken(session.log.revision, revision)
             same_drag = coalesce is not None and coalesce == session.coalesce and time.monotonic() - session.coalesce_at < COALESCE_SECONDS
-            if kind == "edit" and same_drag and session.log.can_replace:
+            if kind in ("edit", "splice") and change is not None and same_drag and session.log.can_replace(change):
                 kind = "replace"
-            if kind == "edit" and len(session.log.done) >= self._limits.edits:
-                raise ProblemError(422, f"A session has at most {self._limits.edits} edits in force.")
             try:
                 log = session.log.after(kind, change)
             except ValueError as error:
                 raise ProblemError(409, str(error)) from error
+            if len(log.done) > max(self._limits.edits, len(session.log.done)):
+                raise ProblemError(422, f"A session has at most {self._limits.edits} edits in force.")
             loaded = session.loaded
             assert loaded is not None
             pose = await self._call(lambda: loaded.pose(log.done, posed.pose))
@@ -308,8 +320,14 @@ class SessionRegistry:
             listener(message)
         return Applied(log.revision, message)
 
-    def _store(self, session_id: str, revision: int, kind: str, change: Edit | list[Edit] | None, key: str | None) -> None:
-        values = [plain_edit(edit) for edit in change] if isinstance(change, list) else plain_edit(change) if change is not None else None
+    def _store(self, session_id: str, revision: int, kind: str, change: Change | None, key: str | None) -> None:
+        values: object = None
+        if isinstance(change, Splice):
+            values = {"start": change.start, "remove": change.remove, "edits": [plain_edit(edit) for edit in change.edits]}
+        elif isinstance(change, Sequence):
+            values = [plain_edit(edit) for edit in change]
+        elif change is not None:
+            values = plain_edit(change)
         with DatabaseSession(self._engine) as database, database.begin():
             database.add(SessionEventRow(session_id=session_id, revision=revision, kind=kind, edit=values, client_key=key))
 
@@ -400,7 +418,18 @@ class SessionRegistry:
             raise ProblemError(422, f"There is no clip {edit.clip[:100]!r}; a simulate job that is done names its clip.")
 
 
-def _change_of(event: SessionEventRow) -> Edit | list[Edit] | None:
-    if isinstance(event.edit, list):
-        return parse_edits(event.edit)
-    return parse_edits([event.edit])[0] if event.edit is not None else None
+def _edits_of(change: Change | None) -> Sequence[Edit]:
+    if isinstance(change, Splice):
+        return change.edits
+    return change if isinstance(change, Sequence) else [change] if change is not None else []
+
+
+def _change_of(event: SessionEventRow) -> Change | None:
+    values = event.edit
+    if isinstance(values, list):
+        return parse_edits(values)
+    if values is None:
+        return None
+    if "start" in values:
+        return Splice(values["start"], values["remove"], tuple(parse_edits(values["edits"])))
+    return parse_edits([values])[0]

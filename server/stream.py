@@ -12,6 +12,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from drgs import __version__
 from server import messages
 from server.context import ServerContext
+from server.edit_log import Splice
 from server.messages import (
     CLOSE_POLICY,
     CLOSE_VERSION_MISMATCH,
@@ -31,6 +32,7 @@ from server.messages import (
     ServerHello,
     SettingsMessage,
     SkippedWork,
+    SpliceMessage,
     StateMessage,
     StatusMessage,
     UndoMessage,
@@ -39,7 +41,7 @@ from server.messages import (
     unpack_frame,
 )
 from server.problems import ProblemError
-from server.sessions import LiveSession
+from server.sessions import Applied, LiveSession, Overtaken
 from server.viewer import Viewer
 
 HELLO_SECONDS = 20.0
@@ -52,7 +54,7 @@ MAX_BAD_MESSAGES = 50
 log = logging.getLogger(__name__)
 router = APIRouter()
 
-Change = EditMessage | UndoMessage | RedoMessage
+Change = EditMessage | SpliceMessage | UndoMessage | RedoMessage
 
 
 @router.websocket("/api/sessions/{session_id}/stream")
@@ -232,7 +234,7 @@ class Connection:
                 viewer.set_visible(message.visible)
                 if not message.visible:
                     self._say(_loading().model_copy(update={"phase": "paused"}))
-            case EditMessage() | UndoMessage() | RedoMessage():
+            case EditMessage() | SpliceMessage() | UndoMessage() | RedoMessage():
                 await self._changes.put(message)
             case PickMessage():
                 await self._pick(message)
@@ -260,13 +262,10 @@ class Connection:
                 change, following = following, None
                 answered.append(change.id)
             try:
-                if isinstance(change, EditMessage):
-                    applied = await self._context.sessions.apply(self._session, "edit", change.edit, change.coalesce, change.key)
-                else:
-                    applied = await self._context.sessions.apply(self._session, change.type, key=change.key)
+                applied = await self._apply(change)
             except ProblemError as problem:
                 for number in answered:
-                    self._say(RejectedMessage(id=number, reason=problem.detail))
+                    self._say(RejectedMessage(id=number, reason=problem.detail, overtaken=isinstance(problem, Overtaken)))
             except SQLAlchemyError as error:
                 log.error("an edit could not be stored", exc_info=error)
                 for number in answered:
@@ -275,6 +274,17 @@ class Connection:
                 for number in answered:
                     self._say(AcceptedMessage(id=number, revision=applied.revision))
         connection.cancel()
+
+    async def _apply(self, change: Change) -> Applied:
+        sessions, session = self._context.sessions, self._session
+        match change:
+            case EditMessage():
+                return await sessions.apply(session, "edit", change.edit, change.coalesce, change.key)
+            case SpliceMessage():
+                splice = Splice(change.start, change.remove, tuple(change.edits))
+                return await sessions.apply(session, "splice", splice, change.coalesce, change.key, change.revision)
+            case UndoMessage() | RedoMessage():
+                return await sessions.apply(session, change.type, key=change.key)
 
     async def _pick(self, message: PickMessage) -> None:
         picture = self.viewer.picture

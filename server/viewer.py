@@ -112,10 +112,11 @@ class Viewer:
     # ---- inputs, from the event loop --------------------------------------------------------------------------------
 
     def set_camera(self, camera: CameraMessage) -> None:
-        """Latest wins; one that looks the same changes nothing."""
+        """Latest wins; the very same one changes nothing. A new number is answered by a frame even where it looks the same: that is how
+        a client tells frames from before a change of its settings from those after it."""
         with self._lock:
             before, self._camera = self._camera, camera
-            if before is None or before.model_copy(update={"number": camera.number}) != camera:
+            if before != camera:
                 self._touch()
 
     def set_settings(self, settings: Settings) -> None:

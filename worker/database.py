@@ -131,7 +131,7 @@ class SessionEventRow(Base):
     revision: Mapped[int] = mapped_column(primary_key=True)
     """1, 2, 3, ..."""
     kind: Mapped[str]
-    """edit, replace (of the last edit, in one slider drag), restore (of a snapshot), undo or redo."""
+    """edit, replace (of the last step, in one slider drag), splice, restore (of a whole list), undo or redo."""
     edit: Mapped[dict | list | None] = mapped_column(JSON)
     """A list for restore."""
     client_key: Mapped[str | None]

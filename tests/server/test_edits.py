@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drgs.scene.edits import parse_edits
-from server.edit_log import EditLog, NothingToDo
+from server.edit_log import EditLog, NothingToDo, Splice
 
 
 def material(roughness: float) -> dict:
@@ -214,3 +214,35 @@ def test_a_session_that_another_server_changed_is_not_overwritten(tmp_path: Path
         assert stale.status_code == 409 and "open it again" in stale.json()["detail"]
         again = one.client.post(f"{url}/edits", json={"edit": material(0.4)}).json()
         assert again["revision"] == 3 and roughnesses(again) == [0.1, 0.2, 0.4]
+
+
+def test_a_splice_is_one_step_of_undo_and_says_what_undo_and_redo_take_one_by_one() -> None:
+    a, b, c, d, e, *_ = EDITS
+    log = EditLog()
+    for edit in (a, b, c):
+        log = log.after("edit", edit)
+    assert log.appended == 3
+    spliced = log.after("splice", Splice(1, 1, (d, e)))
+    assert spliced.done == (a, d, e, c) and spliced.appended == 0
+    again = spliced.after("replace", Splice(1, 2, ()))
+    assert again.done == (a, c) and again.after("undo").done == (a, b, c)
+    longer = again.after("edit", b)
+    assert longer.done == (a, c, b) and longer.appended == 1
+    back = longer.after("undo")
+    assert back.message().undone == [b]
+    assert back.after("undo").message().undone == [], "redo would bring a splice back, which appends nothing"
+    with pytest.raises(ValueError, match="up to number 4, but 3 are in force"):
+        log.after("splice", Splice(2, 2, ()))
+
+
+def test_edits_put_in_place_of_others_come_back_after_a_crash_and_not_over_newer_ones(service: Service) -> None:
+    session = service.open_session()
+    first = service.client.post(f"/api/sessions/{session}/edits", json={"edit": material(0.1)}).json()
+    wanted = {"edits": [material(0.2), material(0.3)], "revision": first["revision"]}
+    put = service.client.put(f"/api/sessions/{session}/edits", json=wanted)
+    assert roughnesses(put.json()) == [0.2, 0.3] and put.json()["appended"] == 0
+    late = service.client.put(f"/api/sessions/{session}/edits", json=wanted)
+    assert late.status_code == 409 and "changed meanwhile" in late.json()["detail"]
+    service.context.sessions._live.clear()  # as after a crash: only the database is left
+    replayed = service.client.get(f"/api/sessions/{session}").json()
+    assert roughnesses(replayed) == [0.2, 0.3] and replayed["revision"] == 2

@@ -129,7 +129,7 @@ def test_the_picture_moves_then_refines_then_converges_and_then_nothing_is_sent(
         assert samples == sorted(samples)
         assert client.text("status")["phase"] in ("moving", "still", "converged")
         # The same camera again changes nothing, so the next thing that comes is the answer to the pick.
-        client.socket.send_json(camera(number=0x1FF))
+        client.socket.send_json(camera(number=0x1FE))
         time.sleep(0.5)
         count = len(client.frames)
         client.send(type="pick", id=5, x=0.25, y=0.5)
@@ -138,6 +138,20 @@ def test_the_picture_moves_then_refines_then_converges_and_then_nothing_is_sent(
         assert len(client.frames) == count
         client.send(type="pick", id=6, x=0.75, y=0.5)
         assert not client.text("picked")["hit"]
+
+
+def test_a_new_number_of_the_camera_marks_the_frames_that_show_new_settings(service: Service) -> None:
+    with talk(service, service.open_session()) as client:
+        client.send(type="settings", settings={"spp_target": 8})
+        client.socket.send_json(camera(number=1))
+        client.frame(FLAG_CONVERGED)
+        # Even settings that change nothing: the frame that says so must come.
+        client.send(type="settings", settings={"spp_target": 8})
+        client.socket.send_json(camera(number=2))
+        before = len(client.frames)
+        last = client.frame(FLAG_CONVERGED)
+        assert last.flags >> 8 == 2
+        assert [header.flags >> 8 for header, _ in client.frames[before:]] == [2] * (len(client.frames) - before)
 
 
 def test_rendering_runs_on_the_render_thread_only(service: Service) -> None:
@@ -167,7 +181,7 @@ def test_edits_are_answered_in_order_and_shown_with_their_revision(service: Serv
 def test_a_wrong_edit_is_rejected_with_a_reason_and_the_rest_goes_on(service: Service) -> None:
     with talk(service, service.open_session()) as client:
         client.send(type="edit", id=1, edit={"op": "deform", "map": {"type": "stretch", "factor": 2}})
-        assert client.text("rejected") == {"type": "rejected", "id": 1, "reason": "This asset is made of stone."}
+        assert client.text("rejected") == {"type": "rejected", "id": 1, "reason": "This asset is made of stone.", "overtaken": False}
         client.send(type="edit", id=2, edit={"op": "environment", "file": "../token"})
         assert "No environment" in client.text("rejected")["reason"]
         client.send(type="edit", id=3, edit=material(0.5))
@@ -308,6 +322,29 @@ def test_an_edit_sent_again_after_the_connection_was_lost_is_applied_once(servic
             client.send(type="edit", id=7, edit=material(0.5), key="once")
             assert client.text("accepted")["revision"] == 1
     assert service.client.get(f"/api/sessions/{session}").json()["revision"] == 1
+
+
+def test_a_splice_over_the_stream_is_applied_once_coalesced_and_never_to_a_log_it_was_not_meant_for(service: Service) -> None:
+    session = service.open_session()
+    with talk(service, session) as client:
+        for number in (1, 2):
+            client.send(type="edit", id=number, edit=material(number / 10))
+            client.text("accepted")
+        splice = {"type": "splice", "start": 0, "remove": 1, "coalesce": "drag"}
+        for key in ("one", "one"):
+            client.send(**splice, id=3, revision=2, edits=[material(0.5)], key=key)
+            assert client.text("accepted")["revision"] == 3
+        client.send(**splice, id=4, revision=3, edits=[material(0.6)], key="two")
+        assert client.text("accepted")["revision"] == 4
+        client.send(**splice, id=5, revision=3, edits=[material(0.7)], key="three")
+        late = client.text("rejected")
+        assert late["id"] == 5 and late["overtaken"] and "changed meanwhile" in late["reason"]
+        client.send(type="splice", id=6, revision=4, start=1, remove=2, edits=[])
+        assert not client.text("rejected")["overtaken"]
+        client.send(type="undo", id=7)
+        client.text("accepted")
+    log = service.client.get(f"/api/sessions/{session}").json()
+    assert [edit["set"]["roughness"] for edit in log["edits"]] == [0.1, 0.2], "two splices of one drag are one step"
 
 
 def test_a_client_that_vanishes_while_its_picture_is_made_leaves_nothing_behind(tmp_path) -> None:

@@ -62,7 +62,7 @@ class Viewer:
 
         wait_until(
             is_settled,
-            lambda: f"a fresh traced picture; the page says: {self.page.locator('.hud, .notices').all_inner_texts()}",
+            lambda: f"a fresh traced picture; the page says: {self.page.locator('.hud, .notices').all_inner_texts()}, {self.stage()}",
         )
 
     def settled_color(self) -> tuple[float, float, float]:

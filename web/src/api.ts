@@ -27,7 +27,15 @@ function sentenceFor(status: number, body: string): string {
   return `The server answered with error ${status}. Its log says more.`;
 }
 
+/** Done once the link's token has become a cookie: what the user does before that waits for it. */
+let signedIn: Promise<unknown> = Promise.resolve();
+
 async function call<T>(method: string, path: string, body?: unknown): Promise<T> {
+  await signedIn;
+  return ask(method, path, body);
+}
+
+async function ask<T>(method: string, path: string, body?: unknown): Promise<T> {
   let response: Response;
   try {
     response = await fetch(path, {
@@ -44,7 +52,8 @@ async function call<T>(method: string, path: string, body?: unknown): Promise<T>
 }
 
 /** Send a form by XMLHttpRequest, which unlike fetch tells how far an upload is (0..1). */
-function upload<T>(path: string, form: FormData, onProgress?: (share: number) => void): Promise<T> {
+async function upload<T>(path: string, form: FormData, onProgress?: (share: number) => void): Promise<T> {
+  await signedIn;
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
     request.open('POST', path);
@@ -60,7 +69,11 @@ function upload<T>(path: string, form: FormData, onProgress?: (share: number) =>
 
 const part = encodeURIComponent;
 
-export const login = (token: string) => call<void>('POST', '/api/login', { token });
+export function login(token: string): Promise<void> {
+  const answer = ask<void>('POST', '/api/login', { token });
+  signedIn = answer.catch(() => {}); // who asked for it tells the user
+  return answer;
+}
 
 export const listAssets = () => call<AssetList>('GET', '/api/assets');
 export const assetThumb = (asset: AssetInfo) => `/api/assets/${part(asset.id)}/thumb.jpg`;

@@ -73,6 +73,16 @@ export function withReplaced(edits: Edit[], edit: Edit, replaces: (other: Edit) 
   return at < 0 ? [...edits, edit] : edits.with(at, edit);
 }
 
+/** What has to be exchanged in `before` to make it `after`: `remove` edits behind the first `start`, for `edits`. */
+export function difference(before: Edit[], after: Edit[]): { start: number; remove: number; edits: Edit[] } {
+  const same = (i: number, j: number) => sameEdits([before[i]!], [after[j]!]);
+  let start = 0;
+  while (start < before.length && start < after.length && same(start, start)) start++;
+  let kept = 0; // at the end
+  while (kept < before.length - start && kept < after.length - start && same(before.length - 1 - kept, after.length - 1 - kept)) kept++;
+  return { start, remove: before.length - start - kept, edits: after.slice(start, after.length - kept) };
+}
+
 const rounded = (value: number) => (Math.round(value * 100) / 100).toString();
 
 const PART_NAMES = { region: 'Region', similar: 'Similar', sphere: 'Sphere', box: 'Box', vertex_weights: 'Painted' } as const;

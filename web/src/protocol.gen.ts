@@ -114,7 +114,10 @@ export interface BuildRequest {
 /** Where this viewer looks from. Latest wins: a newer one replaces one that was not rendered yet. */
 export interface CameraMessage {
   type: "camera";
-  /** Chosen by the client; a frame carries the low 8 bits of the number of the camera that it shows. */
+  /**
+   * Chosen by the client; a frame carries the low 8 bits of the number of the camera that it shows. A new number is answered by a frame
+   * even where nothing else is new: sent behind `settings`, it marks the frames that show them.
+   */
   number?: number;
   /** OpenGL camera-to-world, rows: the camera looks down -z, y up. World is right-handed, z up. */
   world_from_camera: [[number, number, number, number], [number, number, number, number], [number, number, number, number], [number, number, number, number]];
@@ -147,12 +150,16 @@ export interface DeformEdit {
 
 /** The session's edits. The same document answers REST calls. */
 export interface EditLog {
-  /** Rises by one with every edit, undo and redo; never falls. */
+  /** Rises by one with every change; never falls. */
   revision: number;
   /** Those in force, in order. */
   edits: Edit[];
   can_undo: boolean;
   can_redo: boolean;
+  /** How many of the edits, counted from the last, undo takes away one by one; what lies behind them goes in one step. */
+  appended: number;
+  /** Those that redo brings back one by one, the next one first; empty when the next redo does more than append one. */
+  undone: Edit[];
 }
 
 /** Append an edit to the session's log. Applied in order, never dropped, answered by `accepted` or `rejected`. */
@@ -172,6 +179,12 @@ export interface EditMessage {
 
 export interface EditRequest {
   edit: Edit;
+}
+
+export interface EditsRequest {
+  edits: Edit[];
+  /** Of the log that they are meant for: refused once there is a newer one. Absent: whatever is in force goes. */
+  revision?: number | null;
 }
 
 export interface EnvironmentEdit {
@@ -399,6 +412,8 @@ export interface RejectedMessage {
   type: "rejected";
   id: number;
   reason: string;
+  /** The log was changed by somebody else meanwhile: count anew and send again. */
+  overtaken: boolean;
 }
 
 export interface RenderCamera {
@@ -496,6 +511,9 @@ export interface SessionInfo {
   edits: Edit[];
   can_undo: boolean;
   can_redo: boolean;
+  appended: number;
+  /** This and `appended` as in EditLog. */
+  undone: Edit[];
   viewers: number;
 }
 
@@ -576,6 +594,24 @@ export interface Sphere {
   falloff?: number;
 }
 
+/** Put edits in the place of some of those in force, as one step of undo. */
+export interface SpliceMessage {
+  type: "splice";
+  id: number;
+  /** Of the log that `start` and `remove` count in; once there is a newer one the answer is `rejected` with `overtaken`. */
+  revision: number;
+  /** How many edits stay in front. */
+  start: number;
+  /** How many behind them go. */
+  remove: number;
+  /** What comes in their place. */
+  edits: Edit[];
+  /** As of an edit: a splice with the key of the one just before it, < 500 ms earlier, is the same step of undo. */
+  coalesce?: string | null;
+  /** As of an edit. */
+  key?: string | null;
+}
+
 /** A camera that shows the whole object, for the first picture. */
 export interface StartView {
   world_from_camera: [[number, number, number, number], [number, number, number, number], [number, number, number, number], [number, number, number, number]];
@@ -643,6 +679,7 @@ export type ClientMessage =
   | ClientHello
   | CameraMessage
   | EditMessage
+  | SpliceMessage
   | UndoMessage
   | RedoMessage
   | AckMessage

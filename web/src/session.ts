@@ -2,15 +2,13 @@
 
 import { batch } from '@preact/signals';
 import * as api from './api';
-import { environmentEdit, sameEdits, sameSelection, withoutValue, withReplaced, type Light } from './edit_log';
+import { difference, environmentEdit, sameEdits, sameSelection, withoutValue, withReplaced, type Light } from './edit_log';
 import type { Edit, EditLog, FrameHeader, MaterialValues, PickedMessage, ServerHello, SessionInfo, Settings } from './protocol.gen';
-import { attempt, connection, draft, edits, EVERYTHING, flash, light, log, mesh, mode, notify, pending, selection, session, settings, status, tool, undone } from './state';
+import { attempt, connection, draft, edits, EVERYTHING, flash, light, log, mesh, mode, notify, pending, selection, session, settings, status, tool } from './state';
 import { Stream } from './stream';
 
 /** Edits of one drag go out at most this often; the server makes one undo step of those that share a key. */
 const DRAG_INTERVAL_MS = 40;
-/** Well below what the server calls one drag (500 ms): messages take their time. */
-const COALESCE_MS = 350;
 
 let stream: Stream | null = null;
 let helloListener: ((hello: ServerHello) => void) | null = null;
@@ -37,24 +35,21 @@ export async function openAsset(id: string): Promise<void> {
   lastHello = null;
   batch(() => {
     session.value = { id: info.id, asset: info.asset, assetName: info.asset_name };
-    log.value = { revision: info.revision, edits: info.edits, can_undo: info.can_undo, can_redo: info.can_redo };
+    log.value = logOf(info);
     pending.value = [];
     status.value = null;
     mesh.value = null;
-    draft.value = null;
-    undone.value = [];
+    dropSplice();
     selection.value = EVERYTHING;
     tool.value = 'all';
-    rewrite = null;
-    past = [];
-    future = [];
-    later = [];
   });
   history.replaceState(null, '', `#asset=${encodeURIComponent(id)}`);
   document.title = `${info.asset_name} · DR-GS`;
   stream = new Stream(info.id, events(info.asset));
   stream.sendSettings(settings.value);
 }
+
+const logOf = ({ revision, edits, can_undo, can_redo, appended, undone }: SessionInfo): EditLog => ({ revision, edits, can_undo, can_redo, appended, undone });
 
 /** A new session; where the server takes no more, the newest that it has on this asset. */
 async function freshSession(asset: string): Promise<SessionInfo> {
@@ -82,10 +77,7 @@ function events(asset: string): ConstructorParameters<typeof Stream>[1] {
     connection: (state) => (connection.value = state),
     hello: (hello) => {
       takeLog(hello.log);
-      if (rewrite) {
-        stream?.forgetOrdered(); // how far it got shows in the log
-        queueMicrotask(continueRewrite);
-      }
+      queueMicrotask(sendSplice); // one that waited for a connection
       lastHello = hello;
       helloListener?.(hello);
     },
@@ -96,11 +88,13 @@ function events(asset: string): ConstructorParameters<typeof Stream>[1] {
         case 'accepted':
           pending.value = pending.value.map((waiting) => (waiting.id === message.id ? { ...waiting, revision: message.revision } : waiting));
           takeLog(log.value);
-          return continueRewrite();
+          return message.id === splicing?.id ? endSplice() : sendSplice();
         case 'rejected':
-          rewrite = null; // first: who hears of the draft's end must find no rewrite
-          draft.value = null;
-          later = [];
+          if (message.overtaken && splicing?.id === message.id && splicing.attempts-- > 0) {
+            splicing.id = null;
+            return sendSplice();
+          }
+          dropSplice();
           pending.value = pending.value.filter((waiting) => waiting.id !== message.id);
           return notify(message.reason);
         case 'status':
@@ -133,13 +127,14 @@ async function recoverSession(asset: string): Promise<string | null> {
     }
   }
   try {
-    const wanted = [...log.value.edits, ...pending.value.map((waiting) => waiting.edit)];
+    const wanted = splicing?.after ?? [...log.value.edits, ...pending.value.map((waiting) => waiting.edit)];
     const fresh = await api.openSession(asset);
     for (const edit of wanted) await api.appendEdit(fresh.id, edit);
     localStorage.setItem(storageKey(asset), fresh.id);
     batch(() => {
       session.value = { ...open, id: fresh.id };
       pending.value = [];
+      dropSplice();
     });
     return fresh.id;
   } catch {
@@ -149,13 +144,6 @@ async function recoverSession(asset: string): Promise<string | null> {
 
 function takeLog(next: EditLog): void {
   batch(() => {
-    const old = log.value.edits;
-    const kept = next.edits.length;
-    if (next.revision > log.value.revision && rewrite === null) {
-      if (kept < old.length && sameEdits(old.slice(0, kept), next.edits)) undone.value = [...old.slice(kept), ...undone.value];
-      else if (next.can_redo && kept === old.length + 1) undone.value = undone.value.slice(1);
-    }
-    if (!next.can_redo) undone.value = [];
     log.value = next;
     pending.value = pending.value.filter((waiting) => waiting.revision === null || waiting.revision > next.revision);
   });
@@ -171,6 +159,8 @@ const drags = new Map<string, Drag>();
 
 function send(edit: Edit, coalesce: string | null): void {
   if (!stream) return;
+  const last = pending.value.at(-1)?.edit ?? log.value.edits.at(-1);
+  if (last && sameEdits([last], [edit])) return; // Enter behind a number that is in force already
   const id = stream.sendEdit(edit, coalesce);
   pending.value = [...pending.value, { id, edit, revision: null }];
 }
@@ -185,7 +175,7 @@ function sendFlowing(key: string, edit: Edit): void {
   const flow: Drag = { timer: 0, next: edit };
   drags.set(key, flow);
   const step = () => {
-    if (rewrite) flow.timer = window.setTimeout(step, DRAG_INTERVAL_MS);
+    if (splicing) flow.timer = window.setTimeout(step, DRAG_INTERVAL_MS);
     else if (flow.next) {
       send(flow.next, key);
       flow.next = null;
@@ -224,105 +214,99 @@ export function useCapturedLight(): void {
 
 export const isTwin = (edit: Edit) => (other: Edit) => edit.op === 'deform' && other.op === 'deform' && edit.map != null && edit.map.type === other.map?.type;
 
-let timeEditedAt = -Infinity;
+let nextTime: Edit | null = null;
 
-/** Another moment of what moves, in place of the last one: a film is one step of the log however slowly it plays. */
+export const timeKey = (edit: Edit) => `time.${edit.op}`;
+
+/** Another moment of what moves, in place of the last one: a film that plays on is one step of undo. Moments that the server has no time for are left out. */
 export function editTime(edit: Edit): void {
-  if (rewrite) return void later.push(() => editTime(edit));
-  const now = performance.now();
-  const flows = now - timeEditedAt < COALESCE_MS && log.value.edits.at(-1)?.op === edit.op;
-  timeEditedAt = now;
-  if (flows) return sendFlowing(`time.${edit.op}`, edit);
-  replaceEdits(withReplaced(edits.value, edit, (other) => other.op === edit.op), false);
+  const waits = nextTime !== null;
+  nextTime = edit;
+  if (!splicing) playNext();
+  else if (!waits) later.push(playNext);
+}
+
+function playNext(): void {
+  const edit = nextTime;
+  nextTime = null;
+  if (edit) replaceEdits(withReplaced(edits.value, edit, (other) => other.op === edit.op), timeKey(edit));
 }
 
 // ---- edits that take an earlier one's place ------------------------------------------------------------------------------
 
 /** Show what `edit` does, in place of the newest one that it replaces; the server hears of it by `commitDraft`. */
 export function draftEdit(edit: Edit, replaces: (other: Edit) => boolean): void {
-  if (rewrite) return void later.push(() => draftEdit(edit, replaces));
+  if (splicing) return void later.push(() => draftEdit(edit, replaces));
   draft.value = withReplaced([...log.value.edits, ...pending.value.map((waiting) => waiting.edit)], edit, replaces);
 }
 
 export function commitDraft(): void {
-  if (rewrite) later.push(commitDraft);
+  if (splicing) later.push(commitDraft);
   else if (draft.value) replaceEdits(draft.value);
 }
 
-interface Rewrite {
-  before: Edit[];
+interface Splicing {
   after: Edit[];
-  /** Attempts left, should another viewer change the log meanwhile. */
+  coalesce: string | null;
+  /** Of its message, once that is sent. */
+  id: number | null;
+  /** Left, should another viewer change the log meanwhile. */
   attempts: number;
 }
-/** The one under way, and those that undo and redo can step over: the log itself only knows its end. */
-let rewrite: Rewrite | null = null;
-let past: Rewrite[] = [];
-let future: Rewrite[] = [];
-/** What the user did while the log was being changed, to be done then. */
+/** The one that the server has not answered yet. */
+let splicing: Splicing | null = null;
+/** What the user did meanwhile, to be done then: it counts in the log that will be. */
 let later: (() => void)[] = [];
 
-/** Make the log hold exactly these edits: undo back to the first that differs, then add the rest. */
-export function replaceEdits(after: Edit[], remember = true): void {
-  if (rewrite) return void later.push(() => replaceEdits(after, remember));
+/** Make the log hold exactly these edits, in one step of undo. */
+export function replaceEdits(after: Edit[], coalesce: string | null = null): void {
+  if (splicing) return void later.push(() => replaceEdits(after, coalesce));
   if (!stream) return;
-  const before = log.value.edits;
-  if (sameEdits(before, after)) {
-    draft.value = null;
-    return;
-  }
-  rewrite = { before, after, attempts: 3 };
-  if (remember) {
-    past = [...past, rewrite];
-    future = [];
-  }
+  splicing = { after, coalesce, id: null, attempts: 3 };
   draft.value = after;
-  continueRewrite();
+  sendSplice();
 }
 
-function continueRewrite(): void {
-  if (!rewrite || !stream || !stream.idle) return;
-  const { after } = rewrite;
-  const now = log.value.edits;
-  if (sameEdits(now, after) || rewrite.attempts-- === 0) {
-    rewrite = null; // first: who hears of the draft's end must find no rewrite
-    draft.value = null;
-    while (!rewrite && later.length) later.shift()!();
-    return;
-  }
-  let same = 0;
-  while (same < now.length && same < after.length && sameEdits([now[same]!], [after[same]!])) same++;
-  for (let steps = now.length - same; steps > 0; steps--) stream.undo();
-  for (const edit of after.slice(same)) stream.sendEdit(edit, null);
+/** Once all changes before it are answered: only then is it known what it counts in. */
+function sendSplice(): void {
+  if (!splicing || splicing.id !== null || !stream?.idle) return;
+  const { after, coalesce } = splicing;
+  const { edits: now, revision } = log.value;
+  const { start, remove, edits: put } = difference(now, after);
+  if (remove === 0 && put.length === 0) return endSplice();
+  splicing.id = stream.splice(revision, start, remove, put, coalesce);
 }
 
-/** Whether the server's log is between what was and what will be. */
-export const isRewriting = () => rewrite !== null;
+function endSplice(): void {
+  splicing = null; // first: who hears of the draft's end must find none under way
+  draft.value = null;
+  while (!splicing && later.length) later.shift()!();
+}
+
+/** What is waiting to become of the log is wanted no more, or can't be. */
+function dropSplice(): void {
+  splicing = null;
+  later = [];
+  draft.value = null;
+}
 
 export function undo(): void {
-  if (rewrite) return void later.push(undo);
-  const step = past.at(-1);
-  if (step && sameEdits(step.after, log.value.edits)) {
-    past = past.slice(0, -1);
-    future = [...future, step];
-    replaceEdits(step.before, false);
-  } else if (log.value.can_undo || pending.value.length) stream?.undo();
+  if (splicing) later.push(undo);
+  else if (log.value.can_undo || pending.value.length) stream?.undo();
 }
 
 export function redo(): void {
-  if (rewrite) return void later.push(redo);
-  const step = future.at(-1);
-  if (step && sameEdits(step.before, log.value.edits)) {
-    future = future.slice(0, -1);
-    past = [...past, step];
-    replaceEdits(step.after, false);
-  } else if (log.value.can_redo) stream?.redo();
+  if (splicing) later.push(redo);
+  else if (log.value.can_redo) stream?.redo();
 }
 
-/** To the log with `count` edits in force, back or forth among those that are known. */
+/** To the log with `count` of the edits that the history shows in force. */
 export function goTo(count: number): void {
-  for (let steps = log.value.edits.length - count; steps > 0; steps--) stream?.undo();
-  for (let steps = count - log.value.edits.length; steps > 0; steps--) stream?.redo();
+  if (splicing) return void later.push(() => goTo(count));
+  const { edits: now, appended } = log.value;
+  if (now.length - count > appended) return replaceEdits(now.slice(0, count));
+  for (let steps = now.length - count; steps > 0; steps--) stream?.undo();
+  for (let steps = count - now.length; steps > 0; steps--) stream?.redo();
 }
 
 export function changeSettings(change: Partial<Settings>): void {

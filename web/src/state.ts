@@ -22,7 +22,7 @@ export const connection = signal<Connection>('closed');
 export const status = signal<StatusMessage | null>(null);
 
 /** The server's log, and edits sent but not yet in it: panels show both, so a slider never jumps back. */
-export const log = signal<EditLog>({ revision: 0, edits: [], can_undo: false, can_redo: false });
+export const log = signal<EditLog>({ revision: 0, edits: [], can_undo: false, can_redo: false, appended: 0, undone: [] });
 export interface PendingEdit {
   id: number;
   edit: Edit;
@@ -30,12 +30,10 @@ export interface PendingEdit {
   revision: number | null;
 }
 export const pending = signal<PendingEdit[]>([]);
-/** While the log is being changed in its middle, or a slider is dragged whose edit is sent at the end: what it will be. */
+/** While the log is being changed elsewhere than at its end, or a slider is dragged whose edit is sent at the end: what it will be. */
 export const draft = signal<Edit[] | null>(null);
 export const edits = computed<Edit[]>(() => draft.value ?? [...log.value.edits, ...pending.value.map((waiting) => waiting.edit)]);
 export const light = computed(() => lightOf(edits.value));
-/** What redo brings back, the next one first; as far as this page saw it undone. */
-export const undone = signal<Edit[]>([]);
 
 /** The asset's mesh as captured; null until it is here. */
 export const mesh = signal<RestMesh | null>(null);

@@ -2,7 +2,8 @@
  * One WebSocket to a session: JSON text both ways, pictures as binary (docs/protocol.md).
  *
  * Camera and settings are latest-wins and sent at most every CAMERA_INTERVAL_MS. Edits, undo and redo are ordered: they wait
- * in `outbox` until the server has accepted or rejected them, and are sent again after a reconnection, so none is lost.
+ * in `outbox` until the server has accepted or rejected them, and are sent again after a reconnection, so none is lost; their keys
+ * keep the server from applying one twice.
  */
 
 import {
@@ -21,6 +22,7 @@ import {
   type ServerHello,
   type ServerMessage,
   type Settings,
+  type SpliceMessage,
   type UndoMessage,
 } from './protocol.gen';
 
@@ -29,7 +31,7 @@ const RECONNECT_FIRST_MS = 200;
 const RECONNECT_LONGEST_MS = 2000;
 
 export type Connection = 'connecting' | 'open' | 'lost' | 'closed';
-type Ordered = EditMessage | UndoMessage | RedoMessage;
+type Ordered = EditMessage | SpliceMessage | UndoMessage | RedoMessage;
 
 export interface StreamEvents {
   connection(state: Connection): void;
@@ -53,14 +55,14 @@ export class Stream {
   private camera: CameraMessage | null = null;
   private cameraNumber = 0;
   private pose = '';
-  private cameraSentAt = 0;
-  private cameraTimer = 0;
   private settings: Settings | null = null;
-  private settingsTimer = 0;
+  private viewSentAt = 0;
+  private viewTimer = 0;
+  private settingsSent = false;
   private picks = new Map<number, (picked: PickedMessage) => void>();
   private newestFrame = 0;
-  /** Of the log, as far as the server has told. */
-  private revision = 0;
+  /** Of the keys of this page's changes. */
+  private readonly page = crypto.getRandomValues(new Uint32Array(2)).join('-');
 
   constructor(
     private session: string,
@@ -77,48 +79,54 @@ export class Stream {
     this.events.connection('closed');
   }
 
-  /**
-   * Number by which frames will name this camera (low 8 bits). A camera that looks the same keeps its number: the server would not
-   * render it again, so no frame would carry a new one.
-   */
+  /** Number by which frames will name this camera, and the newest settings with it (low 8 bits). A camera that looks the same keeps its number. */
   sendCamera(camera: Omit<CameraMessage, 'type' | 'number'>): number {
     const pose = JSON.stringify(camera);
     if (pose === this.pose) return this.cameraNumber & 0xff;
     this.pose = pose;
     this.cameraNumber = (this.cameraNumber + 1) >>> 0;
     this.camera = { type: 'camera', number: this.cameraNumber, ...camera };
-    if (!this.cameraTimer) {
-      const wait = Math.max(0, this.cameraSentAt + CAMERA_INTERVAL_MS - performance.now());
-      this.cameraTimer = window.setTimeout(this.flushCamera, wait);
-    }
+    this.flushSoon();
     return this.cameraNumber & 0xff;
   }
 
+  /** The camera gets a new number: frames that carry it show these settings. */
   sendSettings(settings: Settings): void {
     this.settings = settings;
-    if (!this.settingsTimer) this.settingsTimer = window.setTimeout(this.flushSettings, CAMERA_INTERVAL_MS);
+    this.settingsSent = false;
+    this.cameraNumber = (this.cameraNumber + 1) >>> 0;
+    if (this.camera) this.camera = { ...this.camera, number: this.cameraNumber };
+    this.flushSoon();
   }
 
   /** The id that `accepted` or `rejected` will repeat. */
   sendEdit(edit: Edit, coalesce: string | null): number {
-    return this.order({ type: 'edit', id: this.nextId++, edit, coalesce });
+    const id = this.nextId++;
+    // Of edits of one drag the server may skip all but the last, so they have no key: one that is sent twice sets the same value twice.
+    return this.order({ type: 'edit', id, edit, coalesce, key: coalesce === null ? this.key(id) : null });
+  }
+
+  /** Put `edits` in the place of `remove` edits behind the first `start` of the log of this revision. */
+  splice(revision: number, start: number, remove: number, edits: Edit[], coalesce: string | null): number {
+    const id = this.nextId++;
+    return this.order({ type: 'splice', id, revision, start, remove, edits, coalesce, key: this.key(id) });
   }
 
   undo(): number {
-    return this.order({ type: 'undo', id: this.nextId++ });
+    const id = this.nextId++;
+    return this.order({ type: 'undo', id, key: this.key(id) });
   }
 
   redo(): number {
-    return this.order({ type: 'redo', id: this.nextId++ });
+    const id = this.nextId++;
+    return this.order({ type: 'redo', id, key: this.key(id) });
   }
 
-  /** Whether the server has answered all edits, undos and redos. */
+  private key = (id: number) => `${this.page}-${id}`;
+
+  /** Whether the server has answered all changes of the log. */
   get idle(): boolean {
     return this.ready && this.outbox.length === 0;
-  }
-
-  forgetOrdered(): void {
-    this.outbox = [];
   }
 
   /** What lies under a point of the picture, as shares of its width and height. */
@@ -131,17 +139,6 @@ export class Stream {
     });
   }
 
-  /**
-   * After a reconnection nobody knows whether the server got what it had not answered. An edit sets values, so sending it twice is
-   * harmless and losing it is not; a second undo would take back one step too many, so it is sent again only if nothing changed.
-   */
-  private sendAgain(revision: number): void {
-    const unchanged = revision === this.revision;
-    this.outbox = this.outbox.filter((waiting) => waiting.type === 'edit' || unchanged);
-    this.revision = revision;
-    for (const waiting of this.outbox) this.send(waiting);
-  }
-
   private order(message: Ordered): number {
     this.outbox.push(message);
     if (this.ready) this.send(message);
@@ -152,16 +149,17 @@ export class Stream {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
-  private flushCamera = () => {
-    this.cameraTimer = 0;
-    if (!this.ready || !this.camera) return;
-    this.cameraSentAt = performance.now();
-    this.send(this.camera);
-  };
+  private flushSoon(): void {
+    if (!this.viewTimer) this.viewTimer = window.setTimeout(this.flushView, Math.max(0, this.viewSentAt + CAMERA_INTERVAL_MS - performance.now()));
+  }
 
-  private flushSettings = () => {
-    this.settingsTimer = 0;
-    if (this.ready && this.settings) this.send({ type: 'settings', settings: this.settings });
+  private flushView = () => {
+    this.viewTimer = 0;
+    if (!this.ready) return;
+    this.viewSentAt = performance.now();
+    if (this.settings && !this.settingsSent) this.send({ type: 'settings', settings: this.settings });
+    this.settingsSent = true;
+    if (this.camera) this.send(this.camera);
   };
 
   private onVisibility = () => {
@@ -190,18 +188,15 @@ export class Stream {
         this.newestFrame = 0;
         this.events.hello(message);
         this.events.connection('open');
-        this.flushSettings();
-        this.flushCamera();
+        this.settingsSent = false;
+        this.flushView();
         if (document.hidden) this.onVisibility();
-        this.sendAgain(message.log.revision);
+        for (const waiting of this.outbox) this.send(waiting);
         return;
       case 'picked':
         this.picks.get(message.id)?.(message);
         this.picks.delete(message.id);
         return;
-      case 'state':
-        this.revision = message.log.revision;
-        break;
       case 'accepted':
       case 'rejected':
         this.outbox = this.outbox.filter((waiting) => waiting.id !== message.id);

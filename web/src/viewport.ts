@@ -5,7 +5,7 @@
  * picture is hidden and a fresh one fades in; without it the newest traced picture always stays.
  */
 
-import { effect, untracked } from '@preact/signals';
+import { effect } from '@preact/signals';
 import CameraControls from 'camera-controls';
 import { Box3, Matrix4, MOUSE, PerspectiveCamera, Quaternion, Raycaster, Sphere, Spherical, Vector2, Vector3, Vector4 } from 'three';
 import * as api from './api';
@@ -14,7 +14,7 @@ import { frameBox } from './framing';
 import { LocalPace } from './local_pace';
 import { LocalPicture } from './local_picture';
 import { FLAG_CONVERGED, FLAG_MOVING, MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from './protocol.gen';
-import { isRewriting, listen, pick, sendCamera } from './session';
+import { listen, pick, sendCamera } from './session';
 import { listenToPointers } from './pointers';
 import { paint, selectAt } from './selecting';
 import { viewNow, type Row, type View } from './viewpoint';
@@ -46,12 +46,9 @@ export class Viewport {
   private movedAt = -Infinity;
   private cameraNumber = 0;
   private newestFrame = 0;
-  /** Set by changes that no camera number or revision tells: settings. Frames up to this id may still show the old ones. */
-  private staleUpTo = 0;
   private fresh = false;
   /** Of the picture on the traced canvas. */
-  private drawn = { revision: -1, camera: -1, frame: 0, enough: false };
-  private held: { header: FrameHeader; picture: ImageBitmap; cameraNumber: number } | null = null;
+  private drawn = { revision: -1, camera: -1, enough: false };
   private localDirty = true;
   private readonly localPace = new LocalPace();
   private localSharp = true;
@@ -122,7 +119,6 @@ export class Viewport {
     this.controls.minDistance = 0.05 * this.bounds.radius;
     this.controls.maxDistance = 60 * this.bounds.radius;
     this.newestFrame = 0;
-    this.staleUpTo = 0;
     if (this.framedSession === hello.asset) return; // a reconnection keeps the view
     this.framedSession = hello.asset;
     this.stage.removeAttribute('data-picture');
@@ -144,17 +140,8 @@ export class Viewport {
 
   private onFrame = (header: FrameHeader, picture: ImageBitmap, cameraNumber: number) => {
     this.newestFrame = header.frameId;
-    this.held?.picture.close();
-    this.held = null;
-    if (isRewriting()) {
-      // Of neither what was nor what will be, unless it is the last one: then it is wanted.
-      this.held = { header, picture, cameraNumber };
-      return;
-    }
     // The first answer to a change counts as moving, yet may have all its samples from before; nothing follows then.
     const converged = (header.flags & FLAG_CONVERGED) !== 0;
-    const asSet = converged || header.frameId > this.staleUpTo;
-    const shown = asSet && cameraNumber === this.cameraNumber && header.stateRev >= log.value.revision && pending.value.length === 0 && draft.value === null;
     const few = Math.min(settings.value.denoise ? SHOW_FROM_SAMPLES.denoised : SHOW_FROM_SAMPLES.raw, header.sppTarget);
     const enough = converged || (header.spp >= few && !(header.flags & FLAG_MOVING));
     if (this.tracedCanvas.width !== header.width || this.tracedCanvas.height !== header.height) {
@@ -166,9 +153,15 @@ export class Viewport {
     this.stage.dataset.tracedFrames = String(Number(this.stage.dataset.tracedFrames ?? 0) + 1);
     this.stage.dataset.samples = String(header.spp);
     this.stage.dataset.revision = String(header.stateRev);
-    this.drawn = { revision: header.stateRev, camera: cameraNumber, frame: header.frameId, enough };
-    this.setFresh(shown && (enough || this.fresh));
+    this.drawn = { revision: header.stateRev, camera: cameraNumber, enough };
+    this.setFresh(this.drawnIsNewest && (enough || this.fresh));
   };
+
+  /** Whether the picture on the traced canvas is of the newest camera, settings and edits. */
+  private get drawnIsNewest(): boolean {
+    const settled = draft.value === null && pending.value.length === 0;
+    return settled && this.drawn.camera === this.cameraNumber && this.drawn.revision >= log.value.revision;
+  }
 
   // ---- what is shown -----------------------------------------------------------------------------------------------------
 
@@ -194,20 +187,12 @@ export class Viewport {
     effect(() => {
       const now = [edits.value, settings.value.exposure_stops, settings.value.background, settings.value.channel, settings.value.denoise];
       if (now.some((value, i) => value !== last[i])) {
-        if (now.slice(1).some((value, i) => value !== last[i + 1])) this.staleUpTo = this.newestFrame + 3;
+        // Settings renumber the camera; the next animation frame asks by which number.
+        if (now.slice(1).some((value, i) => value !== last[i + 1])) this.cameraNumber = -1;
         last = now;
-        this.setFresh(false);
+        // A picture may come before the news that it shows the newest edits; a slider put back where it was asks for no new one.
+        this.setFresh(this.drawnIsNewest && this.drawn.enough);
       }
-    });
-    effect(() => {
-      // A picture may come before the news that it shows the newest edits; a slider put back where it was asks for no new one.
-      const settled = draft.value === null && pending.value.length === 0;
-      const { revision } = log.value;
-      if (!settled) return;
-      const { held, drawn } = this;
-      this.held = null;
-      if (held) untracked(() => this.onFrame(held.header, held.picture, held.cameraNumber));
-      else if (drawn.revision === revision && drawn.camera === this.cameraNumber && drawn.enough && drawn.frame > this.staleUpTo) this.setFresh(true);
     });
     effect(() => {
       localPicture.value;
@@ -360,7 +345,7 @@ export class Viewport {
     if (number === null || number === this.cameraNumber) return;
     this.cameraNumber = number;
     viewNow.value = pose;
-    this.setFresh(false);
+    this.setFresh(this.drawnIsNewest && this.drawn.enough); // its picture may be here already
   }
 
   private pictureSize(): { width: number; height: number } {

@@ -1,5 +1,5 @@
 import { describe, expect, it } from 'vitest';
-import { describeEdit, factorOf, isSet, lightOf, sameEdits, withoutValue, withReplaced } from '../src/edit_log';
+import { describeEdit, difference, factorOf, isSet, lightOf, sameEdits, withoutValue, withReplaced } from '../src/edit_log';
 import type { Edit, Selection } from '../src/protocol.gen';
 
 const all: Selection = { all: true };
@@ -56,4 +56,14 @@ it('an environment edit without a file keeps the one in force', () => {
 it('history names presets and parts', () => {
   expect(describeEdit({ op: 'material', select: fromServer({ region: 2 }), set: { albedo: [1.0, 0.766, 0.336], roughness: 0.2, metallic: 1 } })).toBe('Region: gold');
   expect(describeEdit(rough(0.25))).toBe('Roughness 0.25');
+});
+
+it('finds what has to be exchanged between two lists of edits', () => {
+  const edit = (rotation: number): Edit => ({ op: 'environment', rotation });
+  const list = (...rotations: number[]) => rotations.map(edit);
+  expect(difference(list(1, 2, 3), list(1, 4, 5, 3))).toEqual({ start: 1, remove: 1, edits: list(4, 5) });
+  expect(difference(list(1, 2), list(1, 2))).toEqual({ start: 2, remove: 0, edits: [] });
+  expect(difference(list(1, 1, 1), list(1, 1))).toEqual({ start: 2, remove: 1, edits: [] });
+  expect(difference(list(), list(7))).toEqual({ start: 0, remove: 0, edits: list(7) });
+  expect(difference(list(7, 8), list())).toEqual({ start: 0, remove: 2, edits: [] });
 });

@@ -2,11 +2,11 @@
 
 import { describeEdit } from '../edit_log';
 import { goTo } from '../session';
-import { log, undone } from '../state';
+import { log } from '../state';
 import { Section } from './fields';
 
 export function History() {
-  const { edits } = log.value;
+  const { edits, undone } = log.value;
   const entry = (text: string, count: number) => (
     <li key={count}>
       <button class={count > edits.length ? 'undone' : undefined} aria-current={count === edits.length ? 'step' : undefined} title={count > edits.length ? `Redo up to here: ${text}` : text} onClick={() => goTo(count)}>
@@ -18,7 +18,7 @@ export function History() {
     <Section title="History">
       <ol class="history" aria-label="Edits in force">
         {entry('As captured', 0)}
-        {[...edits, ...undone.value].map((edit, i) => entry(describeEdit(edit), i + 1))}
+        {[...edits, ...undone].map((edit, i) => entry(describeEdit(edit), i + 1))}
       </ol>
     </Section>
   );

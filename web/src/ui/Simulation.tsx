@@ -3,7 +3,7 @@
 import { computed, effect, signal } from '@preact/signals';
 import { startJob } from '../jobs';
 import type { Edit, PoseEdit, SimulateEdit } from '../protocol.gen';
-import { editTime, replaceEdits } from '../session';
+import { editTime, replaceEdits, timeKey } from '../session';
 import { clipSeconds, draft, edits, jobs, pending, session } from '../state';
 import { Choice, Section, Slider, Switch } from './fields';
 
@@ -39,7 +39,7 @@ function sceneOf(height: number, foot: number): Record<string, unknown> {
 
 /** From the first moment on, in place of whatever moved before. */
 function start(edit: Moving): void {
-  replaceEdits([...edits.value.filter((other) => !moves(other)), edit]);
+  replaceEdits([...edits.value.filter((other) => !moves(other)), edit], timeKey(edit));
   playing.value = true;
 }
 
