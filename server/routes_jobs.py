@@ -80,6 +80,7 @@ _BODY: dict[str, Any] = {
                         "file": {"type": "string", "format": "binary", "description": "Zip of a capture."},
                         "name": {"type": "string"},
                         "preset": {"type": "string", "enum": ["draft", "fast", "full"]},
+                        "binding": {"type": "string", "enum": ["particles", "mesh"]},
                         "seed": {"type": "integer"},
                     },
                 }
@@ -165,7 +166,8 @@ def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
             raise ProblemError(409, "Only an asset that was built here can be re-decoupled, since that needs its capture and geometry.")
         row.dataset, row.preset, row.seed = built.dataset, asked.preset, built.seed
         built_preset = built.parameters.get("built_preset", built.preset)
-        row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed}
+        binding = built.parameters.get("binding", "particles")
+        row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed, "binding": binding}
     elif isinstance(asked, SimulateRequest):
         from drgs.deform.simulation_scene import parse_simulation_scene
 
@@ -192,7 +194,7 @@ def _check_render(context: ServerContext, asked: RenderRequest) -> None:
 async def _receive_capture(request: Request, context: ServerContext, job_id: str) -> tuple[BuildRequest, Path]:
     upload = await receive_upload(request, {".zip"})
     try:
-        fields = {"dataset": "upload", "name": upload.field("name") or upload.stem, **upload.given("preset", "seed")}
+        fields = {"dataset": "upload", "name": upload.field("name") or upload.stem, **upload.given("preset", "binding", "seed")}
         asked = BuildRequest.model_validate(fields)
         target = context.directory.uploads / job_id
         await run_in_threadpool(unpack_zip, upload.stream, target)

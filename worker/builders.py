@@ -1,6 +1,6 @@
 """The function that turns a capture into an asset, found by name so that jobs and tests can name another.
 
-A builder is called as `builder(request, progress, should_stop)` and gives the name of each of STAGES as it is finished, its result on
+A builder is called as `builder(request, progress, should_stop)` and gives the name of each of its STAGES as it is finished, its result on
 disk: checkpoints in `OUT.build/`, so that a second call goes on behind the last one, and in the end the asset at `request.out`
 (atomically). It raises BuildStopped soon after `should_stop()` turns true.
 """
@@ -14,8 +14,11 @@ from pathlib import Path
 DEFAULT_BUILDER = "worker.builders:build_with_drgs"
 BUILDER_VARIABLE = "DRGS_BUILDER"
 """Environment variable `module:function`."""
-STAGES = ("read", "fit", "mesh", "materials", "pack")
-"""Those of drgs.build.build_asset.STAGE_SHARES."""
+STAGES = {
+    "particles": ("read", "fit", "mesh", "materials", "pack"),
+    "mesh": ("read", "fit", "mesh", "bind", "materials", "pack"),
+}
+"""Of either binding: those of drgs.build.build_asset.STAGE_SHARES and MESH_STAGE_SHARES."""
 
 
 class BuildStopped(Exception):
@@ -34,6 +37,8 @@ class BuildRequest:
     """auto, cpu or cuda."""
     materials: str | None = None
     """Preset of the stage `materials`; None: `preset`."""
+    binding: str = "particles"
+    """particles or mesh."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +77,7 @@ def build_with_drgs(request: BuildRequest, progress: Callable[[BuildProgress], N
     """drgs.build.build_asset.build_stages, resumed from its checkpoints where there are some."""
     from drgs.build import build_asset as build
 
-    settings = build.BuildSettings(
-        preset=request.preset, seed=request.seed, device=request.device, resume=True, materials=request.materials
-    )
+    settings = build.BuildSettings(request.preset, request.binding, request.device, request.seed, resume=True, materials=request.materials)
 
     def report(made: build.Progress) -> None:
         progress(BuildProgress(**{entry.name: getattr(made, entry.name) for entry in fields(BuildProgress)}))

@@ -10,18 +10,21 @@ from worker.builders import STAGES, BuildRequest
 from worker.job_run import AbstractJobRun, JobContext
 from worker.register_asset import register_asset
 
-KEPT_CHECKPOINTS = ("stage1.safetensors", "mesh.safetensors")
-"""Of a finished build: what a re-decoupling starts from."""
+KEPT_CHECKPOINTS = {
+    "particles": ("stage1.safetensors", "mesh.safetensors"),
+    "mesh": ("stage1.safetensors", "mesh.safetensors", "mesh_surfels.safetensors"),
+}
+"""Of a finished build of either binding: what a re-decoupling starts from."""
 
 
 class BuildRun(AbstractJobRun):
     """Final. One generator runs through the stages, so that a build that nothing disturbs reads its capture once."""
 
-    steps: tuple[str, ...] = (*STAGES, "register")
-
     def __init__(self, job: JobContext) -> None:
         self._job = job
         self._stages: Iterator[str] | None = None
+        self._binding: str = job.parameters.get("binding", "particles")
+        self.steps: tuple[str, ...] = (*STAGES[self._binding], "register")
 
     def run(self, step: str) -> None:
         job = self._job
@@ -43,7 +46,8 @@ class BuildRun(AbstractJobRun):
     def _request(self) -> BuildRequest:
         job = self._job
         assert job.dataset is not None
-        return BuildRequest(job.dataset, job.folder / "asset", job.parameters["preset"], job.parameters["seed"], job.device)
+        given = job.parameters
+        return BuildRequest(job.dataset, job.folder / "asset", given["preset"], given["seed"], job.device, binding=self._binding)
 
     def _register(self) -> None:
         """Does nothing that was already done."""
@@ -54,14 +58,16 @@ class BuildRun(AbstractJobRun):
         patiently(lambda: register_asset(job.directory, job.engine, job.job_id, job.name, "build"), job.should_stop)
         work = Path(f"{built}.build")
         for path in work.iterdir() if work.is_dir() else ():
-            if path.name not in KEPT_CHECKPOINTS:
+            if path.name not in KEPT_CHECKPOINTS[self._binding]:
                 path.unlink()
 
 
 class RedecoupleRun(BuildRun):
     """Final. A build that starts from another one's geometry."""
 
-    steps = ("copy", *STAGES, "register")
+    def __init__(self, job: JobContext) -> None:
+        super().__init__(job)
+        self.steps = ("copy", *self.steps)
 
     def run(self, step: str) -> None:
         if step == "copy":
@@ -74,7 +80,7 @@ class RedecoupleRun(BuildRun):
         patiently(lambda: refresh_job(job.directory, job.parameters["asset"]), job.should_stop)
         source, work = job.directory.job(job.parameters["asset"]) / "asset.build", job.folder / "asset.build"
         work.mkdir(exist_ok=True)
-        for name in KEPT_CHECKPOINTS:
+        for name in KEPT_CHECKPOINTS[self._binding]:
             if not (source / name).is_file():
                 raise ValueError("This asset's geometry was not kept by a build on this service; build it here first.")
             draft = work / f"{name}.part"
@@ -84,4 +90,5 @@ class RedecoupleRun(BuildRun):
     def _request(self) -> BuildRequest:
         job, given = self._job, self._job.parameters
         assert job.dataset is not None
-        return BuildRequest(job.dataset, job.folder / "asset", given["built_preset"], given["built_seed"], job.device, given["preset"])
+        out = job.folder / "asset"
+        return BuildRequest(job.dataset, out, given["built_preset"], given["built_seed"], job.device, given["preset"], self._binding)

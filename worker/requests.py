@@ -11,6 +11,7 @@ from drgs.scene.edits import Edit
 
 JobKind = Literal["build", "redecouple", "simulate", "render", "export"]
 PresetName = Literal["draft", "fast", "full"]
+BindingName = Literal["particles", "mesh"]
 FileFormat = Literal["ply", "ply3", "glb", "usd", "env", "zip"]
 FILE_SUFFIXES: dict[FileFormat, str] = {"ply": ".ply", "ply3": ".ply", "glb": ".glb", "usd": ".usda", "env": ".exr", "zip": ".zip"}
 
@@ -56,6 +57,8 @@ class BuildRequest(_Job):
     dataset: Annotated[str, Field(max_length=1000)]
     """`sample` for the bundled capture, or a folder below a root that was allowed when the server started."""
     preset: PresetName = "fast"
+    binding: BindingName = "particles"
+    """particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
 
 

@@ -37,6 +37,11 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     assert steps["redecouple"] == ("copy", *steps["build"])
     assert (steps["simulate"], steps["export"]) == (("simulate",), ("export glb", "export ply"))
     assert steps["render"] == ("render asset ",)
+    meshed = service.client.post("/api/jobs", json={"dataset": "sample", "binding": "mesh"}).json()
+    service.add_asset(meshed["id"], "meshed")
+    again = service.client.post("/api/jobs", json={"kind": "redecouple", "asset": meshed["id"]}).json()
+    found = [jobs._RUNS[info["kind"]](jobs._job_context(info["id"])).steps for info in (meshed, again)]
+    assert found[0] == ("read", "fit", "mesh", "bind", "materials", "pack", "register") and found[1] == ("copy", *found[0])
     redecoupled = jobs._job_context(infos[1]["id"])
     assert redecoupled.parameters["built_preset"] == "draft" and redecoupled.dataset == service.settings.sample_capture.resolve()
 
@@ -51,6 +56,7 @@ CAMERA = {"name": "a", "world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 
         ({"kind": ["build"]}, 422, "expected one of build"),
         (RENDER | {"asset": "b" * 32}, 404, "No asset"),
         ({"kind": "redecouple", "asset": ASSET}, 409, "built here"),
+        ({"dataset": "sample", "binding": "glue"}, 422, "binding"),
         ({"kind": "simulate", "asset": ASSET, "scene": {"gravity": "much"}}, 422, "gravity"),
         ({"kind": "export", "asset": ASSET, "formats": ["glb", "glb"]}, 422, "once"),
         (RENDER | {"environments": ["none.exr"]}, 422, "No environment"),

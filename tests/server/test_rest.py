@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from server.routes_assets import remove_deleted_assets
 from worker.asset_folder import count_asset_folder
-from worker.database import AssetRow, now
+from worker.database import AssetRow, JobRow, now
 
 
 def zipped(entries: dict[str, bytes]) -> bytes:
@@ -42,11 +42,13 @@ def left_on_disk(service: Service) -> list[Path]:
 
 
 def test_an_uploaded_capture_becomes_a_queued_job(service: Service) -> None:
-    response = submit(service, zipped({"teapot/transforms.json": b"{}"}), preset="draft", seed="7")
+    response = submit(service, zipped({"teapot/transforms.json": b"{}"}), preset="draft", seed="7", binding="mesh")
     assert response.status_code == 202
     job = response.json()
     assert (job["state"], job["name"], job["preset"], job["attempts"], job["asset_id"]) == ("queued", "teapot", "draft", 0, None)
     assert (service.context.directory.uploads / job["id"] / "teapot" / "transforms.json").is_file()
+    with Session(service.context.engine) as session:
+        assert session.get_one(JobRow, job["id"]).parameters["binding"] == "mesh"
     listed = service.client.get("/api/jobs").json()
     assert listed["total"] == 1 and listed["jobs"] == [job] and listed["workers_alive"] == 0
     assert service.client.get(f"/api/jobs/{job['id']}").json() == job

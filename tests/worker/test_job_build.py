@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,11 @@ from drgs.build.densify import DensifySettings
 from drgs.build.extract_mesh import MeshSettings
 from drgs.build.fit_gaussians import FitSettings
 from drgs.build.fit_materials import MaterialSettings
+from drgs.build.fit_mesh_surfels import MeshFitSettings
 from drgs.render.sample_rays import SampleCounts
 from drgs.scene.asset import load_asset
 from tests.build.tiny_capture import write_nerf_synthetic
-from worker.builders import build_with_drgs
+from worker.builders import STAGES, build_with_drgs
 from worker.data_directory import DataDirectory, open_data_directory
 from worker.database import AssetRow, open_database
 from worker.job_build import BuildRun, RedecoupleRun
@@ -26,10 +28,9 @@ TINY = Preset(
     fit=FitSettings(iterations=12, densify=DensifySettings(every=5, budget=700)),
     mesh=MeshSettings(resolution=48, face_limit=2000),
     materials=MaterialSettings(iterations=4, points_a_step=64, samples=SampleCounts(4, 2, 2)),
+    mesh_surfels=MeshFitSettings(iterations=3),
 )
-MORE = Preset(
-    TINY.points, TINY.image_side, TINY.fit, TINY.mesh, MaterialSettings(iterations=8, points_a_step=64, samples=SampleCounts(4, 2, 2))
-)
+MORE = replace(TINY, materials=MaterialSettings(iterations=8, points_a_step=64, samples=SampleCounts(4, 2, 2)))
 
 
 @pytest.fixture
@@ -58,28 +59,33 @@ def contents(folder: Path) -> dict[str, bytes]:
     return files | {"asset.json": json.dumps(manifest).encode()}
 
 
-def test_a_build_that_begins_anew_after_every_stage_makes_the_same_asset_and_can_be_re_decoupled(directory: DataDirectory) -> None:
+@pytest.mark.parametrize("binding", ["particles", "mesh"])
+def test_a_build_that_begins_anew_after_every_stage_makes_the_same_asset_and_can_be_re_decoupled(
+    directory: DataDirectory, binding: str
+) -> None:
     whole: list[str] = []
-    run = BuildRun(context(directory, "a" * 32, whole))
+    run = BuildRun(context(directory, "a" * 32, whole, binding=binding))
     for step in run.steps:
         run.run(step)
     parts: list[str] = []
-    for step in BuildRun.steps:
+    for step in run.steps:
         before = len(parts)
-        BuildRun(context(directory, "b" * 32, parts)).run(step)
+        BuildRun(context(directory, "b" * 32, parts, binding=binding)).run(step)
         if step == "materials":
             assert "fit" not in parts[before:]  # nothing but the capture is worked on again
     assert contents(directory.asset("a" * 32)) == contents(directory.asset("b" * 32))
-    assert list(dict.fromkeys(whole)) == ["read", "fit", "mesh", "materials", "pack"]
+    assert list(dict.fromkeys(whole)) == list(STAGES[binding])
 
     said: list[str] = []
-    again = RedecoupleRun(context(directory, "c" * 32, said, asset="a" * 32, preset="more", built_preset="tiny", built_seed=0))
+    asked = {"asset": "a" * 32, "preset": "more", "built_preset": "tiny", "built_seed": 0, "binding": binding}
+    again = RedecoupleRun(context(directory, "c" * 32, said, **asked))
     for step in again.steps:
         again.run(step)
-    assert "fit" not in said and "materials" in said
+    assert "fit" not in said and "bind" not in said and "materials" in said
     first, second = (load_asset(directory.asset(letter * 32)) for letter in "ac")
     assert first.mesh.vertices.equal(second.mesh.vertices) and not first.mesh.albedo.equal(second.mesh.albedo)
     assert (first.provenance["materials"], second.provenance["materials"]) == ("tiny", "more")
+    assert first.provenance["binding"] == second.provenance["binding"] == binding
     from sqlalchemy.orm import Session
 
     with Session(open_database(directory)) as session:

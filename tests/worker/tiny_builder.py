@@ -18,7 +18,7 @@ def build(request: BuildRequest, progress: Callable[[BuildProgress], None], shou
     plan = json.loads((request.dataset / "plan.json").read_text())
     work = request.out.with_name(request.out.name + ".build")
     work.mkdir(exist_ok=True)
-    for stage in STAGES:
+    for stage in STAGES[request.binding]:
         if stage == "fit":
             fit(request, plan, work, progress, should_stop)
         elif stage == "pack":

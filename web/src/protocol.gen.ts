@@ -108,6 +108,8 @@ export interface BuildRequest {
   /** `sample` for the bundled capture, or a folder below a root that was allowed when the server started. */
   dataset: string;
   preset?: "draft" | "fast" | "full";
+  /** particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face. */
+  binding?: "particles" | "mesh";
   seed?: number;
 }
 
