@@ -184,7 +184,7 @@ def start_frame(
         factor = scene.environment_intensity / previous.scene.environment_intensity if "scale" in make else 1.0
         parts = {"tracer": tracer, "table": table, "light": light, "plan": plan, "made": made, "seconds": seconds}
         return _continued(replace(previous, scene=scene, settings=settings, **parts), factor)
-    memory = RayMemory() if previous is None or "first_rays" in make else RayMemory(previous.memory.rays)
+    memory = RayMemory(writes=changed != {"camera"}) if previous is None or "first_rays" in make else RayMemory(previous.memory.rays)
     pixels, device = camera.width * camera.height, seen.device
     numbers = [torch.zeros(pixels, *tail, device=device) for tail in ((3,), (3,), (), (), (), (3,), ())]
     surface = torch.zeros(pixels if mesh_seen else 1, 15, device=device).expand(pixels, 15)
@@ -229,7 +229,7 @@ def refine_frame(state: FrameState, passes: int = 1) -> FrameState:
     """The frame after `passes` more passes over the tiles that still need them; the given state stays as it is."""
     sums = {name: getattr(state, name).clone() for name in SUMS}
     surface = state.surface if state.fixed is not None else state.surface.clone()
-    state = replace(state, **sums, surface=surface, tile_passes=state.tile_passes.clone(), memory=RayMemory(state.memory.rays))
+    state = replace(state, **sums, surface=surface, tile_passes=state.tile_passes.clone(), memory=replace(state.memory))
     while passes > 0 and bool(state.active.any()):
         # Tiles that rested while others went on catch up first, so that passes of one tile follow each other.
         index = int(state.tile_passes[state.active].min())

@@ -10,40 +10,87 @@ meet the surface it starts on.
 """
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from drgs.render.records import ShadingPoints
 from drgs.render.shade import RayStarts
-from drgs.render.trace_rays import over_slices, trace_rays
+from drgs.render.trace_rays import trace_rays
 from drgs.render.tracer import AbstractTracer
+from drgs.render.tracer_embree import EmbreeTracer, embree_closest
+from drgs.warp_torch import launch, warp_array
 
-NEAR = 0.01
+wp.set_module_options({"enable_backward": False})
+
+NEAR = wp.constant(0.01)
 """How far splats may be from the mesh that they show [share of the mesh's diagonal]."""
-FAR = 0.25
-FACING = 0.2
+FAR = wp.constant(0.25)
+FACING = wp.constant(0.2)
 """Smallest cosine between a point's normal and that of the triangle it is carried to."""
 
 
-SLICE = 8192
-"""Points that a thread carries together."""
+@wp.kernel
+def carry_to_mesh(
+    first: int,
+    question: wp.uint64,
+    tree: wp.uint64,
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    face_normals: wp.array[wp.vec3],
+    extent: float,
+    lift: float,
+    # outputs; the last two are what each ray met
+    start: wp.array[wp.vec3],
+    surface_normal: wp.array[wp.vec3],
+    face: wp.array[int],
+    met: wp.array[int],
+    distance: wp.array[float],
+    barycentric: wp.array[wp.vec2],
+):
+    i = first + wp.tid()
+    here = position[i]
+    n = normal[i]
+    start[i] = here + lift * n
+    surface_normal[i] = n
+    face[i] = -1
+    for attempt in range(3):
+        axis = wo[i]
+        reach = NEAR * extent
+        facing = FACING
+        if attempt == 1:
+            axis = n
+        if attempt == 2:
+            reach = FAR * extent
+            facing = -1.0
+        embree_closest(question, tree, here + reach * axis, -axis, i, distance, met, barycentric)
+        if met[i] >= 0:
+            outward = face_normals[met[i]]
+            near = distance[i] < 2.0 * reach
+            if near and wp.dot(outward, n) > facing and wp.dot(outward, axis) > 0.0:  # the outside of the surface
+                start[i] = here + (reach - distance[i]) * axis + lift * outward
+                surface_normal[i] = outward
+                face[i] = met[i]
+                return
 
 
 def lift_points(points: ShadingPoints, tracer: AbstractTracer) -> RayStarts:
     """Ray starts of shading points; carries no gradient."""
-    places = [values.detach() for values in (points.position_world, points.normal_world, points.wo_world)]
-    tracer.face_normals  # found once, before threads ask for them  # noqa: B018
-    device = places[0].device
-    parts = over_slices(
-        len(places[0]), device, lambda a, b: _lift(*(values[a:b] for values in places), tracer), SLICE if device.type == "cpu" else None
-    )
-    if len(parts) < 2:
-        return parts[0] if parts else _lift(*places, tracer)
-    faces = torch.cat([part.face for part in parts])
-    return RayStarts(*(torch.cat([getattr(part, name) for part in parts]) for name in ("origin_world", "surface_normal_world")), faces)
+    places = [values.detach().float() for values in (points.position_world, points.normal_world, points.wo_world)]
+    if not isinstance(tracer, EmbreeTracer):
+        return lift_points_by_batches(*places, tracer)
+    count = len(places[0])
+    start, surface_normal = torch.empty(count, 3), torch.empty(count, 3)
+    face, met = torch.empty(count, dtype=torch.int32), torch.empty(count, dtype=torch.int32)
+    inputs = [*tracer.first_hit, *(warp_array(values, wp.vec3) for values in (*places, tracer.face_normals)), tracer.extent, tracer.lift]
+    outputs = [warp_array(start, wp.vec3), warp_array(surface_normal, wp.vec3), warp_array(face), warp_array(met)]
+    scratch = [warp_array(torch.empty(count)), warp_array(torch.empty(count, 2), wp.vec2)]
+    launch(carry_to_mesh, count, inputs, [*outputs, *scratch], "cpu")
+    return RayStarts(start, surface_normal, face)
 
 
-def _lift(position: Tensor, normal: Tensor, wo: Tensor, tracer: AbstractTracer) -> RayStarts:
-    """lift_points for some of the points, on the calling thread."""
+def lift_points_by_batches(position: Tensor, normal: Tensor, wo: Tensor, tracer: AbstractTracer) -> RayStarts:
+    """carry_to_mesh for any tracer: all rays of one axis together."""
     face_normals = tracer.face_normals
     start, surface_normal = position + tracer.lift * normal, normal.clone()
     face = torch.full((len(position),), -1, dtype=torch.int32, device=position.device)

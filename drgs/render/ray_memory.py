@@ -2,7 +2,8 @@
 
 Between two frames of an unmoved camera and shape most first rays stay as they are: a new environment changes only those sampled from it, a
 new albedo hardly any. The comparison is exact, so nothing need be known about what an edit did to the samples.
-Only a frame's first pass is remembered: it is the one that somebody waits for.
+Only a frame's first pass is remembered: it is the one that somebody waits for. While the camera moves nothing is, for the next frame's rays
+start elsewhere: the first edit after a move traces all its rays.
 """
 
 from dataclasses import dataclass
@@ -43,6 +44,8 @@ class RayMemory:
     """Holds the rays of the last estimate that was made with it."""
 
     rays: TracedRays | None = None
+    writes: bool = True
+    """Whether an estimate's rays are kept at all."""
 
 
 @wp.kernel
@@ -73,9 +76,9 @@ def note_directions(
         noted[i] = wp.vec3(wp.nan, wp.nan, wp.nan)
 
 
-def room_for_rays(count: int, surfaces: bool, device: torch.device) -> TracedRays | None:
-    """Unwritten rays; None for more than are remembered."""
-    if count > MAX_RAYS:
+def room_for_rays(memory: RayMemory | None, count: int, surfaces: bool, device: torch.device) -> TracedRays | None:
+    """Unwritten rays; None where they are not remembered, or too many."""
+    if memory is None or not memory.writes or count > MAX_RAYS:
         return None
     hit, direction = torch.empty(count, dtype=torch.bool, device=device), torch.empty(count, 3, device=device)
     if not surfaces:

@@ -3,7 +3,8 @@
 //
 // in   base (first path of the group), path_count, path_ray, face, barycentric, ray_direction, throughput, first_point, depth,
 //      points, light, mesh, samples
-// out  origin, direction, contribution of light rays (paths base .. base + 15) and of BRDF rays (path_count further), next_throughput
+// out  either origin, direction, contribution of light rays (paths base .. base + 15) and of BRDF rays (path_count further), next_throughput,
+//      or, where paths end here, their light added to `indirect`
 
 // 1. The surfaces that the group's paths met.
 const int count = samples.cosine + samples.ggx + samples.environment;
@@ -77,6 +78,7 @@ const auto reflect = [&](V3 d, v16 n_dot_l, v16* reflected) -> v16 {
     }
     return share * pdf + (1.0f - share) * n_dot_l * (1.0f / PI);
 };
+// ----
 const auto put = [&](long at, i16 live, V3 d, const v16* light_there, const v16* carried_on) {
     alignas(64) float out[12][16];
     alignas(64) int live_lane[16], traced_lane[16];
@@ -101,7 +103,31 @@ const auto put = [&](long at, i16 live, V3 d, const v16* light_there, const v16*
         }
     }
 };
-
+// ----
+float total[16][3] = {};
+const auto put = [&](long, i16 live, V3 d, const v16* light_there, const v16* carried_on) {
+    alignas(64) float out[9][16];
+    alignas(64) int live_lane[16], traced_lane[16];
+    *(i16*)live_lane = live;
+    *(i16*)traced_lane = dot3(outward, d) <= horizon;
+    const V3 start = {position.x + mesh.lift * outward.x, position.y + mesh.lift * outward.y, position.z + mesh.lift * outward.z};
+    store16(out[0], start.x); store16(out[1], start.y); store16(out[2], start.z);
+    store16(out[3], d.x); store16(out[4], d.y); store16(out[5], d.z);
+    for (int k = 0; k < 3; ++k) store16(out[6 + k], light_there[k]);
+    for (int lane = 0; lane < lanes; ++lane) {
+        if (live_lane[lane] != 0) {
+            const float from[3] = {out[0][lane], out[1][lane], out[2][lane]}, along[3] = {out[3][lane], out[4][lane], out[5][lane]};
+            if (traced_lane[lane] == 0 || !is_blocked(from, along)) {
+                for (int k = 0; k < 3; ++k) total[lane][k] += out[6 + k][lane];
+            }
+        }
+        if (carried_on != nullptr) {  // the last of both
+            float* const sum = (float*)indirect.data + 3 * path_ray.data[base + lane];
+            for (int k = 0; k < 3; ++k) sum[k] += total[lane][k];
+        }
+    }
+};
+// ----
 // 4. Towards the environment.
 v16 u0, u1, reflected[3], incoming[3];
 numbers(16u, u0, u1);

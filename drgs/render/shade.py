@@ -32,9 +32,19 @@ from drgs.render.sample_rays import (
     sampled_direction,
     split_at,
 )
-from drgs.render.trace_indirect import far_along, mesh_arrays, ray_source, scatter_kernel, trace_indirect
+from drgs.render.trace_indirect import (
+    Paths,
+    far_along,
+    light_hits_simd,
+    mesh_arrays,
+    paths_of_hits,
+    ray_source,
+    scatter_kernel,
+    trace_indirect,
+)
 from drgs.render.trace_rays import over_slices
 from drgs.render.tracer import AbstractTracer
+from drgs.render.tracer_embree import EMBREE_RAY, EmbreeTracer
 from drgs.render.tracer_warp import query_any
 from drgs.warp_torch import in_thread_pool, load_kernel, thread_count, warp_array, warp_device
 
@@ -123,7 +133,7 @@ def start_rays(
     radiance[i] = seen
 
 
-@wp.func_native(ray_source("start_rays.h"))
+@wp.func_native(ray_source("start_rays.h", 0, 1))
 def start_sixteen_rays(
     base: int, ray_count: int, first: int,
     points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3), horizon: wp.array(dtype=float),
@@ -155,6 +165,48 @@ def start_rays_simd(
     start_sixteen_rays(
         16 * wp.tid(), ray_count, first, points, starts, surface_normals, horizon, light, samples, keep_dark,
         origin, direction, cosine_weight, specular, radiance,
+    )  # fmt: skip
+
+
+@wp.func_native(EMBREE_RAY + ray_source("start_rays.h", 0, 2))
+def ask_sixteen_rays(
+    question: wp.uint64, tree: wp.uint64, base: int, ray_count: int, first: int,
+    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3), horizon: wp.array(dtype=float),
+    light: EnvironmentLight, samples: SampleSet, keep_dark: int,
+    cosine_weight: wp.array(dtype=float), specular: wp.array(dtype=wp.vec3), radiance: wp.array(dtype=wp.vec3), blocked: wp.array(dtype=wp.bool),
+    path_count: wp.array(dtype=int), path_ray: wp.array(dtype=wp.int64), face: wp.array(dtype=int), barycentric: wp.array(dtype=wp.vec2),
+    arriving: wp.array(dtype=wp.vec3),
+): ...  # fmt: skip
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def ask_rays_simd(
+    question: wp.uint64,
+    tree: wp.uint64,
+    ray_count: int,
+    first: int,
+    points: PointArrays,
+    starts: wp.array[wp.vec3],
+    surface_normals: wp.array[wp.vec3],
+    horizon: wp.array[float],
+    light: EnvironmentLight,
+    samples: SampleSet,
+    keep_dark: int,
+    # outputs
+    cosine_weight: wp.array[float],
+    specular: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+    blocked: wp.array[wp.bool],
+    path_count: wp.array[int],
+    path_ray: wp.array[wp.int64],
+    face: wp.array[int],
+    barycentric: wp.array[wp.vec2],
+    arriving: wp.array[wp.vec3],
+):
+    """start_rays_simd and Embree's answers in one go: no ray is written down but those that met a surface."""
+    ask_sixteen_rays(
+        question, tree, 16 * wp.tid(), ray_count, first, points, starts, surface_normals, horizon, light, samples, keep_dark,
+        cosine_weight, specular, radiance, blocked, path_count, path_ray, face, barycentric, arriving,
     )  # fmt: skip
 
 
@@ -260,7 +312,7 @@ def shade(
     if ray_count == 0:
         return result
     known = usable_rays(memory, ray_count, bounces > 0)
-    kept = None if memory is None else room_for_rays(ray_count, bounces > 0, device)
+    kept = room_for_rays(memory, ray_count, bounces > 0, device)
     warp_dev = warp_device(result.diffuse)
     rounds, samples_round = (samples_round, 0) if isinstance(samples_round, Tensor) else (None, samples_round)
     arrays, samples = point_arrays(points, rounds), sample_set(counts, seed, samples_round, by_material)
@@ -282,24 +334,31 @@ def shade(
         sum_samples,
         scatter_kernel(device),
         query_any,
+        *((ask_rays_simd, light_hits_simd) if device.type == "cpu" else ()),
     ):
         load_kernel(kernel, warp_dev)
 
     def batch(first: int, last: int) -> None:
         rays = (last - first) * counts.total
-        origin, direction, specular, radiance = (torch.empty(rays, 3, device=device) for _ in range(4))
+        specular, radiance = (torch.empty(rays, 3, device=device) for _ in range(2))
         cosine_weight = torch.empty(rays, device=device)
         vectors = [warp_array(t, wp.vec3) for t in (specular, radiance)]
         inputs = [first * counts.total, arrays, *start_arrays, light, samples, int(bounces > 0)]
-        outputs = [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), warp_array(cosine_weight), *vectors]
-        if device.type == "cpu":
-            wp.launch(start_rays_simd, dim=-(-rays // 16), inputs=[rays, *inputs], outputs=outputs, device=warp_dev)
+        if isinstance(tracer, EmbreeTracer) and known is None and kept is None:
+            blocked, paths = _ask_at_once(tracer, bounces > 0, rays, inputs, [warp_array(cosine_weight), *vectors])
         else:
-            wp.launch(start_rays, dim=rays, inputs=inputs, outputs=outputs, device=warp_dev)
-        hits = trace_batch(origin, direction, first * counts.total, tracer, bounces > 0, known, kept)
+            origin, direction = (torch.empty(rays, 3, device=device) for _ in range(2))
+            outputs = [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), warp_array(cosine_weight), *vectors]
+            if device.type == "cpu":
+                wp.launch(start_rays_simd, dim=-(-rays // 16), inputs=[rays, *inputs], outputs=outputs, device=warp_dev)
+            else:
+                wp.launch(start_rays, dim=rays, inputs=inputs, outputs=outputs, device=warp_dev)
+            hits = trace_batch(origin, direction, first * counts.total, tracer, bounces > 0, known, kept)
+            blocked = hits.hit
+            paths = paths_of_hits(hits, direction) if bounces > 0 else None
         indirect = radiance
-        if bounces > 0:
-            indirect = trace_indirect(hits, direction, first, arrays, light, mesh, samples, tracer, bounces)
+        if paths is not None:
+            indirect = trace_indirect(paths, rays, first, arrays, light, mesh, samples, tracer, bounces)
         wp.launch(
             sum_samples,
             dim=last - first,
@@ -309,7 +368,7 @@ def shade(
                 samples,
                 warp_array(cosine_weight),
                 *vectors,
-                warp_array(hits.hit),
+                warp_array(blocked),
                 warp_array(indirect, wp.vec3),
                 bounces,
             ],
@@ -328,6 +387,34 @@ def shade(
     if memory is not None:
         memory.rays = kept
     return result
+
+
+def _ask_at_once(tracer: EmbreeTracer, surfaces: bool, rays: int, inputs: list, outputs: list) -> tuple[Tensor, Paths | None]:
+    """A batch's rays, started and asked about: which of them are blocked, and where they met surfaces if that is wanted.
+
+    Args:
+        inputs, outputs: of ask_rays_simd; without question, tree and number of rays, and without what is met.
+    """
+    room = rays if surfaces else 0
+    blocked, path_count = torch.empty(rays, dtype=torch.bool), torch.zeros(1, dtype=torch.int32)
+    path_ray, face = torch.empty(room, dtype=torch.int64), torch.empty(room, dtype=torch.int32)
+    barycentric, arriving = torch.empty(room, 2), torch.empty(room, 3)
+    packed = [
+        warp_array(path_count),
+        warp_array(path_ray),
+        warp_array(face),
+        warp_array(barycentric, wp.vec2),
+        warp_array(arriving, wp.vec3),
+    ]
+    wp.launch(
+        ask_rays_simd,
+        dim=-(-rays // 16),
+        inputs=[*(tracer.first_hit if surfaces else tracer.any_hit), rays, *inputs],
+        outputs=[*outputs, warp_array(blocked), *packed],
+        device="cpu",
+    )
+    count = int(path_count)
+    return blocked, Paths(path_ray[:count], face[:count], barycentric[:count], arriving[:count]) if surfaces else None
 
 
 def _point_horizons(starts: RayStarts, of_faces: Tensor | None) -> Tensor:

@@ -4,7 +4,8 @@
 //
 // in   base (first ray of the group in the batch), ray_count (of the batch), first (the batch's first ray among all),
 //      points, starts, surface_normals, horizon (of each point), light, samples, keep_dark
-// out  origin, direction, cosine_weight, specular, radiance of rays base .. base + 15
+// out  cosine_weight, specular, radiance of rays base .. base + 15, and either their origin and direction,
+//      or what they met: `blocked`, and for surfaces the rays that met one, packed, with face, barycentric and direction there
 
 // 1. Gather the points of the group's rays.
 const int count = samples.cosine + samples.ggx + samples.environment;
@@ -79,8 +80,6 @@ for (int k = 0; k < 3; ++k) store16(result[6 + k], select(live, seen[k], v16(0.0
 alignas(64) int traced_lane[16];
 *(i16*)traced_lane = above <= load16(gathered[14]);
 const float* const from = (const float*)starts.data;
-float* const origin_out = (float*)origin.data;
-float* const direction_out = (float*)direction.data;
 float* const specular_out = (float*)specular.data;
 float* const radiance_out = (float*)radiance.data;
 for (int lane = 0; lane < lanes; ++lane) {
@@ -88,12 +87,46 @@ for (int lane = 0; lane < lanes; ++lane) {
     const float metal = gathered[10][lane];
     cosine_weight.data[ray] = result[3][lane];
     for (int k = 0; k < 3; ++k) {
-        // Rays that are void or meet nothing for certain leave from far outside, away from the mesh.
-        const float outside = result[k][lane] < 0.0f ? -1.0e15f : 1.0e15f;
-        origin_out[3 * ray + k] = live_lane[lane] != 0 && traced_lane[lane] != 0 ? from[3 * point + k] : outside;
-        direction_out[3 * ray + k] = result[k][lane];
         const float f0 = 0.04f * (1.0f - metal) + albedos[3 * point + k] * metal;
         specular_out[3 * ray + k] = result[4][lane] * f0 + result[5][lane];
         radiance_out[3 * ray + k] = result[6 + k][lane];
     }
+}
+// ----
+// 6. The rays, for a tracer.
+float* const origin_out = (float*)origin.data;
+float* const direction_out = (float*)direction.data;
+for (int lane = 0; lane < lanes; ++lane) {
+    const int ray = base + lane, point = point_lane[lane];
+    for (int k = 0; k < 3; ++k) {
+        // Rays that are void or meet nothing for certain leave from far outside, away from the mesh.
+        const float outside = result[k][lane] < 0.0f ? -1.0e15f : 1.0e15f;
+        origin_out[3 * ray + k] = live_lane[lane] != 0 && traced_lane[lane] != 0 ? from[3 * point + k] : outside;
+        direction_out[3 * ray + k] = result[k][lane];
+    }
+}
+// ----
+// 6. What they meet. A launch runs on one thread from its first index to its last, so rays that met something pack themselves in order.
+for (int lane = 0; lane < lanes; ++lane) {
+    const int ray = base + lane;
+    bool met = false;
+    if (live_lane[lane] != 0 && traced_lane[lane] != 0) {
+        const float along[3] = {result[0][lane], result[1][lane], result[2][lane]};
+        const float* const start = from + 3 * (long)point_lane[lane];
+        if (keep_dark == 0) {
+            met = is_blocked(start, along);
+        } else {
+            RayHit found;
+            met = first_hit(found, start, along);
+            if (met) {
+                const int path = path_count.data[0]++;
+                path_ray.data[path] = ray;
+                face.data[path] = (int)found.triangle;
+                ((float*)barycentric.data)[2 * path] = found.u;
+                ((float*)barycentric.data)[2 * path + 1] = found.v;
+                for (int k = 0; k < 3; ++k) ((float*)arriving.data)[3 * path + k] = along[k];
+            }
+        }
+    }
+    blocked.data[ray] = met;
 }

@@ -7,11 +7,13 @@ bounces are left, ended by Russian roulette from the second hit onwards. Nothing
 The back of a triangle sends nothing.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.maths.brdf import MIN_ROUGHNESS
@@ -21,6 +23,7 @@ from drgs.render.random_warp import hash_combine, shuffle_index, sobol_2d
 from drgs.render.records import Hits
 from drgs.render.sample_rays import PointArrays, SampleSet, round_at, split_at, strategy_of, strategy_seed
 from drgs.render.tracer import AbstractTracer
+from drgs.render.tracer_embree import EMBREE_RAY, EmbreeTracer
 from drgs.scene.mesh import TriangleMesh
 from drgs.warp_torch import warp_array, warp_device
 
@@ -208,14 +211,17 @@ def scatter_hits(
                 next_throughput[i] = reflected / (own * survival)
 
 
-def ray_source(name: str) -> str:
-    """The native function body in one of this folder's files, with what it needs before it."""
+def ray_source(name: str, *parts: int) -> str:
+    """Chosen parts of the native function body in one of this folder's files, with what it needs before it."""
     folder = Path(__file__).parent
-    parts = [folder / "rasterize_gbuffer" / "tile_vector.h", folder / "ray_vector.h", folder / name]
-    return f"constexpr float MIN_ROUGHNESS = {MIN_ROUGHNESS}f;\n" + "".join(part.read_text() for part in parts)
+    shared = [folder / "rasterize_gbuffer" / "tile_vector.h", folder / "ray_vector.h"]
+    body = (folder / name).read_text().split("// ----\n")
+    return f"constexpr float MIN_ROUGHNESS = {MIN_ROUGHNESS}f;\n" + "".join(
+        [path.read_text() for path in shared] + [body[part] for part in parts]
+    )
 
 
-@wp.func_native(ray_source("scatter_hits.h"))
+@wp.func_native(ray_source("scatter_hits.h", 0, 1, 3))
 def scatter_sixteen_hits(
     base: int, path_count: int,
     path_ray: wp.array(dtype=wp.int64), face: wp.array(dtype=int), barycentric: wp.array(dtype=wp.vec2), ray_direction: wp.array(dtype=wp.vec3),
@@ -253,6 +259,42 @@ def scatter_hits_simd(
     )  # fmt: skip
 
 
+@wp.func_native(EMBREE_RAY + ray_source("scatter_hits.h", 0, 2, 3))
+def light_sixteen_hits(
+    question: wp.uint64, tree: wp.uint64, base: int, path_count: int,
+    path_ray: wp.array(dtype=wp.int64), face: wp.array(dtype=int), barycentric: wp.array(dtype=wp.vec2), ray_direction: wp.array(dtype=wp.vec3),
+    throughput: wp.array(dtype=wp.vec3), first_point: int, depth: int,
+    points: PointArrays, light: EnvironmentLight, mesh: MeshArrays, samples: SampleSet,
+    indirect: wp.array(dtype=wp.vec3),
+): ...  # fmt: skip
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def light_hits_simd(
+    question: wp.uint64,
+    tree: wp.uint64,
+    path_ray: wp.array[wp.int64],
+    face: wp.array[int],
+    barycentric: wp.array[wp.vec2],
+    ray_direction: wp.array[wp.vec3],
+    throughput: wp.array[wp.vec3],
+    first_point: int,
+    depth: int,
+    path_count: int,
+    points: PointArrays,
+    light: EnvironmentLight,
+    mesh: MeshArrays,
+    samples: SampleSet,
+    # outputs
+    indirect: wp.array[wp.vec3],
+):
+    """scatter_hits_simd, its two shadow rays asked by Embree, and add_contributions, for paths that end there."""
+    light_sixteen_hits(
+        question, tree, 16 * wp.tid(), path_count, path_ray, face, barycentric, ray_direction, throughput, first_point, depth,
+        points, light, mesh, samples, indirect,
+    )  # fmt: skip
+
+
 def scatter_kernel(device: torch.device) -> Any:
     """The one that trace_indirect launches there."""
     return scatter_hits_simd if device.type == "cpu" else scatter_hits
@@ -278,9 +320,27 @@ def add_contributions(
     indirect[ray] = indirect[ray] + total
 
 
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """The rays of a batch that met a surface, packed in their order."""
+
+    ray: Int[Tensor, "path"]
+    """int64; number in the batch."""
+    face: Int[Tensor, "path"]
+    barycentric: Float[Tensor, "path 2"]
+    arriving: Float[Tensor, "path 3"]
+    """Unit direction of the ray."""
+
+
+def paths_of_hits(hits: Hits, direction: Tensor) -> Paths:
+    """The rays (ray, 3) that met something."""
+    ray = torch.nonzero(hits.hit).squeeze(-1)
+    return Paths(ray, hits.face[ray], hits.barycentric[ray], direction[ray])
+
+
 def trace_indirect(
-    hits: Hits,
-    ray_direction: Tensor,
+    met: Paths,
+    ray_count: int,
     first_point: int,
     points: Any,
     light: Any,
@@ -292,32 +352,36 @@ def trace_indirect(
     """(ray, 3) radiance that the first hits of a batch send back along its rays. Runs on the calling thread.
 
     Args:
-        ray_direction: (ray, 3) unit; rays are grouped by point, `samples` a point, from `first_point` on.
+        ray_count: of the batch; rays are grouped by point, `samples` a point, from `first_point` on.
         points, light, mesh, samples: PointArrays, EnvironmentLight, MeshArrays and SampleSet structs.
         bounces: at least 1; hits that a path may go through.
     """
-    device = ray_direction.device
-    warp_dev = warp_device(ray_direction)
-    indirect = torch.zeros_like(ray_direction)
-    path_ray = torch.nonzero(hits.hit).squeeze(-1)
-    face, barycentric, arriving = hits.face[path_ray], hits.barycentric[path_ray], ray_direction[path_ray]
+    device = met.arriving.device
+    warp_dev = warp_device(met.arriving)
+    indirect = torch.zeros(ray_count, 3, device=device)
+    path_ray, face, barycentric, arriving = met.ray, met.face, met.barycentric, met.arriving
     throughput = torch.ones(len(path_ray), 3, device=device)
     for depth in range(bounces):
         paths = len(path_ray)
         if paths == 0:
+            break
+        inputs = [
+            warp_array(path_ray), warp_array(face), warp_array(barycentric, wp.vec2), warp_array(arriving, wp.vec3),
+            warp_array(throughput, wp.vec3), first_point, depth, paths, points, light, mesh, samples,
+        ]  # fmt: skip
+        if depth + 1 == bounces and isinstance(tracer, EmbreeTracer):
+            inputs = [*tracer.any_hit, *inputs]
+            wp.launch(light_hits_simd, dim=-(-paths // 16), inputs=inputs, outputs=[warp_array(indirect, wp.vec3)], device=warp_dev)
             break
         origin, direction, contribution = (torch.empty(2 * paths, 3, device=device) for _ in range(3))
         next_throughput = torch.empty(paths, 3, device=device)
         wp.launch(
             scatter_kernel(device),
             dim=-(-paths // 16) if device.type == "cpu" else paths,
-            inputs=[
-                warp_array(path_ray), warp_array(face), warp_array(barycentric, wp.vec2), warp_array(arriving, wp.vec3),
-                warp_array(throughput, wp.vec3), first_point, depth, paths, points, light, mesh, samples,
-            ],
+            inputs=inputs,
             outputs=[warp_array(t, wp.vec3) for t in (origin, direction, contribution, next_throughput)],
             device=warp_dev,
-        )  # fmt: skip
+        )
         if depth + 1 == bounces:
             blocked = tracer.occluded(origin, direction)
         else:

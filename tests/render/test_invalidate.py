@@ -174,6 +174,17 @@ def test_first_hits_are_remembered_under_bounces_too(calls: Counter) -> None:
     assert 0 < after < 0.75 * fresh
 
 
+def test_no_ray_is_kept_while_the_camera_moves_and_the_next_edit_traces_anew(calls: Counter) -> None:
+    scene = mesh_scene()
+    before = refine_frame(start_frame(scene, CAMERA, SETTINGS))
+    moved_on = refine_frame(start_frame(scene, front_camera(20, distance=7), SETTINGS, previous=before))
+    assert before.memory.rays is not None and moved_on.memory.rays is None
+    edited = refine_frame(start_frame(new_sky(scene), front_camera(20, distance=7), SETTINGS, previous=moved_on))
+    fresh = refine_frame(start_frame(new_sky(scene), front_camera(20, distance=7), SETTINGS))
+    torch.testing.assert_close(resolve_frame(edited).radiance_linear, resolve_frame(fresh).radiance_linear, rtol=1e-4, atol=1e-5)
+    assert edited.memory.rays is not None
+
+
 def test_a_brighter_light_multiplies_the_sums_it_has() -> None:
     scene = mesh_scene()
     before = refine_frame(start_frame(scene, CAMERA, SETTINGS), 3)
