@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import simplejpeg
 
+from server.problems import artifact_problem
 from server.rest_records import EnvironmentInfo
-from worker.artifact_store import ArtifactMissing, StoreAway
+from worker.artifact_store import ArtifactError, ArtifactMissing, StoreAway
 from worker.artifacts import bring_environment, keep
 from worker.data_directory import DataDirectory
 
@@ -21,7 +22,8 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,79}\.exr")
 
 class EnvironmentStore:
     """Final. Names are file names of this folder and of the form `letters-digits.exr`; nothing else is ever joined to a path. What is not here
-    is looked for in the store that machines share, if there is one, and fetched; each method may then raise ArtifactError."""
+    is looked for in the store that machines share, if there is one, and fetched; each method may then raise ArtifactError, and
+    `has` ProblemError."""
 
     def __init__(self, directory: DataDirectory) -> None:
         self._directory = directory
@@ -58,6 +60,8 @@ class EnvironmentStore:
             return bring_environment(self._directory, name).is_file()
         except ArtifactMissing:
             return False
+        except ArtifactError as error:
+            raise artifact_problem(error) from error
 
     def path(self, name: str) -> Path:
         """

@@ -16,7 +16,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from server.answers import job_info, job_infos
+from server.answers import JOB_LIST_COLUMNS, job_info, job_infos
 from server.context import ServerContext, context_of
 from server.problems import ProblemError
 from server.rest_records import BuildRequest, JobFile, JobFileList, JobInfo, JobList
@@ -256,7 +256,7 @@ def list_jobs(
 ) -> JobList:
     """Newest first."""
     with Session(context.engine) as session:
-        rows = session.scalars(select(JobRow).order_by(JobRow.created_at.desc()).limit(limit).offset(offset)).all()
+        rows = session.execute(select(*JOB_LIST_COLUMNS).order_by(JobRow.created_at.desc()).limit(limit).offset(offset)).all()
         total = session.scalar(select(func.count()).select_from(JobRow)) or 0
     jobs = job_infos(rows, context.queue.statuses(row.id for row in rows))
     return JobList(jobs=jobs, total=total, workers_alive=len(context.queue.alive_workers()))

@@ -89,6 +89,11 @@ class JobRow(Base):
     asset_id: Mapped[str | None]
     error: Mapped[str | None]
 
+    @property
+    def source_asset(self) -> str | None:
+        """What a job of another kind than `build` works on."""
+        return self.parameters.get("asset")
+
 
 class WorkerRow(Base):
     __tablename__ = "workers"

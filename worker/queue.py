@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
+from dbos._schemas.system_database import SystemSchema
 from dbos._serialization import DefaultSerializer
 from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session
@@ -28,6 +29,7 @@ HEARTBEAT_SECONDS = 2.0
 DEAD_AFTER_SECONDS = 15.0
 """Without a heartbeat. A worker on this machine whose process is gone counts as dead at once."""
 
+_STATUS = SystemSchema.workflow_status
 _STATES = {
     "ENQUEUED": "queued",
     "DELAYED": "queued",
@@ -91,9 +93,11 @@ class JobQueue:
         wanted = list(job_ids)
         if not wanted:
             return {}
-        rows = self._client.list_workflows(workflow_ids=wanted, load_input=False, load_output=False)
+        # Three columns of DBOS's table: its own list reads thirty, which is most of what listing 500 jobs costs.
+        query = select(_STATUS.c.workflow_uuid, _STATUS.c.status, _STATUS.c.executor_id).where(_STATUS.c.workflow_uuid.in_(wanted))
+        with self._client._sys_db.engine.connect() as connection:
+            found = {row.workflow_uuid: row for row in connection.execute(query)}
         dead = self._dead_workers()
-        found = {row.workflow_id: row for row in rows}
         answer = {}
         for job_id in wanted:
             row = found.get(job_id)

@@ -31,6 +31,7 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     infos = [built, *(response.json() for response in found)]
     assert [info["kind"] for info in infos] == ["build", "redecouple", "simulate", "render", "export"]
     assert [info["source_asset"] for info in infos] == [None, built["id"], ASSET, ASSET, ASSET]
+    assert service.client.get("/api/jobs").json()["jobs"] == infos[::-1]
     assert (infos[2]["name"], infos[3]["name"], infos[3]["priority"]) == ("fall", "ball", 3)
     steps = {info["kind"]: jobs._RUNS[info["kind"]](jobs._job_context(info["id"])).steps for info in infos}
     assert steps["build"] == ("read", "fit", "mesh", "materials", "pack", "register")
