@@ -4,6 +4,8 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from copy import deepcopy
+from functools import cache
 from html import escape
 
 import psutil
@@ -20,6 +22,7 @@ from server.context import ServerContext
 from server.docs_page import docs_page
 from server.environments import EnvironmentStore
 from server.metrics import Metrics, MetricsMiddleware
+from server.openapi_document import complete_document
 from server.problems import ProblemError, add_problem_handlers
 from server.rate_limit import RateLimit
 from server.render_session import AbstractRenderer
@@ -97,6 +100,8 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
 
     app = FastAPI(title="DR-GS", version=__version__, lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url="/api/openapi.json")
     app.state.context = context
+    derive = app.openapi
+    app.openapi = cache(lambda: complete_document(deepcopy(derive())))  # type: ignore[method-assign]
     add_problem_handlers(app)
     for routes in (routes_jobs, routes_assets, routes_sessions, stream):
         app.include_router(routes.router)

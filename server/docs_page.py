@@ -25,5 +25,16 @@ def docs_page(document: dict) -> str:
             parts.append(f"<ul>{''.join(rows)}</ul>" if rows else "")
             for kind, body in call.get("requestBody", {}).get("content", {}).items():
                 parts.append(f"<p>Body, {escape(kind)}:</p><pre>{escape(json.dumps(body.get('schema', {}), indent=1))}</pre>")
+                parts += [_example(title, example) for title, example in body.get("examples", {}).items()]
+            for status, answer in call["responses"].items():
+                for kind, body in answer.get("content", {}).items() if status != "default" else ():
+                    parts.append(f"<p>Answer {status}, {escape(kind)}</p>")
+                    parts += [_example(title, example) for title, example in body.get("examples", {}).items()]
     parts.append(f"<h2>Schemas</h2><pre>{escape(json.dumps(document.get('components', {}).get('schemas', {}), indent=1))}</pre>")
     return "".join(parts)
+
+
+def _example(title: str, example: dict) -> str:
+    value = example["value"]
+    text = value if isinstance(value, str) else json.dumps(value, indent=1)
+    return f"<details><summary>Example: {escape(title)}</summary><pre>{escape(text)}</pre></details>"
