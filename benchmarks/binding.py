@@ -24,12 +24,14 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from drgs.build.build_asset import CHECKPOINTS, PRESETS, BuildSettings, build_asset, build_stages, read_geometry, reduced_mesh
+from drgs.build.build_asset import PRESETS, BuildSettings, build_asset, build_stages
 from drgs.build.checkpoint import read_tensors
+from drgs.build.durable_stages import CHECKPOINTS, read_geometry
 from drgs.build.fit_gaussians import environment_table, render_stage_one
 from drgs.build.fit_mesh_surfels import MeshFitSettings, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
 from drgs.build.initial_points import initial_points
 from drgs.build.load_views import load_cameras, load_views
+from drgs.build.mesh_from_gaussians import reduced_mesh
 from drgs.build.mesh_surfels import mesh_surfels
 from drgs.build.split_sum import filter_environment
 from drgs.deform.carry_gaussians import carry_tangents

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drgs.build.build_asset import Progress
+    from drgs.build.report_progress import Progress
 
 
 class StopOnInterrupt:

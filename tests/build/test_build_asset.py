@@ -9,12 +9,14 @@ import simplejpeg
 import torch
 
 from drgs.build.bind_gaussians import points_from_binding
-from drgs.build.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, drop_unseen, encode_preview
+from drgs.build.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset
 from drgs.build.densify import DensifySettings
 from drgs.build.extract_mesh import MeshSettings
 from drgs.build.fit_gaussians import FitSettings
 from drgs.build.fit_materials import MaterialSettings
 from drgs.build.fit_mesh_surfels import MeshFitSettings
+from drgs.build.mesh_from_gaussians import drop_unseen
+from drgs.build.report_progress import encode_preview
 from drgs.render.sample_rays import SampleCounts
 from drgs.scene.asset import Asset, load_asset
 from tests.build.surfel_spheres import joined, surfel_sphere

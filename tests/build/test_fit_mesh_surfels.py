@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from drgs.build.bind_gaussians import foot_and_normal, points_from_binding
-from drgs.build.build_asset import chosen_surfels, reduced_mesh
 from drgs.build.checkpoint import fit_tensors, restore_fit
 from drgs.build.fit_gaussians import ENVIRONMENT_PYRAMID
 from drgs.build.fit_mesh_surfels import MeshFitSettings, fit_mesh_surfels, gaussians_from_mesh_fit, start_mesh_fit, surfels_on_faces
 from drgs.build.load_views import load_views
+from drgs.build.mesh_from_gaussians import chosen_surfels, reduced_mesh
 from drgs.build.mesh_surfels import mesh_surfels
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.maths.frames import rotation_from_quat_wxyz
