@@ -66,7 +66,8 @@ def pose_scene(
     material = [edit for edit in edits if isinstance(edit, MaterialEdit)]
     deform = [edit for edit in edits if isinstance(edit, ShapeEdit)]
 
-    vertex_materials, surfel_materials = _remembered(asset, ("material", *map(_text, material)), lambda: _apply_materials(asset, material))
+    material_key = ("material", *map(_text, material))
+    vertex_materials, surfel_materials = _remembered(asset, material_key, lambda: _apply_materials(asset, material, material_key))
     shape_key = ("shape", *_shape_texts(deform, files))
     shape = _remembered(asset, shape_key, lambda: _apply_deformations(asset, deform, files))
 
@@ -135,12 +136,19 @@ def _rest(asset: Asset) -> _Rest:
     return _remembered(asset, ("rest",), lambda: _Rest(surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)))
 
 
-def _apply_materials(asset: Asset, edits: list[MaterialEdit]) -> tuple[Materials, Materials | None]:
-    """Materials of the mesh's vertices and of the surfels."""
+def _apply_materials(asset: Asset, edits: list[MaterialEdit], key: tuple) -> tuple[Materials, Materials | None]:
+    """Materials of the mesh's vertices and of the surfels. One edit more on a long list costs one edit.
+
+    Args:
+        key: of these edits; results of the first few of them may be remembered.
+    """
     mesh, gaussians = asset.mesh, asset.gaussians
     of_vertices = Materials(mesh.albedo, mesh.roughness, mesh.metallic)
     of_surfels = None if gaussians is None else Materials(gaussians.albedo, gaussians.roughness, gaussians.metallic)
-    for edit in edits:
+    done, known = _longest_remembered(asset, key)
+    if known is not None:
+        of_vertices, of_surfels = known
+    for edit in edits[done:]:
         weights = select_vertices(mesh, edit.select)
         of_vertices = _edited(of_vertices, edit, weights)
         if gaussians is not None and of_surfels is not None:
@@ -276,12 +284,27 @@ def _text(edit: Edit) -> str:
     return edit.model_dump_json()
 
 
+def _is_optimised(asset: Asset) -> bool:
+    return any(value.requires_grad for record in (asset.gaussians, asset.mesh) if record is not None for value in vars(record).values())
+
+
+def _longest_remembered(asset: Asset, key: tuple) -> tuple[int, Any]:
+    """How many words after the first of this key, fewer than all, are those of a key whose result is remembered, and that; or 0 and None."""
+    if _is_optimised(asset):
+        return 0, None
+    with _lock:
+        kept = _memory.get(asset, OrderedDict())
+        begun = [other for other in kept if len(other) < len(key) and other == key[: len(other)]]
+        longest = max(begun, key=len, default=None)
+        return (0, None) if longest is None else (len(longest) - 1, kept[longest])
+
+
 def _remembered(asset: Asset, key: tuple, make: Callable[[], Result]) -> Result:
     """The result of `make` for this key, the same object as long as it is among the last few of its kind (the key's first word).
 
     An asset is frozen, so nothing here goes stale; while its tensors are being optimised, nothing is remembered.
     """
-    if any(value.requires_grad for record in (asset.gaussians, asset.mesh) if record is not None for value in vars(record).values()):
+    if _is_optimised(asset):
         return make()
     with _lock:
         kept = _memory.setdefault(asset, OrderedDict())

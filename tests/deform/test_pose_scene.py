@@ -15,6 +15,7 @@ from drgs.scene.edits import TwistMap, parse_edits
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians, surfel_tangents
 from drgs.scene.mesh import TriangleMesh
+from drgs.scene.select_vertices import select_vertices
 
 GRID = 9
 
@@ -166,6 +167,28 @@ def test_selections_refer_to_the_object_at_rest():
 def test_material_edits_apply_in_their_order():
     scene = pose(plate_asset(), material({"all": True}, roughness=0.5), material({"all": True}, "multiply", roughness=0.5))
     assert (scene.mesh.roughness == 0.25).all()
+
+
+def test_one_material_edit_more_costs_one_edit_and_changes_no_bit(monkeypatch):
+    asset, applied = plate_asset(), []
+    monkeypatch.setattr(
+        "drgs.deform.pose_scene.select_vertices", lambda mesh, select: applied.append(select) or select_vertices(mesh, select)
+    )
+    sphere = {"sphere": {"center": [0.1, 0, 0.2], "radius": 0.3, "falloff": 0.4}}
+    edits = [material(sphere, mode="multiply", albedo=[0.9, 0.5 + k / 20, 0.7], roughness=0.3 + k / 20) for k in range(8)]
+    for count in range(1, 9):
+        scene = pose(asset, *edits[:count])
+        assert len(applied) == count
+    fresh = pose(plate_asset(), *edits)
+    assert torch.equal(scene.mesh.albedo, fresh.mesh.albedo) and torch.equal(scene.mesh.roughness, fresh.mesh.roughness)
+    assert scene.surfels is not None and fresh.surfels is not None
+    assert torch.equal(scene.surfels.materials.albedo, fresh.surfels.materials.albedo)
+    applied.clear()
+    pose(asset, *edits[:7])  # undone
+    pose(asset, *edits[:7], material({"all": True}, metallic=1.0))  # another one instead
+    assert len(applied) == 1
+    changed = pose(asset, edits[1], edits[0])  # not a beginning of what was remembered
+    assert torch.equal(changed.mesh.albedo, pose(plate_asset(), edits[1], edits[0]).mesh.albedo)
 
 
 def test_a_map_moves_vertices_normals_centres_and_tangents():
