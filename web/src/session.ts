@@ -292,12 +292,12 @@ function dropSplice(): void {
 
 export function undo(): void {
   if (splicing) later.push(undo);
-  else if (log.value.can_undo || pending.value.length) stream?.undo();
+  else if (log.value.can_undo || pending.value.length || stream?.awaits('redo')) stream?.undo();
 }
 
 export function redo(): void {
   if (splicing) later.push(redo);
-  else if (log.value.can_redo) stream?.redo();
+  else if (log.value.can_redo || stream?.awaits('undo')) stream?.redo();
 }
 
 /** To the log with `count` of the edits that the history shows in force. */

@@ -129,6 +129,11 @@ export class Stream {
     return this.ready && this.outbox.length === 0;
   }
 
+  /** Whether one of these is on its way: what it will make possible may be asked for already. */
+  awaits(type: 'undo' | 'redo'): boolean {
+    return this.outbox.some((waiting) => waiting.type === type);
+  }
+
   /** What lies under a point of the picture, as shares of its width and height. */
   pick(x: number, y: number): Promise<PickedMessage> {
     const id = this.nextId++;

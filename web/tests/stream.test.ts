@@ -96,4 +96,5 @@ it('sends what was not answered again under the same key after a reconnection', 
   expect(again).toEqual(before.slice(1));
   expect(new Set(before.map((message) => message.key)).size).toBe(3);
   expect(stream.idle).toBe(false);
+  expect([stream.awaits('undo'), stream.awaits('redo')]).toEqual([true, false]);
 });
