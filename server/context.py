@@ -39,6 +39,7 @@ class ServerContext:
     """Open streams by their viewer."""
 
 
-def context_of(request: Request) -> ServerContext:
-    """Dependency of routes."""
+async def context_of(request: Request) -> ServerContext:
+    """Dependency of routes. Async, though it waits for nothing: FastAPI would look it up in another thread, and each change of threads costs a wait
+    for Python's lock while a frame is rendered."""
     return request.app.state.context

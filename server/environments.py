@@ -5,6 +5,7 @@ import re
 import shutil
 import struct
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from worker.artifacts import bring_environment, keep
 from worker.data_directory import DataDirectory
 
 THUMBNAIL_SIZE = (256, 128)
+UNSURE_NS = 2_000_000_000
+"""A folder that was changed so shortly before may have been changed twice at one time of its clock."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,79}\.exr")
 
 
@@ -30,6 +33,8 @@ class EnvironmentStore:
         self._folder = directory.environments
         self._sizes: dict[str, tuple[int, int]] = {}
         self._making = threading.Lock()
+        self._listed: tuple[int, list[EnvironmentInfo]] | None = None
+        """What was in the folder when it had been changed last at this time."""
 
     def add_bundled(self, source: Path) -> None:
         """Copy the EXR files of a folder that are not there yet."""
@@ -74,10 +79,15 @@ class EnvironmentStore:
 
     def all(self) -> list[EnvironmentInfo]:
         """By name; files that are no readable environments are left out."""
-        found = []
-        names = {path.name for path in self._folder.glob("*.exr")}
         if self._directory.store is not None:
-            names |= set(self._directory.store.list("environments"))
+            return self._described({path.name for path in self._folder.glob("*.exr")} | set(self._directory.store.list("environments")))
+        stamp = self._folder.stat().st_mtime_ns
+        if self._listed is None or self._listed[0] != stamp or time.time_ns() - stamp < UNSURE_NS:
+            self._listed = stamp, self._described({path.name for path in self._folder.glob("*.exr")})
+        return self._listed[1]
+
+    def _described(self, names: set[str]) -> list[EnvironmentInfo]:
+        found = []
         for name in sorted(names):
             try:
                 found.append(self.info(name))

@@ -52,9 +52,11 @@ def list_assets(
     if search:
         which = which.where(AssetRow.name.icontains(search, autoescape=True))
     with Session(context.engine) as session:
-        rows = session.scalars(which.order_by(AssetRow.created_at.desc(), AssetRow.id).limit(limit).offset(offset)).all()
-        total = session.scalar(select(func.count()).select_from(which.subquery())) or 0
-    return AssetList(assets=[_info(context, row) for row in rows], total=total)
+        page = which.add_columns(func.count().over()).order_by(AssetRow.created_at.desc(), AssetRow.id).limit(limit).offset(offset)
+        rows = session.execute(page).all()
+        # A page behind the last one has no row that says it.
+        total = rows[0][1] if rows else session.scalar(select(func.count()).select_from(which.subquery())) or 0
+    return AssetList(assets=[_info(context, row) for row, _ in rows], total=total)
 
 
 @router.post("/assets", status_code=201)
@@ -231,8 +233,10 @@ def remove_deleted_assets(context: ServerContext) -> int:
 
 
 @router.get("/environments", tags=["environments"])
-def list_environments(context: Context) -> EnvironmentList:
-    return EnvironmentList(environments=context.environments.all())
+async def list_environments(context: Context) -> EnvironmentList:
+    """By name."""
+    all_ = context.environments.all
+    return EnvironmentList(environments=all_() if context.directory.store is None else await run_in_threadpool(all_))
 
 
 @router.post("/environments", status_code=201, tags=["environments"])

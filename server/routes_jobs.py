@@ -25,7 +25,7 @@ from server.zip_guard import single_folder, unpack_zip
 from worker.artifact_store import StoreAway
 from worker.artifacts import drop, has_clip, keep, refresh_job
 from worker.database import AssetRow, JobRow, now
-from worker.queue import JobNotInState
+from worker.queue import JobNotInState, is_alive
 from worker.requests import JOB_REQUESTS, OWN_LIGHT, JobRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 
 router = APIRouter(prefix="/api/jobs", tags=["jobs"])
@@ -257,9 +257,11 @@ def list_jobs(
     """Newest first."""
     with Session(context.engine) as session:
         rows = session.execute(select(*JOB_LIST_COLUMNS).order_by(JobRow.created_at.desc()).limit(limit).offset(offset)).all()
-        total = session.scalar(select(func.count()).select_from(JobRow)) or 0
-    jobs = job_infos(rows, context.queue.statuses(row.id for row in rows))
-    return JobList(jobs=jobs, total=total, workers_alive=len(context.queue.alive_workers()))
+        # A page behind the last one has no row that says it.
+        total = rows[0].total if rows else session.scalar(select(func.count()).select_from(JobRow)) or 0
+    workers = context.queue.workers()
+    jobs = job_infos(rows, context.queue.statuses((row.id for row in rows), workers))
+    return JobList(jobs=jobs, total=total, workers_alive=sum(map(is_alive, workers)))
 
 
 @router.get("/{job_id}")

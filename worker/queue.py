@@ -88,8 +88,12 @@ class JobQueue:
             row.id,
         )
 
-    def statuses(self, job_ids: Iterable[str]) -> dict[str, JobStatus]:
-        """One for each id, `unknown` for those the queue has never heard of."""
+    def statuses(self, job_ids: Iterable[str], workers: Iterable[WorkerRow] | None = None) -> dict[str, JobStatus]:
+        """One for each id, `unknown` for those the queue has never heard of.
+
+        Args:
+            workers: as `workers()` says, if the caller has asked already.
+        """
         wanted = list(job_ids)
         if not wanted:
             return {}
@@ -97,7 +101,7 @@ class JobQueue:
         query = select(_STATUS.c.workflow_uuid, _STATUS.c.status, _STATUS.c.executor_id).where(_STATUS.c.workflow_uuid.in_(wanted))
         with self._client._sys_db.engine.connect() as connection:
             found = {row.workflow_uuid: row for row in connection.execute(query)}
-        dead = self._dead_workers()
+        dead = {row.id for row in (self.workers() if workers is None else workers) if not is_alive(row)}
         answer = {}
         for job_id in wanted:
             row = found.get(job_id)
@@ -154,7 +158,7 @@ class JobQueue:
 
     def requeue_dead(self) -> list[str]:
         """Hand over all jobs of dead workers, if some worker is alive to take them. Returns their ids."""
-        dead = self._dead_workers()
+        dead = {row.id for row in self.workers() if not is_alive(row)}
         if not dead or not self.alive_workers():
             return []
         rows = self._client.list_workflows(status="PENDING", executor_id=sorted(dead), load_input=False, load_output=False)
@@ -184,13 +188,13 @@ class JobQueue:
         """Jobs that wait or run."""
         return len(self._client.list_workflows(status=["ENQUEUED", "DELAYED", "PENDING"], load_input=False, load_output=False))
 
-    def alive_workers(self) -> list[str]:
+    def workers(self) -> list[WorkerRow]:
+        """All that ever were."""
         with Session(self._engine) as session:
-            return [row.id for row in session.scalars(select(WorkerRow)) if is_alive(row)]
+            return list(session.scalars(select(WorkerRow)))
 
-    def _dead_workers(self) -> set[str]:
-        with Session(self._engine) as session:
-            return {row.id for row in session.scalars(select(WorkerRow)) if not is_alive(row)}
+    def alive_workers(self) -> list[str]:
+        return [row.id for row in self.workers() if is_alive(row)]
 
 
 def is_alive(worker: WorkerRow) -> bool:

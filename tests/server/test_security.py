@@ -1,10 +1,13 @@
 """What a stranger, a hostile page and a rebound name get: nothing."""
 
 import stat
+from pathlib import Path
 
 import pytest
 from conftest import Service
 from starlette.websockets import WebSocketDisconnect
+
+from worker.settings import read_settings
 
 OURS = "http://127.0.0.1:8000"
 PATHS = ["/api/jobs", "/api/assets", "/api/environments", "/api/sessions", "/api/openapi.json", "/api/docs", "/api/no-such-call"]
@@ -135,3 +138,14 @@ def test_health_needs_no_token_and_says_nothing(service: Service) -> None:
 
 def test_without_a_built_viewer_the_page_names_the_command(service: Service) -> None:
     assert "./run setup" in service.anonymous.get("/").text
+
+
+def test_a_token_from_the_settings_takes_the_place_of_the_folders_own(tmp_path: Path) -> None:
+    service = Service(tmp_path, token="s3cret-" * 6)
+    with service.anonymous as client:
+        answers = [
+            client.get("/api/jobs", headers={"Authorization": f"Bearer {token}"}).status_code for token in ("s3cret-" * 6, service.token)
+        ]
+    assert answers == [200, 401] and "s3cret" not in repr(service.settings)
+    with pytest.raises(ValueError, match="expected 32 characters or more"):
+        read_settings(token="short")
