@@ -33,7 +33,9 @@ SEED = 7
 
 
 def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--changes", type=int, default=10_000)
     given = parser.parse_args(arguments)
@@ -125,7 +127,11 @@ def _edit(chooser: random.Random) -> dict:
         return {"op": "deform", "map": {"type": "twist", "rate": chooser.uniform(-0.05, 0.05)}}
     center = [chooser.uniform(-1, 1) for _ in range(3)]
     select = {"all": True} if kind == "all" else {"sphere": {"center": center, "radius": 0.4, "falloff": 0.1}}
-    return {"op": "material", "select": select, "set": {"roughness": chooser.uniform(0.1, 1), "albedo": [chooser.random() for _ in range(3)]}}
+    return {
+        "op": "material",
+        "select": select,
+        "set": {"roughness": chooser.uniform(0.1, 1), "albedo": [chooser.random() for _ in range(3)]},
+    }
 
 
 async def _change(client: Client, session: str, changes: int) -> list[float]:
@@ -171,7 +177,9 @@ def _replayed(folder: Path, session: str) -> tuple[int, tuple]:
 
     engine, log = open_database(open_data_directory(folder / "data")), EditLog()
     with Session(engine) as database:
-        for event in database.scalars(select(SessionEventRow).where(SessionEventRow.session_id == session).order_by(SessionEventRow.revision)):
+        for event in database.scalars(
+            select(SessionEventRow).where(SessionEventRow.session_id == session).order_by(SessionEventRow.revision)
+        ):
             log = log.after(event.kind, _change_of(event))  # type: ignore[arg-type]
     engine.dispose()
     return log.revision, log.done

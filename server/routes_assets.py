@@ -225,10 +225,9 @@ def remove_deleted_assets(context: ServerContext) -> int:
             session.execute(delete(table).where(table.session_id.in_(sessions)))
         session.execute(delete(SessionRow).where(SessionRow.asset_id.in_(gone)))
         session.execute(delete(AssetRow).where(AssetRow.id.in_(gone)))
-        left = set(session.scalars(select(AssetRow.id)))
     for asset_id in gone:
         shutil.rmtree(context.directory.asset(asset_id), ignore_errors=True)
-    clear_cache(context.directory, left)
+    clear_cache(context.directory, context.engine)
     return len(gone)
 
 

@@ -17,10 +17,14 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
+from sqlalchemy import Engine, select
+from sqlalchemy.orm import Session
+
 from drgs.scene.edits import Edit, EnvironmentEdit, PoseEdit
 from worker.artifact_store import ArtifactMissing, StoreAway
 from worker.builders import BuildStopped
 from worker.data_directory import DataDirectory, try_lock_file
+from worker.database import AssetRow, JobRow
 
 Result = TypeVar("Result")
 
@@ -185,20 +189,30 @@ def refresh_job(directory: DataDirectory, job_id: str) -> None:
             os.close(lock)
 
 
-def clear_cache(directory: DataDirectory, known_assets: set[str]) -> int:
-    """Remove assets of this machine that were deleted on another one. Returns how many.
+def clear_cache(directory: DataDirectory, engine: Engine) -> int:
+    """Remove from this machine what was deleted on another one. Returns how many folders.
 
-    Args:
-        known_assets: those that the database has a row of.
+    Raises:
+        StoreAway: a sentence.
     """
     if directory.store is None:
         return 0
-    old = time.time() - CACHE_SECONDS
-    here = [path for path in directory.assets.iterdir() if path.name not in known_assets and path.stat().st_mtime < old]
-    gone = [path for path in here if not path.name.startswith(".") and not directory.store.has("assets", path.name)]
-    for path in gone:
-        shutil.rmtree(path, ignore_errors=True)
-    return len(gone)
+    with Session(engine) as session:
+        assets, jobs = (set(session.scalars(select(table.id))) for table in (AssetRow, JobRow))
+    old, removed = time.time() - CACHE_SECONDS, 0
+    clips = directory.environments / "clips"
+    for kind, folder, known in (
+        ("assets", directory.assets, assets),
+        ("captures", directory.uploads, jobs),
+        ("jobs", directory.jobs, jobs),
+        ("clips", clips, jobs),
+    ):
+        for path in folder.iterdir() if folder.is_dir() else ():
+            if path.name.startswith(".") or path.name in known or path.stat().st_mtime > old or directory.store.has(kind, path.name):
+                continue
+            shutil.rmtree(path, ignore_errors=True)
+            removed += 1
+    return removed
 
 
 def _is_own(path: str) -> bool:

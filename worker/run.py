@@ -17,6 +17,8 @@ from sqlalchemy import Engine
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
+from worker.artifact_store import StoreAway
+from worker.artifacts import clear_cache
 from worker.builders import find_builder
 from worker.data_directory import DataDirectory, open_data_directory, try_lock_file
 from worker.database import WorkerRow, now, open_database
@@ -48,6 +50,10 @@ def run_worker(data: Path | None = None, device: str | None = None, parent_pid: 
     engine = open_database(directory)
     migrate_queue(directory)
     refuse_pickled_rows()
+    try:
+        clear_cache(directory, engine)
+    except StoreAway as error:  # the next start tries again
+        logging.getLogger(__name__).warning("%s", error)
     stopping = threading.Event()
     set_context(WorkerContext(directory, engine, worker_id, find_builder(), settings.device, stopping))
 

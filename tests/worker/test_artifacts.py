@@ -197,10 +197,26 @@ def test_an_asset_of_one_machine_is_opened_on_another(machines: Machines) -> Non
     made = make_folder(machines.first.asset(ASSET), **{"asset.json": COUNTS})
     register_asset(machines.first, machines.engine, ASSET, "ball", "upload")
     assert contents(artifacts.bring_asset(machines.second, ASSET)) == contents(made)
+
+
+def test_what_one_machine_deleted_leaves_the_others_caches(machines: Machines) -> None:
+    make_folder(machines.first.asset(ASSET), **{"asset.json": COUNTS})
+    register_asset(machines.first, machines.engine, ASSET, "ball", "upload")
+    artifacts.bring_asset(machines.second, ASSET)
+    make_folder(machines.second.job("j"))
+    artifacts.keep_job(machines.second, "j")
+    make_folder(machines.second.jobs / "young")
+    make_folder(machines.second.uploads / ".draft")
+    for path in (machines.second.asset(ASSET), machines.second.job("j"), machines.second.uploads / ".draft"):
+        os.utime(path, (0, 0))
+    assert artifacts.clear_cache(machines.second, machines.engine) == 0  # the one has a row, the other is in the store
+    with Session(machines.engine) as session, session.begin():
+        session.delete(session.get_one(AssetRow, ASSET))
     artifacts.drop(machines.first, "assets", ASSET)
-    os.utime(machines.second.asset(ASSET), (0, 0))
-    assert artifacts.clear_cache(machines.second, {ASSET}) == 0 and machines.second.asset(ASSET).exists()
-    assert artifacts.clear_cache(machines.second, set()) == 1 and not machines.second.asset(ASSET).exists()
+    artifacts.drop(machines.first, "jobs", "j")
+    assert artifacts.clear_cache(machines.second, machines.engine) == 2
+    assert not machines.second.asset(ASSET).exists() and not machines.second.job("j").exists()
+    assert (machines.second.jobs / "young").exists() and (machines.second.uploads / ".draft").exists()
 
 
 def test_an_asset_that_cannot_be_shared_is_not_listed(machines: Machines, s3: servers.StoreServer) -> None:
