@@ -7,12 +7,15 @@ import shutil
 import stat
 import tempfile
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
+from drgs.exchange.zip_entries import open_entry, open_zip
+
 _CHUNK_BYTES = 1 << 20
+_LONGEST_PART = 255
+"""Bytes of a file's name that file systems take."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +39,8 @@ def unpack_zip(source: IO[bytes], target: Path, limits: ZipLimits | None = None)
     target.parent.mkdir(parents=True, exist_ok=True)
     draft = Path(tempfile.mkdtemp(prefix=".unpack-", dir=target.parent))
     try:
-        try:
-            with zipfile.ZipFile(source) as archive:
-                _unpack(archive, draft, limits)
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, UnicodeDecodeError) as error:
-            raise ValueError(f"The zip is damaged or of a kind that is not read here ({error}).") from error
+        with open_zip(source, "What was sent") as archive:
+            _unpack(archive, draft, limits)
         draft.rename(target)
     except BaseException:
         shutil.rmtree(draft, ignore_errors=True)
@@ -51,35 +51,33 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, limits: ZipLimits) -> None:
     entries = archive.infolist()
     if len(entries) > limits.entries:
         raise ValueError(f"The zip has {len(entries)} entries; at most {limits.entries} are read.")
-    names: set[str] = set()
+    is_folder: dict[str, bool] = {}
     total = 0
     for entry in entries:
         path = safe_path(entry.filename, limits)
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
             raise ValueError(f"The zip's entry {entry.filename!r} is a link or a device; only files and folders are read.")
-        if entry.flag_bits & 0x1:
-            raise ValueError(f"The zip's entry {entry.filename!r} is encrypted; pack it without a password.")
         # Case is folded: on some disks two such names are one file.
         key = str(path).casefold()
-        if key in names and not entry.is_dir():
+        if not entry.is_dir() and is_folder.get(key) is False:
             raise ValueError(f"The zip has two entries of the name {entry.filename!r}.")
-        names.add(key)
+        if is_folder.setdefault(key, entry.is_dir()) != entry.is_dir() or not all(
+            is_folder.setdefault(str(parent), True) for parent in PurePosixPath(key).parents
+        ):
+            raise ValueError(f"The zip's entry {entry.filename!r} is both a file and a folder.")
         place = folder / path
         if entry.is_dir():
             place.mkdir(parents=True, exist_ok=True)
-            continue
-        try:
+        else:
             place.parent.mkdir(parents=True, exist_ok=True)
             total = _copy_entry(archive, entry, place, total, limits)
-        except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            raise ValueError(f"The zip's entry {entry.filename!r} is both a file and a folder.") from error
 
 
 def _copy_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: Path, total: int, limits: ZipLimits) -> int:
     """Returns the bytes unpacked so far in all."""
     size = 0
-    with archive.open(entry) as source, place.open("xb") as file:
+    with open_entry(archive, entry, f"The zip's entry {entry.filename!r}") as source, place.open("xb") as file:
         while chunk := source.read(_CHUNK_BYTES):
             size += len(chunk)
             if total + size > limits.total_bytes:
@@ -94,7 +92,7 @@ def safe_path(name: str, limits: ZipLimits) -> PurePosixPath:
     """The entry's path inside the target folder.
 
     Raises:
-        ValueError: absolute, with a drive, a backslash, `..`, a control character, or too long.
+        ValueError: absolute, with a drive, a backslash, `..`, a control character, or too long, as a whole or in a part.
     """
     path = PurePosixPath(name)
     bad = (
@@ -105,6 +103,7 @@ def safe_path(name: str, limits: ZipLimits) -> PurePosixPath:
         or ":" in name
         or any(part in ("", ".", "..") for part in name.rstrip("/").split("/"))
         or any(ord(character) < 32 for character in name)
+        or any(len(part.encode()) > _LONGEST_PART for part in path.parts)
     )
     if bad:
         raise ValueError(f"The zip's entry {name[:80]!r} does not name a place inside the folder it is unpacked to.")

@@ -10,8 +10,9 @@ import os
 import shutil
 import tempfile
 import zipfile
-import zlib
 from pathlib import Path, PurePosixPath
+
+from drgs.exchange.zip_entries import open_entry, open_zip
 
 MANIFEST = "asset.json"
 MAX_FILE_BYTES = 4 << 30
@@ -54,12 +55,9 @@ def read_package(path: Path, known: tuple[str, ...], required: tuple[str, ...], 
         return _checked(path, lambda name: _read_file(path, name), known, required, newest)
     if not path.exists():
         raise ValueError(f"{path}: does not exist; expected an asset folder or zip")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            prefix = _check_names(path, archive)
-            return _checked(path, lambda name: _read_entry(path, archive, prefix + name), known, required, newest)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, zlib.error) as error:
-        raise ValueError(f"{path}: is neither an asset folder nor a readable zip ({error})") from error
+    with open_zip(path, f"{path}: is no asset folder; as a file it") as archive:
+        prefix = _check_names(path, archive)
+        return _checked(path, lambda name: _read_entry(path, archive, prefix + name), known, required, newest)
 
 
 def _checked(path: Path, read, known: tuple[str, ...], required: tuple[str, ...], newest: int) -> tuple[dict, dict[str, bytes]]:
@@ -70,6 +68,8 @@ def _checked(path: Path, read, known: tuple[str, ...], required: tuple[str, ...]
         manifest = json.loads(text)
     except ValueError as error:
         raise ValueError(f"{path}: {MANIFEST} is damaged ({error})") from error
+    except RecursionError as error:
+        raise ValueError(f"{path}: {MANIFEST} is damaged (brackets within brackets without end)") from error
     version, listed = (manifest.get("schema_version"), manifest.get("files")) if isinstance(manifest, dict) else (None, None)
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise ValueError(f"{path}: {MANIFEST} has the schema version {version!r}; expected a whole number from 1")
@@ -132,10 +132,8 @@ def _read_entry(path: Path, archive: zipfile.ZipFile, name: str) -> bytes | None
         entry = archive.getinfo(name)
     except KeyError:
         return None
-    if entry.flag_bits & 1:
-        raise ValueError(f"{path}: {name} is encrypted; expected a plain zip")
     chunks, size = [], 0
-    with archive.open(entry) as stream:
+    with open_entry(archive, entry, f"{path}: {name}") as stream:
         while chunk := stream.read(_CHUNK):
             size += len(chunk)
             if size > MAX_FILE_BYTES or (size > _CHUNK and size > MAX_RATIO * entry.compress_size):
@@ -202,11 +200,14 @@ def _write_folder(path: Path, files: dict[str, bytes]) -> None:
 
 def _own_files(path: Path) -> set[str]:
     """Names that the package now at `path` wrote; empty where there is none."""
+    if not (path / MANIFEST).is_file():
+        return set()
     try:
-        listed = json.loads((path / MANIFEST).read_bytes())["files"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {MANIFEST} if (path / MANIFEST).is_file() else set()
-    return {MANIFEST, *listed}
+        manifest = json.loads((path / MANIFEST).read_bytes())
+    except ValueError:  # damaged: it names nothing, and is replaced
+        return {MANIFEST}
+    listed = manifest.get("files") if isinstance(manifest, dict) else None
+    return {MANIFEST, *(listed if isinstance(listed, dict) else ())}
 
 
 def _sync_folder(folder: Path) -> None:

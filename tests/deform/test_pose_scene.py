@@ -240,7 +240,7 @@ def test_a_wrong_vertex_file_is_refused_with_a_sentence(tmp_path):
     (tmp_path / "text.npz").write_text("hello")
     cases = {
         "nan.npz": "1 values that are not finite", "few.npz": r"shape \(5, 3\).*expected \(81, 3\)", "name.npz": "holds no array 'vertices'",
-        "pickle.npz": "type object", "text.npz": "not a readable NPZ", "none.npz": "does not exist",
+        "pickle.npz": r"type \|O; expected", "text.npz": "is no zip", "none.npz": "does not exist",
     }  # fmt: skip
     for name, sentence in cases.items():
         with pytest.raises(ValueError, match=sentence):

@@ -195,7 +195,7 @@ def test_a_truncated_zip_a_missing_path_and_a_foreign_file_are_refused(tmp_path)
     save_asset(small_asset(), tmp_path / "a.zip")
     (tmp_path / "a.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-100])
     (tmp_path / "note.txt").write_text("hello")
-    for name, sentence in [("a.zip", "nor a readable zip"), ("nothing", "does not exist"), ("note.txt", "nor a readable zip")]:
+    for name, sentence in [("a.zip", "is no zip"), ("nothing", "does not exist"), ("note.txt", "no asset folder; as a file it is no zip")]:
         with pytest.raises(ValueError, match=sentence):
             load_asset(tmp_path / name)
 

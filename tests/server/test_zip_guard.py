@@ -32,7 +32,8 @@ def test_an_honest_archive_is_unpacked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["../evil", "a/../../evil", "/etc/evil", "C:/evil", "a\\..\\evil", "a/./b", "a//b", "a\nb", "x" * 500, "nul:stream"]
+    "name",
+    ["../evil", "a/../../evil", "/etc/evil", "C:/evil", "a\\..\\evil", "a/./b", "a//b", "a\nb", "x" * 500, "nul:stream", "a/" + "ä" * 150],
 )
 def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match="does not name a place inside"):
@@ -70,14 +71,20 @@ def test_two_entries_of_one_name_are_refused(tmp_path: Path) -> None:
         unpack_zip(archive({"A.png": b"1", "a.png": b"2"}), tmp_path / "out", SMALL)
 
 
-def test_a_name_that_is_file_and_folder_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", [("a", "a/b"), ("a/b", "a"), ("a", "a/"), ("a/", "a"), ("A", "a/b/c")])
+def test_a_name_that_is_file_and_folder_is_refused(tmp_path: Path, names: tuple[str, str]) -> None:
     with pytest.raises(ValueError, match="both a file and a folder"):
-        unpack_zip(archive({"a": b"1", "a/b": b"2"}), tmp_path / "out", SMALL)
+        unpack_zip(archive(dict.fromkeys(names, b"")), tmp_path / "out", SMALL)
+
+
+def test_folders_may_be_named_twice(tmp_path: Path) -> None:
+    unpack_zip(archive({"a/": b"", "a/b": b"1", "A/": b"", "a/c/d": b"2"}), tmp_path / "out", SMALL)
+    assert (tmp_path / "out/a/c/d").read_bytes() == b"2"
 
 
 @pytest.mark.parametrize("data", [b"", b"PK", b"not a zip", b"\x80\x04\x95pickle"])
 def test_what_is_no_archive_is_refused(tmp_path: Path, data: bytes) -> None:
-    with pytest.raises(ValueError, match="damaged"):
+    with pytest.raises(ValueError, match="What was sent is no zip"):
         unpack_zip(io.BytesIO(data), tmp_path / "out", SMALL)
 
 
