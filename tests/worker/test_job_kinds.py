@@ -140,6 +140,19 @@ def test_a_simulation_becomes_a_clip_that_pictures_show(job: Callable[..., JobCo
     assert np.abs(first.astype(int) - second).max() > 20  # the second shows it 0.2 s later, fallen
 
 
+def test_a_simulation_that_was_stopped_goes_on_with_the_next_frame(job: Callable[..., JobContext]) -> None:
+    request = {"kind": "simulate", "asset": ASSET, "scene": {"particles": 200, "duration": 0.2, "fps": 10, "floor": None}}
+    told: list[BuildProgress] = []
+    context = job(request, told.append, lambda: len(told) >= 2)
+    with pytest.raises(BuildStopped):
+        run(SimulateRun(context))
+    assert (context.folder / "frames" / "state.safetensors").is_file() and not context.directory.clip(JOB).exists()
+    again: list[BuildProgress] = []
+    run(SimulateRun(job(request, again.append)))
+    assert [made.iteration for made in again] == [2, 3]
+    assert open_clip(context.directory.clip(JOB)).frame_count == 3 and not (context.folder / "frames").exists()
+
+
 def test_an_export_writes_each_format(job: Callable[..., JobContext]) -> None:
     context = job({"kind": "export", "asset": ASSET, "formats": ["glb"]})
     run(ExportRun(context))
