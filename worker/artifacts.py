@@ -11,6 +11,7 @@ deleted while nobody works with it.
 """
 
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterable
@@ -27,6 +28,7 @@ from worker.data_directory import DataDirectory, try_lock_file
 from worker.database import AssetRow, JobRow
 
 Result = TypeVar("Result")
+_UPLOAD = re.compile(r"[0-9a-f]{32}")
 
 OUTAGE_SECONDS = 120.0
 """How long a worker waits for a store that is away; then its job fails with a sentence and can be retried."""
@@ -88,6 +90,8 @@ def bring_capture(directory: DataDirectory, dataset: Path) -> Path:
     if directory.store is None or dataset.is_dir() or "uploads" not in dataset.parts:
         return dataset
     below = dataset.parts[len(dataset.parts) - dataset.parts[::-1].index("uploads") :]
+    if not below or not _UPLOAD.fullmatch(below[0]):
+        return dataset  # a folder of a capture root that is called so
     _bring(directory, "captures", below[0], directory.uploads / below[0])
     return directory.uploads.joinpath(*below)
 

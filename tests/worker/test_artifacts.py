@@ -247,6 +247,19 @@ def test_a_job_goes_on_where_its_last_step_ended_on_another_machine(machines: Ma
     assert (first / "half.part").exists() and (first / ".lock").exists()
 
 
+def test_a_capture_is_looked_for_where_this_machine_keeps_uploads(machines: Machines, tmp_path: Path) -> None:
+    job = "c" * 32
+    make_folder(machines.first.uploads / job / "mug")
+    artifacts.keep(machines.first, "captures", job, machines.first.uploads / job)
+    there = machines.first.uploads / job / "mug"
+    assert artifacts.bring_capture(machines.first, there) == there
+    elsewhere = Path("/gone/first/uploads") / job / "mug"
+    found = artifacts.bring_capture(machines.second, elsewhere)
+    assert found == machines.second.uploads / job / "mug" and contents(found) == contents(there)
+    for strange in (Path("/gone/uploads"), Path("/gone/uploads/mug"), Path("/gone")):
+        assert artifacts.bring_capture(machines.second, strange) == strange
+
+
 class TwoMachines(Bench):
     """The queue as one machine's API sees it; workers on the other."""
 
