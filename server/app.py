@@ -61,6 +61,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
         from server.drgs_renderer import DrgsRenderer
 
         renderer = DrgsRenderer(settings.device)
+    prepare = renderer.prepare
     if directory.store is not None:
         renderer = SharedRenderer(renderer, directory)
     connections: dict[Viewer, stream.Connection] = {}
@@ -87,6 +88,8 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         thread.start()
+        if await asyncio.to_thread(context.sessions.any):
+            asyncio.get_running_loop().run_in_executor(None, prepare)
         chores = [asyncio.create_task(_requeue_dead_workers_jobs(context.queue)), asyncio.create_task(_remove_deleted_assets(context))]
         yield
         for chore in chores:

@@ -60,6 +60,11 @@ class DrgsRenderer(AbstractRenderer):
 
         return LoadedAsset(load_asset(folder, device_from_name(self._device)), environments)
 
+    def prepare(self) -> None:
+        from drgs.deform import pose_scene  # noqa: F401
+        from drgs.render import accumulate, trace_rays  # noqa: F401
+        from drgs.scene import asset  # noqa: F401
+
 
 class LoadedAsset(AbstractLoadedAsset):
     """Final."""

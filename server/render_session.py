@@ -116,6 +116,9 @@ class AbstractRenderer(ABC):
             ValueError: the folder holds no readable asset.
         """
 
+    def prepare(self) -> None:
+        """What takes long the first time, so that whoever comes back to a session need not wait for it. Runs on a thread of its own."""
+
 
 def view_of_bounds(bounds: Bounds) -> StartView:
     """The camera of `worker.start_view` as a message."""

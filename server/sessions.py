@@ -177,6 +177,11 @@ class SessionRegistry:
             found.append(live if live is not None else await asyncio.to_thread(self._replay, session_id))
         return found
 
+    def any(self) -> bool:
+        """Whether there are sessions that somebody may come back to."""
+        with DatabaseSession(self._engine) as database:
+            return database.scalars(select(SessionRow.id).limit(1)).first() is not None
+
     async def remove(self, session_id: str) -> None:
         """
         Raises:

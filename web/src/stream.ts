@@ -28,7 +28,7 @@ import {
 
 const CAMERA_INTERVAL_MS = 25;
 const RECONNECT_FIRST_MS = 200;
-const RECONNECT_LONGEST_MS = 2000;
+const RECONNECT_LONGEST_MS = 500;
 
 export type Connection = 'connecting' | 'open' | 'lost' | 'closed';
 type Ordered = EditMessage | SpliceMessage | UndoMessage | RedoMessage;
