@@ -5,7 +5,7 @@
 Starts `drgs serve` in a process of its own on a new data folder, with the real renderer and a ball of 1 280 faces. A program sends edits,
 undos and redos over a stream (six, three and one in ten), a few at a time on their way. Then the server is killed (-9) and another one
 started on the same folder. Compared are the log before, the log after, a replay of the stored events in this process, and a picture of
-each: before, after, and of a new session that is given the edits in force one by one.
+each: before, after, and of a new session that is given the edits in force at once.
 """
 
 import argparse
@@ -55,7 +55,7 @@ def measure(changes: int, folder: Path) -> dict:
         _digest(session)  # kernels are compiled once a machine; that is not what is measured
         process = psutil.Process(server.pid)
         rss_before, cpu_before, start = process.memory_info().rss, sum(process.cpu_times()[:2]), time.monotonic()
-        seconds = asyncio.run(_change(client, session.id, changes))
+        seconds = asyncio.run(_send(client, session.id, _messages(changes)))
         took, cpu = time.monotonic() - start, sum(process.cpu_times()[:2]) - cpu_before
         rss_after = process.memory_info().rss
         info, picture = session.info(), _digest(session)
@@ -69,7 +69,7 @@ def measure(changes: int, folder: Path) -> dict:
         replay_seconds = time.monotonic() - start
         picture_again = _digest(again)
         fresh = client.open_session(asset)
-        asyncio.run(_append(client, fresh.id, [edit.model_dump(mode="json", exclude_none=True) for edit in info.edits]))
+        fresh.put_edits(info.edits)
         picture_fresh = _digest(fresh)
     finally:
         client.close()
@@ -132,14 +132,6 @@ def _edit(chooser: random.Random) -> dict:
         "select": select,
         "set": {"roughness": chooser.uniform(0.1, 1), "albedo": [chooser.random() for _ in range(3)]},
     }
-
-
-async def _change(client: Client, session: str, changes: int) -> list[float]:
-    return await _send(client, session, _messages(changes))
-
-
-async def _append(client: Client, session: str, edits: list[dict]) -> None:
-    await _send(client, session, [{"type": "edit", "edit": edit} for edit in edits])
 
 
 async def _send(client: Client, session: str, messages: list[dict]) -> list[float]:
