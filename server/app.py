@@ -61,7 +61,6 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
         from server.drgs_renderer import DrgsRenderer
 
         renderer = DrgsRenderer(settings.device)
-    prepare = renderer.prepare
     if directory.store is not None:
         renderer = SharedRenderer(renderer, directory)
     connections: dict[Viewer, stream.Connection] = {}
@@ -89,7 +88,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         thread.start()
         if await asyncio.to_thread(context.sessions.any):
-            asyncio.get_running_loop().run_in_executor(None, prepare)
+            asyncio.get_running_loop().run_in_executor(None, renderer.prepare)
         chores = [asyncio.create_task(_requeue_dead_workers_jobs(context.queue)), asyncio.create_task(_remove_deleted_assets(context))]
         yield
         for chore in chores:

@@ -116,6 +116,7 @@ class AbstractRenderer(ABC):
             ValueError: the folder holds no readable asset.
         """
 
+    @abstractmethod
     def prepare(self) -> None:
         """What takes long the first time, so that whoever comes back to a session need not wait for it. Runs on a thread of its own."""
 

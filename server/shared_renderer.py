@@ -29,6 +29,9 @@ class SharedRenderer(AbstractRenderer):
             bring_asset(self._directory, folder.name)
         return SharedAsset(self._renderer.load(folder, environments), self._directory)
 
+    def prepare(self) -> None:
+        self._renderer.prepare()
+
 
 class SharedAsset(AbstractLoadedAsset):
     """Final."""

@@ -29,12 +29,16 @@ class Painter(AbstractRenderer):
         self.pass_seconds = pass_seconds
         self.pose_seconds = 0.0
         self.loads = 0
+        self.prepared = 0
         self.begun: list[tuple[int, int]] = []
         self.threads: set[str] = set()
 
     def load(self, folder: Path, environments: Path) -> "PaintedAsset":
         self.loads += 1
         return PaintedAsset(self)
+
+    def prepare(self) -> None:
+        self.prepared += 1
 
 
 class PaintedAsset(AbstractLoadedAsset):

@@ -189,6 +189,16 @@ def test_many_edits_undone_and_redone_end_as_their_replay_does(service: Service)
     service.client.portal.call(soak)
 
 
+def test_a_server_whose_sessions_wait_prepares_its_renderer(tmp_path: Path) -> None:
+    first = Service(tmp_path)
+    with first.client:
+        first.open_session()
+    again = Service(tmp_path)
+    with again.client:
+        pass
+    assert (first.painter.prepared, again.painter.prepared) == (0, 1)
+
+
 def test_a_long_pose_of_one_session_does_not_hold_up_the_pictures_of_another(service: Service) -> None:
     slow = service.open_session()
     quick = service.client.post("/api/sessions", json={"asset": "a" * 32}).json()["id"]
