@@ -54,6 +54,9 @@ LIMITS = """
 - **Substeps**: 2000 a call by default; more are refused with a sentence that names wave speed and cell size.
 - **The room** is three times the object's size on every side unless the scene says otherwise. Particles cannot leave it, and `reached_wall` in
   the report says that they tried; one that starts outside is refused.
+- **Thin parts**: what is thinner than one cell of the grid, such as a teapot's handle at 20 000 particles, has no matter between its sides to
+  hold it together, and may tear; below three cells it bends too easily. `drgs simulate` says before the first frame where, and how many
+  particles would do.
 - **CUDA**: measured on the CPU only.
 """
 

@@ -215,7 +215,12 @@ def simulate(
     with frame_progress("Simulating", None) as advance:
         folder = Path() if scene is None else scene.parent
         _, report = run_simulation(
-            _open_asset(asset, device), setting, out, lambda done, total: advance(f"{done} of {total}"), lambda name: folder / name
+            _open_asset(asset, device),
+            setting,
+            out,
+            lambda done, total: advance(f"{done} of {total}"),
+            lambda name: folder / name,
+            warn=lambda sentence: print(f"drgs: {sentence}", file=sys.stderr),
         )
     _print_document({"out": str(out)} | vars(report), as_json)
 

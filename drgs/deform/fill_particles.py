@@ -14,17 +14,20 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from drgs.deform.measure_thickness import ThinPart, measure_thickness, share_of_area, thin_parts, welded
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
 
 SURVEY_POINTS = 40_000
 """Lattice points that measure the volume before the spacing is chosen."""
+THIN_CELLS = 3.0
+"""Parts thinner than this many grid cells bend too easily."""
 MOST_LATTICE_POINTS = 40_000_000
 TRACER_SHARE = 1e-3
 """Mass and volume of a tracer, as a part of an interior particle's: it follows, and hardly pushes."""
-THIN_SPACINGS = 6.0
-"""Parts thinner than this many spacings (3 grid cells) bend too easily."""
+SPACINGS_A_CELL = 2.0
+"""Of the lattice in a cell of the simulation's grid."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,10 @@ class Particles:
     """Of the interior lattice [world units]."""
     interior: int
     """How many of the particles are interior ones."""
-    thin_fraction: float
-    """Part of the surface (of its vertices) below which the object is thinner than three grid cells of two spacings."""
+    thin_share: float
+    """Of the surface's area, where the object is thinner than three grid cells: it bends too easily there."""
+    torn_parts: tuple[ThinPart, ...]
+    """Where it is thinner than one, the largest first: particles on its two sides hardly feel each other, and it tears."""
 
 
 @wp.kernel
@@ -74,25 +79,6 @@ def measure_depth(
         nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
         distance = -query.sign * wp.length(nearest - points[i])
     depth[i] = distance
-
-
-@wp.kernel
-def measure_thickness(
-    first: int,
-    mesh: wp.uint64,
-    points: wp.array[wp.vec3],
-    inward: wp.array[wp.vec3],
-    lift: float,
-    reach: float,
-    # outputs
-    thickness: wp.array[float],
-):
-    i = first + wp.tid()
-    query = wp.mesh_query_ray(mesh, points[i] + lift * inward[i], inward[i], reach)
-    found = wp.float32(1.0e30)
-    if query.result:
-        found = query.t
-    thickness[i] = found
 
 
 def fill_particles(vertices: Tensor, faces: Tensor, settings: FillSettings | None = None) -> Particles:
@@ -140,8 +126,11 @@ def fill_particles(vertices: Tensor, faces: Tensor, settings: FillSettings | Non
         volumes.append(torch.full((len(surface),), each * share, device=vertices.device))
         if settings.surface == "particles":  # all share the volume
             volumes = [torch.full_like(v, enclosed / (len(interior) + len(surface))) for v in volumes]
-    thin = _thin_fraction(tree, vertices, solid, spacing)
-    return Particles(torch.cat(positions).contiguous(), torch.cat(volumes), spacing, len(interior), thin)
+    cell = SPACINGS_A_CELL * spacing
+    thickness = measure_thickness(tree, vertices, solid, THIN_CELLS * cell)
+    thin = share_of_area(vertices, solid, thickness < THIN_CELLS * cell)
+    parts = thin_parts(vertices, solid, thickness, cell)
+    return Particles(torch.cat(positions).contiguous(), torch.cat(volumes), spacing, len(interior), thin, parts)
 
 
 def depths(tree: wp.Mesh, points: Tensor) -> Tensor:
@@ -168,9 +157,7 @@ def _without_floaters(vertices: Tensor, faces: Tensor, share: float) -> Tensor:
     """The faces of connected parts with enough area; vertices at one place count as one."""
     where = vertices.double().cpu().numpy()
     corners = faces.long().cpu().numpy()
-    extent = float(np.ptp(where, axis=0).max()) or 1.0
-    _, welded = np.unique(np.round((where - where.min(0)) / (extent * 1e-6)).astype(np.int64), axis=0, return_inverse=True)
-    linked = welded.reshape(-1)[corners]
+    linked = welded(vertices)[corners]
     pairs = np.concatenate([linked[:, [0, 1]], linked[:, [1, 2]]])
     count = int(linked.max()) + 1
     graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
@@ -196,14 +183,3 @@ def _one_a_voxel(points: Tensor, size: float) -> Tensor:
     fresh = torch.ones_like(ordered, dtype=torch.bool)
     fresh[1:] = ordered[1:] != ordered[:-1]
     return order[fresh]
-
-
-def _thin_fraction(tree: wp.Mesh, vertices: Tensor, faces: Tensor, spacing: float) -> float:
-    corners = vertices[faces.long()]
-    inward = -torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
-    step = max(1, len(faces) // 4096)
-    centers, inward = corners.mean(1)[::step].contiguous(), inward[::step].contiguous()
-    thickness = torch.empty(len(centers), device=vertices.device)
-    inputs = [tree.id, warp_array(centers, wp.vec3), warp_array(inward, wp.vec3), 1e-3 * spacing, THIN_SPACINGS * spacing]
-    launch(measure_thickness, len(centers), inputs, [warp_array(thickness)], warp_device(vertices))
-    return float((thickness < THIN_SPACINGS * spacing).float().mean())

@@ -20,7 +20,7 @@ from drgs.deform.carry_gaussians import carry_normals, carry_tangents
 from drgs.deform.checkpoint_simulation import read_progress, save_progress
 from drgs.deform.clip import ClipFrame, blend_frames, save_clip
 from drgs.deform.drive_mesh import vertex_gradients
-from drgs.deform.fill_particles import FillSettings, Particles, fill_particles
+from drgs.deform.fill_particles import SPACINGS_A_CELL, FillSettings, Particles, fill_particles
 from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate
 from drgs.deform.measure_solid import distances_from_solid
 from drgs.deform.mpm import (
@@ -52,6 +52,8 @@ STILL = 1e-4
 """Cells a frame: below it, matter is at rest."""
 STILL_FRAMES = 3
 """Frames at rest after which nothing is computed until something acts again."""
+MOST_PARTS_NAMED = 3
+"""Of those that may tear, in a warning."""
 ROOM_SIZES = 3.0
 """How far the room reaches beyond the object on every side, in sizes of the object."""
 
@@ -94,7 +96,6 @@ class Simulation:
         local = (mesh.vertices.double() - self._center.to(mesh.vertices.device)).float()
         surface = "particles" if scene.variant == "paper" else "tracers"
         filled = fill_particles(local, mesh.faces, FillSettings(scene.particles, surface=surface, seed=scene.seed))
-        self.warnings = _warnings(filled)
         self.model = _make_model(asset, scene, filled, self._center, find)
         self._settings = MpmSettings(
             courant=scene.courant,
@@ -110,6 +111,7 @@ class Simulation:
         # Sand and fluids mix: what their particles have turned says nothing about the surface, which the moved mesh still tells.
         mixes = (self.model.laws == LAWS.index("drucker_prager")) | (self.model.laws == LAWS.index("fluid"))
         self._loose = mixes[self._weights.neighbours[:, 0].long()]
+        self.warnings = _warnings(filled, self._center, scene.particles, holds=not bool(mixes.all()))
         _, nearest = cKDTree(local.cpu().numpy()).query(points.cpu().numpy()) if bool(self._loose.any()) else (None, [])
         self._nearest_vertex = torch.as_tensor(nearest, device=local.device)
         self._state = _first_state(self.model, scene)
@@ -202,6 +204,7 @@ def simulate(
     progress: Callable[[int, int], None] | None = None,
     find: Files = refuse_files,
     checkpoint: Path | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> tuple[list[ClipFrame], SimulationReport]:
     """Simulate a whole scene, and write it as a clip if `out` says where.
 
@@ -209,11 +212,14 @@ def simulate(
         progress: told of each finished frame and of how many there will be.
         find: the files that the scene names.
         checkpoint: folder that keeps every finished frame, and from which an interrupted run goes on, to the same clip; removed in the end.
+        warn: told of what will not look right before the first frame is computed; the report has it too.
 
     Raises:
         ValueError: one sentence: the mesh encloses nothing, the scene does not fit, or `out` is taken.
     """
     simulation = Simulation(asset, scene, find)
+    for sentence in simulation.warnings if warn is not None else ():
+        warn(sentence)
     if checkpoint is not None:
         simulation.go_on_from(read_progress(checkpoint, simulation.progress, scene.model_dump_json()))
     found, kept = len(simulation.progress.frames), []
@@ -254,7 +260,7 @@ def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center:
     low, high = filled.positions.amin(0).double().cpu(), filled.positions.amax(0).double().cpu()
     size = float((high - low).max())
     axis = "xyz".index(scene.up)
-    dx = 2 * filled.spacing
+    dx = SPACINGS_A_CELL * filled.spacing
     materials: list[Material] = [make_material(scene.matter, size, asset.meters_per_unit)]
     material_of = torch.zeros(len(filled.positions), dtype=torch.int64, device=interior.device)
     for region in scene.regions:
@@ -319,10 +325,27 @@ def _acts_later(conditions: tuple[Condition, ...], time: float) -> bool:
     return any(time < c.start or (math.isfinite(c.end) and time < c.end) or (any(c.velocity) and time < c.end) for c in conditions)
 
 
-def _warnings(filled: Particles) -> tuple[str, ...]:
-    if filled.thin_fraction > 0.1:
+def _warnings(filled: Particles, center: Tensor, particles: int, holds: bool) -> tuple[str, ...]:
+    """
+    Args:
+        center: of the object, where the particles have their origin.
+        particles: that were asked for.
+        holds: some of the matter is not sand and no fluid.
+    """
+    if filled.torn_parts and holds:
+        cell, shown = SPACINGS_A_CELL * filled.spacing, []
+        for part in filled.torn_parts[:MOST_PARTS_NAMED]:
+            place = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in (center + torch.tensor(part.middle, dtype=torch.float64)).tolist())
+            shown.append(f"{part.thickness:.3g} about ({place})")
+        # Cells shrink with the cube root of the number of particles.
+        enough = particles * (cell / min(part.thickness for part in filled.torn_parts)) ** 3
         return (
-            f"{filled.thin_fraction:.0%} of the surface belongs to parts thinner than three grid cells, which bend too easily: "
+            f"{sum(part.share for part in filled.torn_parts):.0%} of the surface belongs to parts thinner than one grid cell ({cell:.3g}), "
+            f"which may tear: {', '.join(shown)}; some {float(f'{enough:.1e}'):,.0f} particles would give each of them a cell",
+        )
+    if filled.thin_share > 0.1:
+        return (
+            f"{filled.thin_share:.0%} of the surface belongs to parts thinner than three grid cells, which bend too easily: "
             "use more particles",
         )
     return ()

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from drgs.deform.fill_particles import FillSettings, fill_particles
+from drgs.deform.fill_particles import SPACINGS_A_CELL, FillSettings, fill_particles
 
 
 def sphere(radius=0.5, center=(0.0, 0.0, 0.0)):
@@ -78,8 +78,24 @@ def test_tracers_lie_on_the_surface_one_a_voxel_and_weigh_next_to_nothing():
 def test_thin_parts_are_reported():
     plate = trimesh.creation.box((2.0, 2.0, 0.02))
     vertices, faces = torch.tensor(plate.vertices, dtype=torch.float32), torch.tensor(plate.faces, dtype=torch.int32)
-    assert fill_particles(vertices, faces, FillSettings(particles=2000)).thin_fraction > 0.3
-    assert fill_particles(*sphere(), FillSettings(particles=2000)).thin_fraction < 0.01
+    plate = fill_particles(vertices, faces, FillSettings(particles=2000))
+    assert plate.thin_share == pytest.approx(8 / (8 + 8 * 0.02))  # all but the rim
+    ball = fill_particles(*sphere(), FillSettings(particles=2000))
+    assert ball.thin_share < 0.01 and ball.torn_parts == ()
+
+
+def test_a_handle_thinner_than_a_cell_is_found_until_there_are_particles_enough():
+    body, handle = trimesh.creation.box((1.0, 1.0, 1.0)), trimesh.creation.box((1.0, 0.1, 0.1))
+    handle.apply_translation((0.5, 0.3, 0.3))
+    mesh = trimesh.util.concatenate([body, handle])
+    vertices, faces = torch.tensor(mesh.vertices, dtype=torch.float32), torch.tensor(mesh.faces, dtype=torch.int32)
+    coarse = fill_particles(vertices, faces, FillSettings(particles=300))
+    (part,) = coarse.torn_parts
+    assert part.thickness == pytest.approx(0.1, rel=1e-3) and part.share == pytest.approx(0.4 / 6.42, rel=1e-5)
+    assert part.middle == pytest.approx((0.5, 0.3, 0.3), abs=1e-5)
+    enough = 300 * (SPACINGS_A_CELL * coarse.spacing / part.thickness) ** 3
+    assert len(fill_particles(vertices, faces, FillSettings(particles=int(0.9 * enough))).torn_parts) == 1
+    assert fill_particles(vertices, faces, FillSettings(particles=int(1.1 * enough))).torn_parts == ()
 
 
 def test_a_sheet_encloses_nothing_and_is_refused():

@@ -15,7 +15,7 @@ from drgs.scene.asset import Asset
 from drgs.scene.edits import parse_edits
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians, surfel_tangents
-from drgs.scene.mesh import TriangleMesh
+from drgs.scene.mesh import TriangleMesh, vertex_normals
 
 CENTER = (2.0, -1.0, 5.0)
 SMALL = {"particles": 400, "duration": 0.5, "fps": 20}
@@ -249,3 +249,21 @@ def test_normals_of_matter_that_flows_are_those_of_the_surface_that_it_has_becom
     # No surfel is drawn into a needle.
     asset_lengths = torch.linalg.svdvals(surfel_tangents(ball_asset().gaussians))
     assert float((torch.linalg.svdvals(frame.tangents) / asset_lengths).max()) < 3.01
+
+
+def test_a_handle_that_will_tear_is_named_before_the_first_frame():
+    body = trimesh.creation.box((1.0, 1.0, 1.0))
+    handle = trimesh.creation.box((1.0, 0.1, 0.1))
+    handle.apply_translation((0.5, 0.3, 0.3))
+    shape = trimesh.util.concatenate([body, handle])
+    vertices, faces = torch.tensor(shape.vertices + CENTER, dtype=torch.float32), torch.tensor(shape.faces, dtype=torch.int32)
+    count = len(vertices)
+    mesh = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), torch.ones(count, 3), torch.ones(count), torch.zeros(count))
+    asset = Asset(None, mesh, None, Environment(torch.ones(4, 8, 3)))
+    told: list[str] = []
+    _, report = simulate(asset, scene(duration=0.05), progress=lambda done, _: told.append(f"frame {done}"), warn=told.append)
+    assert told[1:] == ["frame 1", "frame 2"] and report.warnings == (told[0],)
+    assert "6% of the surface belongs to parts thinner than one grid cell" in told[0]
+    assert "which may tear: 0.1 about (2.50, -0.70, 5.30); some 8,000 particles would give each of them a cell" in told[0]
+    assert Simulation(asset, scene(particles=9000)).warnings == ()
+    assert Simulation(asset, scene(matter={"preset": "honey"})).warnings == ()  # what flows does not tear
