@@ -335,7 +335,8 @@ def _warnings(filled: Particles, center: Tensor, particles: int, holds: bool) ->
     if filled.torn_parts and holds:
         cell, shown = SPACINGS_A_CELL * filled.spacing, []
         for part in filled.torn_parts[:MOST_PARTS_NAMED]:
-            place = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in (center + torch.tensor(part.middle, dtype=torch.float64)).tolist())
+            middle = (center + torch.tensor(part.middle, dtype=torch.float64)).tolist()
+            place = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in middle)
             shown.append(f"{part.thickness:.3g} about ({place})")
         # Cells shrink with the cube root of the number of particles.
         enough = particles * (cell / min(part.thickness for part in filled.torn_parts)) ** 3
