@@ -9,7 +9,7 @@ estimate happens to be small would favour dark estimates.
 import torch
 from torch import Tensor
 
-from drgs.render.image_tiles import tile_grid, tile_of_pixels
+from drgs.render.image_tiles import TILE, tile_grid
 
 DARK = 0.01
 """Squared luminance below which errors are absolute."""
@@ -36,10 +36,9 @@ def tile_errors(luminance: Tensor, variance: Tensor, covered: Tensor, width: int
         luminance, variance: (pixel,) mean and variance of the mean. covered: (pixel,) bool.
     """
     across, down = tile_grid(width, height)
-    tile = tile_of_pixels(torch.arange(width * height, device=luminance.device), width)
     square = torch.where(covered, variance / (luminance.square() + DARK), 0.0)
-    total = torch.zeros(across * down, device=square.device).index_add_(0, tile, square)
-    count = torch.zeros(across * down, device=square.device).index_add_(0, tile, covered.float())
+    maps = torch.nn.functional.pad(torch.stack([square, covered.float()]).view(2, height, width), (0, -width % TILE, 0, -height % TILE))
+    total, count = maps.view(2, down, TILE, across, TILE).sum((2, 4))
     mean = (total / count.clamp(min=1)).view(1, 1, down, across)
     return torch.nn.functional.max_pool2d(mean, 3, 1, 1).reshape(-1).sqrt()
 

@@ -237,6 +237,7 @@ class Horizons:
         """Faces looked at so far."""
         self._lift = lift
         self._rays = 0
+        self._open_sky = 0.0
         self._known = torch.zeros(count, dtype=torch.bool, device=corners.device)
         self._order = _curve_order(corners.mean(1)) if count else torch.empty(0, dtype=torch.int64, device=corners.device)
         self._corners = corners[self._order].contiguous()
@@ -285,9 +286,8 @@ class Horizons:
         """Places of the unknown ones among faces."""
         if starts is None:
             return self._scattered[:0]
-        asked = torch.zeros_like(self._known)
-        asked[self._place[starts[starts >= 0].long()]] = True
-        return torch.nonzero(asked & ~self._known).squeeze(-1)
+        places = self._place[starts[starts >= 0].long()]
+        return torch.unique(places[~self._known[places]])
 
     def _look_at(self, which: Tensor) -> None:
         """Faces at places along the curve."""
@@ -310,7 +310,9 @@ class Horizons:
             launch(raise_horizons_simd, len(which), [*corners, *lanes, self._lift], [warp_array(tangent)], device)
         tangent = tangent[which.long()]
         sine = tangent / torch.sqrt(1 + tangent.square().clamp(max=1e12)) + MARGIN
-        self.sine[self._order[which.long()]] = torch.where(tangent < float(STEEPEST), sine, BLOCKED)
+        sine = torch.where(tangent < float(STEEPEST), sine, BLOCKED)
+        self.sine[self._order[which.long()]] = sine
+        self._open_sky += float((1 - sine.square()).clamp(min=0).sum())
         self._known[which.long()] = True
         self.found += len(which)
 
@@ -319,7 +321,7 @@ class Horizons:
 
     def spared(self) -> float:
         """Share of cosine-weighted rays from the faces looked at that need no tracing (each face counting alike)."""
-        return float((1 - self.sine.square()).clamp(min=0).sum()) / self.found if self.found else 0.0  # unknown faces add 0
+        return self._open_sky / self.found if self.found else 0.0
 
 
 def usable_horizons(horizons: Horizons | None, blocked_share: float = 0.0) -> Tensor | None:

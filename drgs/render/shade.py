@@ -52,8 +52,8 @@ wp.set_module_options({"enable_backward": False})
 
 RAYS_A_BATCH = 65536
 """Rays of one CPU batch: its 4 MB of ray data stay in the cache between sampling, tracing and shading."""
-MIN_RAYS_A_BATCH = 16384
-"""Fewer are not cut up further to balance threads: launches cost about a millisecond a batch."""
+MIN_RAYS_A_BATCH = 8192
+"""Fewer are not cut up further to balance threads: launches cost half a millisecond a batch."""
 RAYS_A_BATCH_GPU = 1 << 23
 
 
@@ -376,14 +376,9 @@ def shade(
             device=warp_dev,
         )
 
-    if device.type == "cpu":
-        threads = 1 if in_thread_pool() else thread_count()
-        even = -(-point_count // (4 * threads)) if threads > 1 else point_count
-        even = max(even, MIN_RAYS_A_BATCH // counts.total)
-        batch_points = max(1, min(RAYS_A_BATCH // counts.total, even))
-    else:
-        batch_points = max(1, RAYS_A_BATCH_GPU // counts.total)
-    over_slices(point_count, device, batch, batch_points)
+    batch_points = max(1, (RAYS_A_BATCH if device.type == "cpu" else RAYS_A_BATCH_GPU) // counts.total)
+    shrinking = device.type == "cpu" and thread_count() > 1 and not in_thread_pool()
+    over_slices(point_count, device, batch, batch_points, max(1, MIN_RAYS_A_BATCH // counts.total) if shrinking else None)
     if memory is not None:
         memory.rays = kept
     return result

@@ -51,13 +51,26 @@ def _check_numbers(mesh: TriangleMesh) -> None:
         )
 
 
-def over_slices(count: int, device: torch.device, work: Callable[[int, int], object], slice_length: int | None = None) -> list:
-    """work(first, last) for slices of range(count): over the thread pool on the CPU; one after the other elsewhere, and in the pool."""
+def over_slices(
+    count: int, device: torch.device, work: Callable[[int, int], object], slice_length: int | None = None, shortest: int | None = None
+) -> list:
+    """work(first, last) for slices of range(count): over the thread pool on the CPU; one after the other elsewhere, and in the pool.
+
+    Args:
+        shortest: slices shrink towards the end down to this length, so that no thread waits long for another's last one; None: all alike.
+    """
     if count == 0:
         return []
-    slices = -(-count // (slice_length or (SLICE_RAYS if device.type == "cpu" else SLICE_RAYS_GPU)))
-    edges = [count * k // slices for k in range(slices + 1)]
-    if device.type != "cpu" or thread_count() == 1 or slices == 1 or in_thread_pool():
+    length = slice_length or (SLICE_RAYS if device.type == "cpu" else SLICE_RAYS_GPU)
+    if shortest is None:
+        slices = -(-count // length)
+        edges = [count * k // slices for k in range(slices + 1)]
+    else:
+        edges = [0]
+        while edges[-1] < count:
+            left = count - edges[-1]
+            edges.append(edges[-1] + min(left, length, max(shortest, left // (2 * thread_count()))))
+    if device.type != "cpu" or thread_count() == 1 or len(edges) == 2 or in_thread_pool():
         return [work(a, b) for a, b in pairwise(edges)]
     return [done.result() for done in [thread_pool().submit(work, a, b) for a, b in pairwise(edges)]]
 
