@@ -40,7 +40,10 @@ def main(source: str, out: str) -> None:
             inherit_mode_handling=ufbx.InheritModeHandling.HELPER_NODES,
         )
         arrays = read_scene(scene)
-    except (ufbx.UfbxError, ValueError) as error:
+    except ufbx.UfbxError as error:
+        print(f"is no FBX file, or a damaged one ({error})", file=sys.stderr)
+        leave(REFUSED)
+    except ValueError as error:
         print(error, file=sys.stderr)
         leave(REFUSED)
     np.savez(out, allow_pickle=False, **arrays)

@@ -109,6 +109,14 @@ def test_pivots_pre_rotations_and_geometric_transforms_place_a_node(ufbx, tmp_pa
     assert np.allclose(posed(writer, tmp_path), np.add(2 * local, [0, 5, 0]), atol=1e-12)
 
 
+def test_a_node_that_does_not_inherit_scale_keeps_its_size_though_not_its_place(ufbx, tmp_path):
+    writer = FbxWriter(unit_centimeters=100.0)
+    parent = writer.node("parent", Lcl_Scaling=(2, 3, 4), Lcl_Rotation=(0, 0, 90))
+    square(writer, parent, Lcl_Translation=(1, 1, 1), Lcl_Rotation=(0, 30, 0), InheritType=2)
+    expected = (SQUARE @ turned("y", 30).T + [2, 3, 4]) @ turned("z", 90).T
+    assert np.allclose(posed(writer, tmp_path), expected, atol=1e-12)
+
+
 def test_curves_turn_by_euler_angles_between_their_keys(ufbx, tmp_path):
     writer = FbxWriter(unit_centimeters=100.0)
     node, _ = square(writer)
@@ -187,7 +195,7 @@ def test_what_is_not_read_is_refused_by_name(ufbx, tmp_path):
 def test_a_damaged_file_is_refused_by_name(ufbx, tmp_path, content):
     path = tmp_path / "bad.fbx"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"bad\.fbx: \w+"):
+    with pytest.raises(ValueError, match=r"bad\.fbx: is no FBX file, or a damaged one \(\w+"):
         read_fbx_rig(path)
     with pytest.raises(ValueError, match=r"none\.fbx: does not exist"):
         read_fbx_rig(tmp_path / "none.fbx")
