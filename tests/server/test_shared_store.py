@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 from conftest import Service
 from painter import PaintedAsset, Painter
-from test_rest import exr, is_problem
+from test_rest import exr, is_problem, zipped
 
 from server.routes_assets import remove_deleted_assets
 from server.settings import Limits
 from tests.worker import store_server as servers
+from worker.artifacts import keep_job
 from worker.register_asset import register_asset
 
 ASSET = "a" * 32
@@ -104,4 +105,28 @@ def test_an_asset_deleted_for_good_leaves_the_store(pair: tuple[Service, Service
     add(first)
     assert first.client.delete(f"/api/assets/{ASSET}").status_code == 204
     assert remove_deleted_assets(first.context) == 1
+    assert s3.keys(first.settings.artifact_url.removeprefix(f"s3://{servers.BUCKET}/")) == []  # type: ignore[union-attr]
+
+
+def test_what_a_job_made_on_another_machine_is_listed_downloaded_and_deleted(
+    pair: tuple[Service, Service], s3: servers.StoreServer
+) -> None:
+    first, second = pair
+    job = first.client.post("/api/jobs", files={"file": ("mug.zip", zipped({"mug/transforms.json": b"{}"}))}).json()["id"]
+    folder = second.context.directory.job(job)
+    (folder / "files").mkdir(parents=True)
+    (folder / "files" / "asset-own-0000.png").write_bytes(b"picture")
+    (folder / "files" / "draft-asset.glb").write_bytes(b"half")
+    (folder / "log.txt").write_text("render: finished\n")
+    (folder / "preview.jpg").write_bytes(b"\xff\xd8")
+    keep_job(second.context.directory, job)
+    url = f"/api/jobs/{job}"
+    assert [found["name"] for found in first.client.get(f"{url}/files").json()["files"]] == ["asset-own-0000.png"]
+    assert first.client.get(f"{url}/files/asset-own-0000.png", headers={"Range": "bytes=1-3"}).content == b"ict"
+    assert first.client.get(f"{url}/log").text == "render: finished\n"
+    assert first.client.get(f"{url}/preview.jpg").content == b"\xff\xd8"
+    assert first.client.post(f"{url}/cancel").json()["state"] == "cancelled"
+    with s3.away():
+        assert "does not answer" in is_problem(first.client.delete(url), 503)
+    assert first.client.get(url).status_code == 200 and first.client.delete(url).status_code == 204
     assert s3.keys(first.settings.artifact_url.removeprefix(f"s3://{servers.BUCKET}/")) == []  # type: ignore[union-attr]
