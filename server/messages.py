@@ -96,7 +96,8 @@ class EditMessage(_Message):
     """Chosen by the client; the answer repeats it."""
     edit: Edit
     coalesce: Annotated[str, Field(max_length=100)] | None = None
-    """Edits of one slider drag share a key: an edit replaces the last one when keys match and they are < 500 ms apart."""
+    """Edits of one gesture, like the drag of a slider, share a key that no other has: an edit whose key is that of the newest change replaces
+    it. When a gesture ends is the client's to say: it sees the hand, and how late messages arrive tells nothing."""
     key: ClientKey | None = None
     """Unique in the session, and the same when the client sends this edit again because it lost the connection before the answer: it is
     then answered as before and not applied twice."""
@@ -130,7 +131,7 @@ class SpliceMessage(_Message):
     edits: list[Edit]
     """What comes in their place."""
     coalesce: Annotated[str, Field(max_length=100)] | None = None
-    """As of an edit: a splice with the key of the one just before it, < 500 ms earlier, is the same step of undo."""
+    """As of an edit: a splice with the key of the one just before it is the same step of undo."""
     key: ClientKey | None = None
     """As of an edit."""
 

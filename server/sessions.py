@@ -6,7 +6,6 @@ back from its log the next time somebody looks at it.
 
 import asyncio
 import re
-import time
 import uuid
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -23,12 +22,14 @@ from server import messages
 from server.edit_log import Change, EditLog, EventKind, Splice
 from server.environments import EnvironmentStore
 from server.metrics import Metrics
-from server.problems import ProblemError
+from server.problems import ProblemError, artifact_problem
 from server.render_session import AbstractLoadedAsset, AbstractRenderer
 from server.render_thread import RenderThread
 from server.settings import Limits
 from server.settle_memory import settle_memory
 from server.viewer import Posed, Viewer
+from worker.artifact_store import ArtifactError
+from worker.artifacts import has_clip
 from worker.asset_folder import folder_bytes
 from worker.data_directory import DataDirectory
 from worker.database import AssetRow, SessionEventRow, SessionRow, SnapshotRow, now
@@ -40,8 +41,6 @@ POSING_THREADS = 4
 """Sessions whose edits are posed at the same time; each session's own come one after the other."""
 
 _CLIP = re.compile(r"clips/[0-9a-f]{32}")
-COALESCE_SECONDS = 0.5
-"""Edits with the same key, closer together than this, are one step of undo."""
 
 
 class Overtaken(ProblemError):
@@ -74,12 +73,12 @@ class LiveSession:
     """None while the asset is not in memory; read by the render thread."""
     loaded: AbstractLoadedAsset | None = None
     viewers: set[Viewer] = field(default_factory=set)
-    listeners: set[Callable[[messages.EditLog], None]] = field(default_factory=set)
-    """Told of every change of the log."""
+    listeners: set[Callable[[str], None]] = field(default_factory=set)
+    """Given the stream's message about every change of the log."""
     keys: dict[str, int] = field(default_factory=dict)
     """Revision that each client key was answered with."""
     coalesce: str | None = None
-    coalesce_at: float = 0.0
+    """Of the newest change: the next one with the same key belongs to the same gesture."""
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     """Held while the log changes: edits are applied in the order in which they came."""
 
@@ -288,15 +287,18 @@ class SessionRegistry:
             ProblemError: a sentence; the log is as before.
         """
         for edit in _edits_of(change):
-            self.check_edit(edit)
+            if isinstance(edit, PoseEdit):  # may have to be fetched
+                await asyncio.to_thread(self.check_edit, edit)
+            else:
+                self.check_edit(edit)
         async with session.lock:
             if key is not None and key in session.keys:
                 return Applied(session.keys[key], session.log.message())
             posed = await self._load(session)
             if revision is not None and revision != session.log.revision:
                 raise Overtaken(session.log.revision, revision)
-            same_drag = coalesce is not None and coalesce == session.coalesce and time.monotonic() - session.coalesce_at < COALESCE_SECONDS
-            if kind in ("edit", "splice") and change is not None and same_drag and session.log.can_replace(change):
+            same_gesture = coalesce is not None and coalesce == session.coalesce
+            if kind in ("edit", "splice") and change is not None and same_gesture and session.log.can_replace(change):
                 kind = "replace"
             try:
                 log = session.log.after(kind, change)
@@ -315,14 +317,16 @@ class SessionRegistry:
             if key is not None:
                 session.keys[key] = log.revision
             session.log, session.posed = log, Posed(log.revision, pose)
-            session.coalesce, session.coalesce_at = coalesce, time.monotonic()
+            session.coalesce = coalesce
         for viewer in session.viewers:
             viewer.scene_changed()
         self._thread.wake()
         self._metrics.add("drgs_edits_total", kind=kind)
         message = log.message()
-        for listener in list(session.listeners):
-            listener(message)
+        if session.listeners:
+            state = messages.StateMessage(log=message).model_dump_json()  # once for all: a long log takes milliseconds
+            for listener in list(session.listeners):
+                listener(state)
         return Applied(log.revision, message)
 
     def _store(self, session_id: str, revision: int, kind: str, change: Change | None, key: str | None) -> None:
@@ -417,10 +421,14 @@ class SessionRegistry:
             raise ProblemError(
                 422, "A deform edit over the network has a `map` or `handles`; `vertices` names a file and works with `drgs render` only."
             )
-        if isinstance(edit, PoseEdit) and not (
-            _CLIP.fullmatch(edit.clip) and (self._directory.environments / edit.clip / "clip.json").is_file()
-        ):
+        if isinstance(edit, PoseEdit) and not self._has_clip(edit.clip):
             raise ProblemError(422, f"There is no clip {edit.clip[:100]!r}; a simulate job that is done names its clip.")
+
+    def _has_clip(self, clip: str) -> bool:
+        try:
+            return _CLIP.fullmatch(clip) is not None and has_clip(self._directory, clip)
+        except ArtifactError as error:
+            raise artifact_problem(error) from error
 
 
 def _edits_of(change: Change | None) -> Sequence[Edit]:

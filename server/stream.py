@@ -33,7 +33,6 @@ from server.messages import (
     SettingsMessage,
     SkippedWork,
     SpliceMessage,
-    StateMessage,
     StatusMessage,
     UndoMessage,
     VisibilityMessage,
@@ -141,7 +140,7 @@ class Connection:
             )
         )
         session.viewers.add(self.viewer)
-        session.listeners.add(self._log_changed)
+        session.listeners.add(self._enqueue)
         self._context.connections[self.viewer] = self
         thread.add(self.viewer)
         try:
@@ -156,7 +155,7 @@ class Connection:
         finally:
             thread.remove(self.viewer)
             session.viewers.discard(self.viewer)
-            session.listeners.discard(self._log_changed)
+            session.listeners.discard(self._enqueue)
             self._context.connections.pop(self.viewer, None)
         with suppress(WebSocketDisconnect, RuntimeError):
             await self._socket.close(CLOSE_POLICY if self._overrun.is_set() or self._bad_messages >= MAX_BAD_MESSAGES else 1000)
@@ -181,9 +180,6 @@ class Connection:
         self._outgoing.put_nowait(out)
         if self._outgoing.qsize() > MAX_WAITING_MESSAGES:
             self._overrun.set()
-
-    def _log_changed(self, log: messages.EditLog) -> None:
-        self._say(StateMessage(log=log))
 
     async def _write(self) -> None:
         with suppress(WebSocketDisconnect, RuntimeError):

@@ -75,9 +75,10 @@ class RunningServer:
     def address(self) -> str:
         return f"http://127.0.0.1:{self.port}"
 
-    def ask(self, path: str) -> dict:
-        """GET with the token, as a script would."""
-        request = urllib.request.Request(self.address + path, headers={"Authorization": f"Bearer {self.token}"})
+    def ask(self, path: str, body: dict | None = None) -> dict:
+        """GET with the token, as a script would; POST where there is a body."""
+        headers = {"Authorization": f"Bearer {self.token}", "Content-Type": "application/json"}
+        request = urllib.request.Request(self.address + path, None if body is None else json.dumps(body).encode(), headers)
         with urllib.request.urlopen(request, timeout=20) as answer:
             return json.load(answer)
 

@@ -33,9 +33,15 @@ class Viewer:
 
     def session(self) -> dict:
         """What the server says of the open session."""
+        return self.server.ask(self.session_path())
+
+    def append_edit(self, edit: dict) -> None:
+        """To the open session, as somebody else would."""
+        self.server.ask(f"{self.session_path()}/edits", {"edit": edit})
+
+    def session_path(self) -> str:
         asset = self.page.evaluate("new URLSearchParams(location.hash.slice(1)).get('asset')")
-        session = self.page.evaluate(f"localStorage.getItem('drgs.session.{asset}')")
-        return self.server.ask(f"/api/sessions/{session}")
+        return "/api/sessions/" + self.page.evaluate(f"localStorage.getItem('drgs.session.{asset}')")
 
     def open_tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()

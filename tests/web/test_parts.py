@@ -90,6 +90,18 @@ def test_reset_takes_that_value_back_and_nothing_else(ball: Viewer) -> None:
     wait_until(lambda: any(edit["set"].get("roughness") == 0.1 for edit in ball.edits()), "roughness again")
 
 
+def test_what_is_being_typed_stays_while_news_of_the_value_arrives(ball: Viewer) -> None:
+    field = ball.page.get_by_label("Metallic, exact value")
+    field.fill("0.75")
+    # Somebody else who looks at the same session.
+    edit = {"op": "material", "select": {"all": True}, "set": {"roughness": 0.3}, "mode": "absolute"}
+    ball.append_edit(edit)
+    expect(ball.page.get_by_label("Roughness, exact value")).to_have_value("0.30", timeout=30_000)
+    expect(field).to_have_value("0.75")
+    field.press("Enter")
+    wait_until(lambda: ball.edits()[-1]["set"].get("metallic") == 0.75, "what was typed in the log")
+
+
 def test_multiplying_keeps_what_was_captured_apart(ball: Viewer) -> None:
     ball.page.get_by_role("radio", name="Multiply", exact=True).check()
     type_number(ball, "Roughness", "0.5")

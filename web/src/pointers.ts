@@ -1,7 +1,7 @@
 /** What mouse, pen, fingers and arrow keys do to the picture, beside what camera-controls does by itself. */
 
 import CameraControls from 'camera-controls';
-import { editLight } from './session';
+import { editLight, newKey } from './session';
 import { flying, light, tool } from './state';
 
 const DEGREES_PER_PIXEL = 0.4;
@@ -21,7 +21,7 @@ export interface PointerActions {
 
 export function listenToPointers(stage: HTMLElement, controls: CameraControls, on: PointerActions): void {
   const { ACTION } = CameraControls;
-  let turning: { pointer: number; x: number; rotation: number } | null = null;
+  let turning: { pointer: number; x: number; rotation: number; key: string } | null = null;
   let pressed: { pointer: number; x: number; y: number; at: number } | null = null;
   let painting: number | null = null;
   stage.addEventListener(
@@ -34,7 +34,7 @@ export function listenToPointers(stage: HTMLElement, controls: CameraControls, o
       if (painting !== null) stage.setPointerCapture(event.pointerId);
       controls.mouseButtons.middle = event.shiftKey ? ACTION.TRUCK : event.ctrlKey ? ACTION.DOLLY : ACTION.ROTATE;
       if (!turns) return;
-      turning = { pointer: event.pointerId, x: event.clientX, rotation: light.value.rotation };
+      turning = { pointer: event.pointerId, x: event.clientX, rotation: light.value.rotation, key: newKey() };
       stage.setPointerCapture(event.pointerId);
       event.preventDefault();
     },
@@ -44,7 +44,7 @@ export function listenToPointers(stage: HTMLElement, controls: CameraControls, o
     if (event.pointerId === painting) on.paint(event);
     if (!turning || event.pointerId !== turning.pointer) return;
     const degrees = turning.rotation + (event.clientX - turning.x) * DEGREES_PER_PIXEL;
-    editLight({ rotation: Math.round((((degrees % 360) + 360) % 360) * 10) / 10 });
+    editLight({ rotation: Math.round((((degrees % 360) + 360) % 360) * 10) / 10 }, turning.key);
   });
   const release = () => {
     turning = painting = pressed = null;

@@ -170,7 +170,10 @@ export interface EditMessage {
   /** Chosen by the client; the answer repeats it. */
   id: number;
   edit: Edit;
-  /** Edits of one slider drag share a key: an edit replaces the last one when keys match and they are < 500 ms apart. */
+  /**
+   * Edits of one gesture, like the drag of a slider, share a key that no other has: an edit whose key is that of the newest change replaces
+   * it. When a gesture ends is the client's to say: it sees the hand, and how late messages arrive tells nothing.
+   */
   coalesce?: string | null;
   /**
    * Unique in the session, and the same when the client sends this edit again because it lost the connection before the answer: it is
@@ -608,7 +611,7 @@ export interface SpliceMessage {
   remove: number;
   /** What comes in their place. */
   edits: Edit[];
-  /** As of an edit: a splice with the key of the one just before it, < 500 ms earlier, is the same step of undo. */
+  /** As of an edit: a splice with the key of the one just before it is the same step of undo. */
   coalesce?: string | null;
   /** As of an edit. */
   key?: string | null;

@@ -7,8 +7,10 @@ import type { Edit, EditLog, FrameHeader, MaterialValues, PickedMessage, ServerH
 import { attempt, connection, draft, edits, EVERYTHING, flash, light, log, mesh, mode, notify, pending, selection, session, settings, status, tool } from './state';
 import { Stream } from './stream';
 
-/** Edits of one drag go out at most this often; the server makes one undo step of those that share a key. */
+/** Edits of one gesture go out at most this often; the server makes one undo step of those that share a key. */
 const DRAG_INTERVAL_MS = 40;
+/** Changes of the same value that are closer together than this are one gesture. */
+const GESTURE_MS = 500;
 
 let stream: Stream | null = null;
 let helloListener: ((hello: ServerHello) => void) | null = null;
@@ -151,11 +153,24 @@ function takeLog(next: EditLog): void {
 
 // ---- edits -------------------------------------------------------------------------------------------------------------
 
-interface Drag {
-  timer: number;
+interface Flow {
   next: Edit | null;
+  key: string;
 }
-const drags = new Map<string, Drag>();
+const flows = new Map<string, Flow>();
+
+let gesture = { name: '', key: '', at: -Infinity };
+
+/** The same key for as long as the same thing is changed without a pause. */
+export function keyOfGesture(name: string): string {
+  const at = performance.now();
+  const goesOn = name === gesture.name && at - gesture.at < GESTURE_MS;
+  gesture = { name, key: goesOn ? gesture.key : newKey(), at };
+  return gesture.key;
+}
+
+/** That of no other gesture, of no other page. */
+export const newKey = () => crypto.getRandomValues(new Uint32Array(3)).join('-');
 
 function send(edit: Edit, coalesce: string | null): void {
   if (!stream) return;
@@ -165,22 +180,25 @@ function send(edit: Edit, coalesce: string | null): void {
   pending.value = [...pending.value, { id, edit, revision: null }];
 }
 
-/** Send now, or, while edits of this key are flowing, the newest of them every DRAG_INTERVAL_MS. */
-function sendFlowing(key: string, edit: Edit): void {
-  const drag = drags.get(key);
-  if (drag) {
-    drag.next = edit;
+/** Send now, or, while edits of this name are flowing, the newest of them every DRAG_INTERVAL_MS. */
+function sendFlowing(name: string, edit: Edit, key = keyOfGesture(name)): void {
+  const flowing = flows.get(name);
+  if (flowing) {
+    // The last one of a gesture that is over has its own place in the log.
+    if (flowing.next && flowing.key !== key) send(flowing.next, flowing.key);
+    flowing.next = edit;
+    flowing.key = key;
     return;
   }
-  const flow: Drag = { timer: 0, next: edit };
-  drags.set(key, flow);
+  const flow: Flow = { next: edit, key };
+  flows.set(name, flow);
   const step = () => {
-    if (splicing) flow.timer = window.setTimeout(step, DRAG_INTERVAL_MS);
-    else if (flow.next) {
-      send(flow.next, key);
+    if (!splicing && !flow.next) return void flows.delete(name);
+    if (!splicing && flow.next) {
+      send(flow.next, flow.key);
       flow.next = null;
-      flow.timer = window.setTimeout(step, DRAG_INTERVAL_MS);
-    } else drags.delete(key);
+    }
+    window.setTimeout(step, DRAG_INTERVAL_MS);
   };
   step();
 }
@@ -201,8 +219,9 @@ export function resetMaterial(key: keyof MaterialValues): void {
   replaceEdits(withoutValue(edits.value, selection.value, key));
 }
 
-export function editLight(change: Partial<Light>): void {
-  sendFlowing(`light.${Object.keys(change).join('+')}`, environmentEdit({ ...light.value, ...change }));
+/** `key`: of a gesture that lasts until the hand lets go, however slowly it moves. */
+export function editLight(change: Partial<Light>, key?: string): void {
+  sendFlowing(`light.${Object.keys(change).join('+')}`, environmentEdit({ ...light.value, ...change }), key);
 }
 
 /** The asset's own environment again. An edit without a file keeps the one in force, so those that named one must go. */
@@ -215,11 +234,11 @@ export function useCapturedLight(): void {
 export const isTwin = (edit: Edit) => (other: Edit) => edit.op === 'deform' && other.op === 'deform' && edit.map != null && edit.map.type === other.map?.type;
 
 let nextTime: Edit | null = null;
+let timeKey = '';
 
-export const timeKey = (edit: Edit) => `time.${edit.op}`;
-
-/** Another moment of what moves, in place of the last one: a film that plays on is one step of undo. Moments that the server has no time for are left out. */
-export function editTime(edit: Edit): void {
+/** Another moment of what moves, in place of the last one; with one key, a film is one step of undo. Moments that the server has no time for are left out. */
+export function editTime(edit: Edit, key: string): void {
+  timeKey = key;
   const waits = nextTime !== null;
   nextTime = edit;
   if (!splicing) playNext();
@@ -229,7 +248,7 @@ export function editTime(edit: Edit): void {
 function playNext(): void {
   const edit = nextTime;
   nextTime = null;
-  if (edit) replaceEdits(withReplaced(edits.value, edit, (other) => other.op === edit.op), timeKey(edit));
+  if (edit) replaceEdits(withReplaced(edits.value, edit, (other) => other.op === edit.op), timeKey);
 }
 
 // ---- edits that take an earlier one's place ------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 import { computed, effect, signal } from '@preact/signals';
 import { startJob } from '../jobs';
 import type { Edit, PoseEdit, SimulateEdit } from '../protocol.gen';
-import { editTime, replaceEdits, timeKey } from '../session';
+import { editTime, keyOfGesture, newKey, replaceEdits } from '../session';
 import { clipSeconds, draft, edits, jobs, pending, session } from '../state';
 import { Choice, Section, Slider, Switch } from './fields';
 
@@ -37,9 +37,13 @@ function sceneOf(height: number, foot: number): Record<string, unknown> {
   return { matter, floor: ground, duration: seconds.value, fps: FPS, particles: fine.value ? PARTICLES.fine : PARTICLES.quick };
 }
 
+/** One for each film: however slowly it plays, undo takes it away in one step. */
+let film = newKey();
+
 /** From the first moment on, in place of whatever moved before. */
 function start(edit: Moving): void {
-  replaceEdits([...edits.value.filter((other) => !moves(other)), edit], timeKey(edit));
+  film = newKey();
+  replaceEdits([...edits.value.filter((other) => !moves(other)), edit], film);
   playing.value = true;
 }
 
@@ -67,14 +71,14 @@ effect(() => {
     before = now;
     const length = durationOf(edit);
     if (edit.time + step > length && !loop.value) playing.value = false;
-    seek(edit, playing.value ? (edit.time + step) % length : length);
+    seek(edit, playing.value ? (edit.time + step) % length : length, film);
   }, 1000 / FPS);
   return () => clearInterval(timer);
 });
 
-function seek(edit: Moving, time: number): void {
+function seek(edit: Moving, time: number, key: string): void {
   const next: Edit = { ...edit, time: Math.round(time * 1000) / 1000 };
-  editTime(next);
+  editTime(next, key);
 }
 
 export function Simulation({ height, foot }: { height: number; foot: number }) {
@@ -121,7 +125,7 @@ export function Simulation({ height, foot }: { height: number; foot: number }) {
       {edit && (
         <div class="timeline" role="group" aria-label="Timeline">
           <button onClick={() => (playing.value = !playing.value)}>{playing.value ? 'Pause' : 'Play'}</button>
-          <Slider label="Time" unit="s" value={edit.time} min={0} max={durationOf(edit)} step={0.01} onChange={(value) => { playing.value = false; seek(edit, value); }} />
+          <Slider label="Time" unit="s" value={edit.time} min={0} max={durationOf(edit)} step={0.01} onChange={(value) => { playing.value = false; seek(edit, value, keyOfGesture('time')); }} />
           <Choice label="Speed" value={speed.value} options={['0.25', '0.5', '1'].map((value) => ({ value, text: `${value}×` }))} onChange={(value) => (speed.value = value)} />
           <Switch label="Loop" value={loop.value} onChange={(value) => (loop.value = value)} />
         </div>

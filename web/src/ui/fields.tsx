@@ -1,7 +1,7 @@
 /** Form pieces that every panel uses. While a value is dragged they show the dragged value, not the echo of the server. */
 
 import { useState } from 'preact/hooks';
-import type { ComponentChildren } from 'preact';
+import type { ComponentChildren, InputHTMLAttributes } from 'preact';
 import { hexFromLinear, linearFromHex, type Triple } from '../color';
 import { Icon } from './icons';
 
@@ -11,6 +11,28 @@ export function Section({ title, children, open = true }: { title: string; child
       <summary>{title}</summary>
       <div class="section-body">{children}</div>
     </details>
+  );
+}
+
+type EntryProps = { type: 'text' | 'number'; value: string | number; onEnter(text: string): void } & Pick<
+  InputHTMLAttributes,
+  'class' | 'min' | 'max' | 'step' | 'title' | 'spellcheck' | 'maxLength' | 'aria-label' | 'aria-invalid'
+>;
+
+/** A text or a number that counts once it is entered. What is being typed stays, whatever news of the value arrives meanwhile. */
+function Entry({ value, onEnter, ...attributes }: EntryProps) {
+  const [typed, setTyped] = useState<string | null>(null);
+  return (
+    <input
+      {...(attributes as object)}
+      value={typed ?? value}
+      onInput={(event) => setTyped(event.currentTarget.value)}
+      onChange={(event) => {
+        setTyped(null);
+        onEnter(event.currentTarget.value);
+      }}
+      onBlur={() => setTyped(null)}
+    />
   );
 }
 
@@ -67,14 +89,14 @@ export function Slider({ label, value, min, max, step, unit, logarithmic, unset,
         onDblClick={onReset}
       />
       <span class="number">
-        <input
+        <Entry
           type="number"
           aria-label={`${label}, exact value`}
           min={logarithmic ? 10 ** min : min}
           max={logarithmic ? 10 ** max : max}
           step={logarithmic ? 'any' : step}
           value={logarithmic ? Number((10 ** shown).toPrecision(2)) : shown.toFixed(digits)}
-          onChange={(event) => set(event.currentTarget.value)}
+          onEnter={set}
         />
         {unit && <span class="unit">{unit}</span>}
       </span>
@@ -118,13 +140,13 @@ export function ColorField({ label, value, unset, onChange, onCommit, onReset }:
       <div class="field">
         <label for="color-picker">{label}</label>
         <input id="color-picker" type="color" value={hex} onInput={(event) => takeHex(event.currentTarget.value)} onChange={onCommit} />
-        <input class="hex" type="text" aria-label={`${label}, sRGB hex`} aria-invalid={wrongHex} spellcheck={false} maxLength={7} value={hex} onChange={(event) => typeHex(event.currentTarget.value)} />
+        <Entry class="hex" type="text" aria-label={`${label}, sRGB hex`} aria-invalid={wrongHex} spellcheck={false} maxLength={7} value={hex} onEnter={typeHex} />
         <ResetButton label={label} onReset={onReset} />
       </div>
       <div class="field linear">
         <span class="label">Linear</span>
         {(['Red', 'Green', 'Blue'] as const).map((name, i) => (
-          <input
+          <Entry
             type="number"
             aria-label={`${label}, linear ${name.toLowerCase()}`}
             title={name}
@@ -132,9 +154,9 @@ export function ColorField({ label, value, unset, onChange, onCommit, onReset }:
             max={1}
             step={0.01}
             value={value[i]!.toFixed(3)}
-            onChange={(event) => {
-              const number = event.currentTarget.valueAsNumber;
-              if (!Number.isFinite(number)) return;
+            onEnter={(text) => {
+              const number = Number(text);
+              if (text.trim() === '' || !Number.isFinite(number)) return;
               onChange(value.map((old, k) => (k === i ? clamp(number, 0, 1) : old)) as Triple);
               onCommit?.();
             }}
