@@ -71,6 +71,11 @@ def warp_array(tensor: Tensor, dtype: Any = None) -> wp.array:
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 
 
+def warp_view(tensor: Tensor, dtype: Any = None) -> wp.array:
+    """A Warp array on a tensor's memory as it lies there, part of a larger one or not; trailing dimensions as in warp_array must be whole."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
 def warp_device(tensor: Tensor) -> Any:
     """Warp's device of a tensor."""
     return wp.device_from_torch(tensor.device)

@@ -1,11 +1,18 @@
-"""Slow torch twin of drgs/render/denoise.py's two kernels on whole maps; the specification of the kernels."""
+"""Slow torch twin of drgs/render/denoise.py on whole maps; the specification of its kernels."""
 
 import torch
 from torch import Tensor
 
+from drgs.maths.brdf import f0_from_base
 from drgs.maths.color import luminance
-from drgs.render.denoise import NEIGHBOUR_VARIANCE, NORMAL_POWER, SIGMA_LUMINANCE, SIGMA_PLANE
+from drgs.render.denoise import MIN_REFLECTANCE, NEIGHBOUR_VARIANCE, NORMAL_POWER, SIGMA_LUMINANCE, SIGMA_PLANE
 from drgs.render.records import GBuffer
+
+
+def reflectances(gbuffer: GBuffer) -> tuple[Tensor, Tensor]:
+    """(height, width, 3) factors of the diffuse and the specular part that textures carry."""
+    diffuse = (1 - gbuffer.metallic)[..., None] * gbuffer.albedo
+    return diffuse.clamp(min=MIN_REFLECTANCE), f0_from_base(gbuffer.albedo, gbuffer.metallic).clamp(min=MIN_REFLECTANCE)
 
 
 def shifted(values: Tensor, dx: int, dy: int) -> Tensor:

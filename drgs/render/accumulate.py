@@ -186,7 +186,8 @@ def start_frame(
         return _continued(replace(previous, scene=scene, settings=settings, **parts), factor)
     memory = RayMemory(writes=changed != {"camera"}) if previous is None or "first_rays" in make else RayMemory(previous.memory.rays)
     pixels, device = camera.width * camera.height, seen.device
-    numbers = [torch.zeros(pixels, *tail, device=device) for tail in ((3,), (3,), (), (), (), (3,), ())]
+    # Memory is taken by the first pass, which copies them.
+    numbers = [torch.zeros(1, *tail, device=device).expand(pixels, *tail) for tail in ((3,), (3,), (), (), (), (3,), ())]
     surface = torch.zeros(pixels if mesh_seen else 1, 15, device=device).expand(pixels, 15)
     history = frame_history(previous) if previous is not None and changed == {"camera"} and settings.denoise != "none" else None
     tile_passes = torch.zeros(across * down, dtype=torch.int64, device=device)

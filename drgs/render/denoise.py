@@ -18,10 +18,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from drgs.maths.brdf import f0_from_base
 from drgs.render.records import GBuffer, Radiance
 from drgs.scene.camera import Camera
-from drgs.warp_torch import launch, warp_array, warp_device
+from drgs.warp_torch import launch, warp_array, warp_device, warp_view
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,7 +37,7 @@ NEIGHBOUR_VARIANCE = 0.25
 """Share of the neighbour's variance in the standard deviation. At 0 dark pixels, whose variance is underestimated, refuse
 bright neighbours that do not refuse them, and the picture darkens (teapot under lamps, 32 samples: -3.3 % at 26.4 dB, with 0.25 and
 SIGMA_LUMINANCE 2: -2.3 % at 26.6 dB); at 1 it keeps its energy but spreads outliers (-1.5 %, 26.3 dB)."""
-MIN_REFLECTANCE = 0.02
+MIN_REFLECTANCE = wp.constant(0.02)
 """Division by darker textures would only amplify noise."""
 
 
@@ -147,13 +146,7 @@ def filter_level(
     )
 
 
-def reflectances(gbuffer: GBuffer) -> tuple[Tensor, Tensor]:
-    """(height, width, 3) factors of the diffuse and the specular part that textures carry."""
-    diffuse = (1 - gbuffer.metallic)[..., None] * gbuffer.albedo
-    return diffuse.clamp(min=MIN_REFLECTANCE), f0_from_base(gbuffer.albedo, gbuffer.metallic).clamp(min=MIN_REFLECTANCE)
-
-
-PAD = 32
+PAD = wp.constant(32)
 """Empty pixels at both ends of a row: as far as the widest kernel reaches."""
 
 
@@ -261,21 +254,17 @@ def filter_maps_simd(maps: Maps, gbuffer: GBuffer, footprint: float, levels: int
     height, width = gbuffer.coverage.shape
     columns = -(-width // 16) * 16
     pitch = columns + 2 * PAD
-
-    def planes(*values: Tensor) -> Tensor:
-        """(plane, height, pitch)."""
-        count = sum(1 if v.dim() == 2 else v.shape[-1] for v in values)
-        result = torch.zeros(count, height, pitch)
-        at = 0
-        for v in values:
-            size = 1 if v.dim() == 2 else v.shape[-1]
-            result[at : at + size, :, PAD : PAD + width] = v[None] if v.dim() == 2 else v.permute(2, 0, 1)
-            at += size
-        return result
-
-    depth = torch.where(torch.isfinite(gbuffer.depth), gbuffer.depth, 0.0)
-    guides = planes(gbuffer.coverage, footprint * depth, gbuffer.position_world, gbuffer.normal_world)
-    source = planes(*maps)
+    guides, source = torch.zeros(8, height, pitch), torch.zeros(8, height, pitch)
+    launch(
+        lay_in_planes,
+        height * width,
+        [
+            width, footprint, warp_view(gbuffer.coverage), warp_view(gbuffer.depth), warp_view(gbuffer.position_world, wp.vec3),
+            warp_view(gbuffer.normal_world, wp.vec3), warp_view(maps[0], wp.vec3), warp_view(maps[1], wp.vec3), warp_view(maps[2], wp.vec2),
+        ],
+        [warp_array(guides), warp_array(source)],
+        "cpu",
+    )  # fmt: skip
     target, smooth = torch.zeros_like(source), torch.zeros(2, height, pitch)
     full = (guides[0, :, PAD : PAD + columns].reshape(height, -1, 16) > 0).any(-1).nonzero()
     groups = warp_array((full[:, 0] * pitch + PAD + 16 * full[:, 1]).int())
@@ -291,24 +280,147 @@ def filter_maps_simd(maps: Maps, gbuffer: GBuffer, footprint: float, levels: int
     return inside[..., :3], inside[..., 3:6], inside[..., 6:]
 
 
-def denoise_svgf(radiance: Radiance, gbuffer: GBuffer, camera: Camera) -> Radiance:
-    """The spatial filter; radiance must carry the variances of both parts."""
+@wp.kernel
+def lay_in_planes(
+    first: int,
+    width: int,
+    footprint: float,
+    coverage: wp.array2d[float],
+    depth: wp.array2d[float],
+    position: wp.array2d[wp.vec3],
+    normal: wp.array2d[wp.vec3],
+    diffuse: wp.array2d[wp.vec3],
+    specular: wp.array2d[wp.vec3],
+    variance: wp.array2d[wp.vec2],
+    # outputs
+    guides: wp.array3d[float],
+    source: wp.array3d[float],
+):
+    """Maps as denoise.h wants them; what is not covered stays 0."""
+    i = first + wp.tid()
+    y = i / width
+    x = i - y * width
+    if coverage[y, x] <= 0.0:
+        return
+    at = x + PAD
+    guides[0, y, at] = coverage[y, x]
+    guides[1, y, at] = footprint * depth[y, x]
+    for k in range(3):
+        guides[2 + k, y, at] = position[y, x][k]
+        guides[5 + k, y, at] = normal[y, x][k]
+        source[k, y, at] = diffuse[y, x][k]
+        source[3 + k, y, at] = specular[y, x][k]
+    source[6, y, at] = variance[y, x][0]
+    source[7, y, at] = variance[y, x][1]
+
+
+@wp.func
+def diffuse_reflectance(albedo: wp.vec3, metallic: float) -> wp.vec3:
+    return wp.max((1.0 - metallic) * albedo, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
+
+
+@wp.func
+def specular_reflectance(albedo: wp.vec3, metallic: float) -> wp.vec3:
+    f0 = metallic * albedo + wp.vec3(0.04, 0.04, 0.04) * (1.0 - metallic)
+    return wp.max(f0, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
+
+
+@wp.func
+def mean_square(v: wp.vec3) -> float:
+    return wp.dot(v, v) / 3.0
+
+
+@wp.kernel
+def take_reflectance_out(
+    first: int,
+    width: int,
+    albedo: wp.array2d[wp.vec3],
+    metallic: wp.array2d[float],
+    diffuse: wp.array2d[wp.vec3],
+    specular: wp.array2d[wp.vec3],
+    diffuse_variance: wp.array2d[float],
+    specular_variance: wp.array2d[float],
+    # outputs
+    diffuse_out: wp.array2d[wp.vec3],
+    specular_out: wp.array2d[wp.vec3],
+    variance_out: wp.array2d[wp.vec2],
+):
+    i = first + wp.tid()
+    y = i / width
+    x = i - y * width
+    d = diffuse_reflectance(albedo[y, x], metallic[y, x])
+    s = specular_reflectance(albedo[y, x], metallic[y, x])
+    diffuse_out[y, x] = wp.cw_div(diffuse[y, x], d)
+    specular_out[y, x] = wp.cw_div(specular[y, x], s)
+    variance_out[y, x] = wp.vec2(diffuse_variance[y, x] / mean_square(d), specular_variance[y, x] / mean_square(s))
+
+
+@wp.kernel
+def put_reflectance_in(
+    first: int,
+    width: int,
+    albedo: wp.array2d[wp.vec3],
+    metallic: wp.array2d[float],
+    diffuse: wp.array3d[float],
+    specular: wp.array3d[float],
+    variance: wp.array3d[float],
+    # outputs
+    diffuse_out: wp.array2d[wp.vec3],
+    specular_out: wp.array2d[wp.vec3],
+    diffuse_variance: wp.array2d[float],
+    specular_variance: wp.array2d[float],
+):
+    i = first + wp.tid()
+    y = i / width
+    x = i - y * width
+    d = diffuse_reflectance(albedo[y, x], metallic[y, x])
+    s = specular_reflectance(albedo[y, x], metallic[y, x])
+    diffuse_out[y, x] = wp.cw_mul(wp.vec3(diffuse[y, x, 0], diffuse[y, x, 1], diffuse[y, x, 2]), d)
+    specular_out[y, x] = wp.cw_mul(wp.vec3(specular[y, x, 0], specular[y, x, 1], specular[y, x, 2]), s)
+    diffuse_variance[y, x] = variance[y, x, 0] * mean_square(d)
+    specular_variance[y, x] = variance[y, x, 1] * mean_square(s)
+
+
+def without_reflectance(radiance: Radiance, gbuffer: GBuffer) -> Maps:
+    """Both parts over what textures carry, and the variance of their luminance.
+
+    Raises:
+        ValueError: the radiance carries no variance of its parts.
+    """
     if radiance.diffuse_variance is None or radiance.specular_variance is None:
         raise ValueError("denoising needs the variance of the diffuse and specular part; this radiance carries none")
-    factors = reflectances(gbuffer)
-    squares = [f.square().mean(-1) for f in factors]
-    variance = torch.stack([radiance.diffuse_variance / squares[0], radiance.specular_variance / squares[1]], -1)
+    height, width = gbuffer.coverage.shape
+    maps = tuple(radiance.diffuse.new_empty(height, width, channels) for channels in (3, 3, 2))
+    launch(
+        take_reflectance_out,
+        height * width,
+        [
+            width, warp_view(gbuffer.albedo, wp.vec3), warp_view(gbuffer.metallic), warp_view(radiance.diffuse, wp.vec3),
+            warp_view(radiance.specular, wp.vec3), warp_view(radiance.diffuse_variance), warp_view(radiance.specular_variance),
+        ],
+        [warp_array(maps[0], wp.vec3), warp_array(maps[1], wp.vec3), warp_array(maps[2], wp.vec2)],
+        warp_device(maps[0]),
+    )  # fmt: skip
+    return maps
+
+
+def denoise_svgf(radiance: Radiance, gbuffer: GBuffer, camera: Camera) -> Radiance:
+    """The spatial filter; radiance must carry the variances of both parts."""
+    maps = without_reflectance(radiance, gbuffer)
     filter_all = filter_maps if gbuffer.coverage.is_cuda else filter_maps_simd
     footprint = 1.0 / float(camera.intrinsics[0, 0])  # of a pixel at distance 1
-    maps = (radiance.diffuse / factors[0], radiance.specular / factors[1], variance)
-    diffuse, specular, variance = filter_all(maps, gbuffer, footprint, levels_for(radiance.samples))
-    return replace(
-        radiance,
-        diffuse=diffuse * factors[0],
-        specular=specular * factors[1],
-        diffuse_variance=variance[..., 0] * squares[0],
-        specular_variance=variance[..., 1] * squares[1],
+    filtered = filter_all(maps, gbuffer, footprint, levels_for(radiance.samples))
+    height, width = gbuffer.coverage.shape
+    shown = [torch.empty_like(maps[0]) for _ in range(2)]
+    variances = [shown[0].new_empty(height, width) for _ in range(2)]
+    launch(
+        put_reflectance_in,
+        height * width,
+        [width, warp_view(gbuffer.albedo, wp.vec3), warp_view(gbuffer.metallic), *(warp_view(values) for values in filtered)],
+        [*(warp_array(values, wp.vec3) for values in shown), *(warp_array(values) for values in variances)],
+        warp_device(maps[0]),
     )
+    return replace(radiance, diffuse=shown[0], specular=shown[1], diffuse_variance=variances[0], specular_variance=variances[1])
 
 
 def denoise(radiance: Radiance, gbuffer: GBuffer, camera: Camera, method: Literal["none", "svgf", "oidn"]) -> Radiance:

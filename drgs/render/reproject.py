@@ -21,16 +21,16 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.render.denoise import reflectances
+from drgs.render.denoise import diffuse_reflectance, mean_square, specular_reflectance, without_reflectance
 from drgs.render.records import GBuffer, Radiance
 from drgs.scene.camera import Camera
-from drgs.warp_torch import launch, warp_array, warp_device
+from drgs.warp_torch import launch, warp_array, warp_device, warp_view
 
 wp.set_module_options({"enable_backward": False})
 
 MOST_SAMPLES = 64.0
 """What a pixel's history is worth at most [samples]: more would let old errors live long."""
-FADE_SAMPLES = 256.0
+FADE_SAMPLES = wp.constant(256.0)
 """A frame's own samples after which history counts for nothing."""
 PLANE = wp.constant(2.0)
 """Largest distance of an old point from the new one's tangent plane [pixel footprints at its distance]."""
@@ -51,7 +51,7 @@ class History:
     camera: Camera
     gbuffer: GBuffer
     diffuse: Float[Tensor, "height width 3"]
-    """Over reflectance (denoise.reflectances), as is specular."""
+    """Over reflectance (denoise.without_reflectance), as is specular."""
     specular: Float[Tensor, "height width 3"]
     variance: Float[Tensor, "height width 2"]
     """Of the diffuse and specular luminance above."""
@@ -89,34 +89,36 @@ def look_up_history(
     intrinsics: wp.mat33,
     old_center: wp.vec3,
     most_samples: float,
-    coverage: wp.array[float],
-    position: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
-    wo: wp.array[wp.vec3],
-    roughness: wp.array[float],
-    old_coverage: wp.array[float],
-    old_position: wp.array[wp.vec3],
-    old_normal: wp.array[wp.vec3],
-    old_diffuse: wp.array[wp.vec3],
-    old_specular: wp.array[wp.vec3],
-    old_variance: wp.array[wp.vec2],
-    old_samples: wp.array[wp.vec2],
+    coverage: wp.array2d[float],
+    position: wp.array2d[wp.vec3],
+    normal: wp.array2d[wp.vec3],
+    wo: wp.array2d[wp.vec3],
+    roughness: wp.array2d[float],
+    old_coverage: wp.array2d[float],
+    old_position: wp.array2d[wp.vec3],
+    old_normal: wp.array2d[wp.vec3],
+    old_diffuse: wp.array2d[wp.vec3],
+    old_specular: wp.array2d[wp.vec3],
+    old_variance: wp.array2d[wp.vec2],
+    old_samples: wp.array2d[wp.vec2],
     # outputs
-    diffuse: wp.array[wp.vec3],
-    specular: wp.array[wp.vec3],
-    variance: wp.array[wp.vec2],
-    samples: wp.array[wp.vec2],
+    diffuse: wp.array2d[wp.vec3],
+    specular: wp.array2d[wp.vec3],
+    variance: wp.array2d[wp.vec2],
+    samples: wp.array2d[wp.vec2],
 ):
-    p = first + wp.tid()
-    diffuse[p] = wp.vec3(0.0, 0.0, 0.0)
-    specular[p] = wp.vec3(0.0, 0.0, 0.0)
-    variance[p] = wp.vec2(0.0, 0.0)
-    samples[p] = wp.vec2(0.0, 0.0)
-    if coverage[p] <= 0.0:
+    i = first + wp.tid()
+    y = i / width
+    x = i - y * width
+    diffuse[y, x] = wp.vec3(0.0, 0.0, 0.0)
+    specular[y, x] = wp.vec3(0.0, 0.0, 0.0)
+    variance[y, x] = wp.vec2(0.0, 0.0)
+    samples[y, x] = wp.vec2(0.0, 0.0)
+    if coverage[y, x] <= 0.0:
         return
-    x = position[p]
-    n = normal[p]
-    in_camera = wp.transform_point(camera_from_world, x)
+    here = position[y, x]
+    n = normal[y, x]
+    in_camera = wp.transform_point(camera_from_world, here)
     if in_camera[2] <= 0.0:
         return
     on_screen = intrinsics * in_camera
@@ -128,7 +130,7 @@ def look_up_history(
         return
     footprint = in_camera[2] / intrinsics[0, 0]
     reach = PLANE * footprint
-    towards_old = wp.dot(n, wp.normalize(old_center - x))
+    towards_old = wp.dot(n, wp.normalize(old_center - here))
     if towards_old <= GRAZING:
         return
     spread = SPREAD * footprint / wp.max(towards_old, 0.25)
@@ -143,27 +145,26 @@ def look_up_history(
         qx = column + dx
         qy = row + dy
         if qx >= 0 and qy >= 0 and qx < old_width and qy < old_height:
-            q = qy * old_width + qx
-            apart = old_position[q] - x
+            apart = old_position[qy, qx] - here
             near = wp.abs(wp.dot(n, apart)) <= reach and wp.length(apart) <= spread
-            if near and old_coverage[q] > 0.0 and wp.dot(n, old_normal[q]) >= FACING:
+            if near and old_coverage[qy, qx] > 0.0 and wp.dot(n, old_normal[qy, qx]) >= FACING:
                 w = wp.abs(1.0 - float(dx) - (u - float(column))) * wp.abs(1.0 - float(dy) - (v - float(row)))
-                sum_d += w * old_diffuse[q]
-                sum_s += w * old_specular[q]
-                sum_variance += w * old_variance[q]
-                sum_samples += w * old_samples[q]
+                sum_d += w * old_diffuse[qy, qx]
+                sum_s += w * old_specular[qy, qx]
+                sum_variance += w * old_variance[qy, qx]
+                sum_samples += w * old_samples[qy, qx]
                 weights += w
     if weights < 0.05:
         return
     # The lobe of a rougher surface forgives a larger turn.
-    alpha = wp.max(roughness[p] * roughness[p], 1.0e-4)
-    turned = wp.length(wo[p] - wp.normalize(old_center - x))
+    alpha = wp.max(roughness[y, x] * roughness[y, x], 1.0e-4)
+    turned = wp.length(wo[y, x] - wp.normalize(old_center - here))
     still = wp.exp(-wp.min((LOBE * turned / alpha) * (LOBE * turned / alpha), 80.0))
     worth = sum_samples / weights
-    diffuse[p] = sum_d / weights
-    specular[p] = sum_s / weights
-    variance[p] = sum_variance / weights
-    samples[p] = wp.vec2(wp.min(worth[0], most_samples), still * wp.min(worth[1], most_samples))
+    diffuse[y, x] = sum_d / weights
+    specular[y, x] = sum_s / weights
+    variance[y, x] = sum_variance / weights
+    samples[y, x] = wp.vec2(wp.min(worth[0], most_samples), still * wp.min(worth[1], most_samples))
 
 
 def reproject(history: History, gbuffer: GBuffer, camera: Camera) -> Reprojected:
@@ -174,46 +175,91 @@ def reproject(history: History, gbuffer: GBuffer, camera: Camera) -> Reprojected
     vectors = [torch.empty(height, width, 3, device=device) for _ in range(2)]
     pairs = [torch.empty(height, width, 2, device=device) for _ in range(2)]
     old, old_map = history.camera, history.gbuffer
-
-    def flat(values: Tensor, dtype: object = None) -> wp.array:
-        return warp_array(values.float().reshape(-1, *values.shape[2:]), dtype)
-
     launch(
         look_up_history,
         height * width,
         [
             width, height, old_width, old_height, wp.mat44(*old.camera_from_world.flatten().tolist()),
             wp.mat33(*old.intrinsics.flatten().tolist()), wp.vec3(*old.center_world.tolist()), MOST_SAMPLES,
-            flat(gbuffer.coverage), flat(gbuffer.position_world, wp.vec3), flat(gbuffer.normal_world, wp.vec3),
-            flat(gbuffer.wo_world, wp.vec3), flat(gbuffer.roughness),
-            flat(old_map.coverage), flat(old_map.position_world, wp.vec3), flat(old_map.normal_world, wp.vec3),
-            flat(history.diffuse, wp.vec3), flat(history.specular, wp.vec3), flat(history.variance, wp.vec2), flat(history.samples, wp.vec2),
+            warp_view(gbuffer.coverage), warp_view(gbuffer.position_world, wp.vec3), warp_view(gbuffer.normal_world, wp.vec3),
+            warp_view(gbuffer.wo_world, wp.vec3), warp_view(gbuffer.roughness),
+            warp_view(old_map.coverage), warp_view(old_map.position_world, wp.vec3), warp_view(old_map.normal_world, wp.vec3),
+            warp_view(history.diffuse, wp.vec3), warp_view(history.specular, wp.vec3), warp_view(history.variance, wp.vec2),
+            warp_view(history.samples, wp.vec2),
         ],
-        [*(flat(t, wp.vec3) for t in vectors), *(flat(t, wp.vec2) for t in pairs)],
+        [*(warp_array(t, wp.vec3) for t in vectors), *(warp_array(t, wp.vec2) for t in pairs)],
         warp_device(gbuffer.coverage),
     )  # fmt: skip
     return Reprojected(*vectors, *pairs)
 
 
-def history_weights(reprojected: Reprojected, samples: Tensor) -> Tensor:
-    """(height, width, 2) share of the diffuse and specular mean that history has, beside `samples` (height, width) of the frame's own."""
-    worth = reprojected.samples * (1 - samples / FADE_SAMPLES).clamp(min=0)[..., None]
-    return worth / (worth + samples[..., None]).clamp(min=1e-6)
+@wp.func
+def faded(samples: float) -> float:
+    """What is left of history's worth beside so many of the frame's own samples."""
+    return wp.max(1.0 - samples / FADE_SAMPLES, 0.0)
 
 
-def blend_history(radiance: Radiance, reprojected: Reprojected, gbuffer: GBuffer, samples: Tensor) -> Radiance:
-    """The mean of the frame's own samples (height, width) and what history is worth."""
+@wp.func
+def history_share(worth: float, samples: float) -> float:
+    """Of the mean of a frame's own samples and of history that is worth so many."""
+    left = worth * faded(samples)
+    return left / wp.max(left + samples, 1.0e-6)
+
+
+@wp.kernel
+def add_history(
+    first: int,
+    width: int,
+    samples: wp.array2d[float],
+    albedo: wp.array2d[wp.vec3],
+    metallic: wp.array2d[float],
+    old_diffuse: wp.array2d[wp.vec3],
+    old_specular: wp.array2d[wp.vec3],
+    old_variance: wp.array2d[wp.vec2],
+    old_samples: wp.array2d[wp.vec2],
+    # in and out
+    diffuse: wp.array2d[wp.vec3],
+    specular: wp.array2d[wp.vec3],
+    diffuse_variance: wp.array2d[float],
+    specular_variance: wp.array2d[float],
+):
+    i = first + wp.tid()
+    y = i / width
+    x = i - y * width
+    worth = old_samples[y, x]
+    d = diffuse_reflectance(albedo[y, x], metallic[y, x])
+    share = history_share(worth[0], samples[y, x])
+    diffuse[y, x] = (1.0 - share) * diffuse[y, x] + share * wp.cw_mul(old_diffuse[y, x], d)
+    diffuse_variance[y, x] = (1.0 - share) * (1.0 - share) * diffuse_variance[y, x] + share * share * old_variance[y, x][0] * mean_square(d)
+    s = specular_reflectance(albedo[y, x], metallic[y, x])
+    share = history_share(worth[1], samples[y, x])
+    specular[y, x] = (1.0 - share) * specular[y, x] + share * wp.cw_mul(old_specular[y, x], s)
+    specular_variance[y, x] = (1.0 - share) * (1.0 - share) * specular_variance[y, x] + share * share * old_variance[y, x][1] * mean_square(
+        s
+    )
+
+
+def blend_history(radiance: Radiance, reprojected: Reprojected, gbuffer: GBuffer, samples: Tensor) -> None:
+    """Make a frame's own mean the mean of that and of what history is worth, in place.
+
+    Args:
+        samples: (height, width) behind the frame's own mean.
+    """
     assert radiance.diffuse_variance is not None and radiance.specular_variance is not None
-    share = history_weights(reprojected, samples)
-    factors = reflectances(gbuffer)
-    scales = [f.square().mean(-1) for f in factors]
-    parts, variances = [], []
-    own = ((radiance.diffuse, radiance.diffuse_variance), (radiance.specular, radiance.specular_variance))
-    for k, ((mean, variance), old) in enumerate(zip(own, (reprojected.diffuse, reprojected.specular), strict=True)):
-        w = share[..., k]
-        parts.append(torch.lerp(mean, old * factors[k], w[..., None]))
-        variances.append((1 - w).square() * variance + w.square() * reprojected.variance[..., k] * scales[k])
-    return replace(radiance, diffuse=parts[0], specular=parts[1], diffuse_variance=variances[0], specular_variance=variances[1])
+    height, width = gbuffer.coverage.shape
+    launch(
+        add_history,
+        height * width,
+        [
+            width, warp_view(samples), warp_view(gbuffer.albedo, wp.vec3), warp_view(gbuffer.metallic), warp_view(reprojected.diffuse, wp.vec3),
+            warp_view(reprojected.specular, wp.vec3), warp_view(reprojected.variance, wp.vec2), warp_view(reprojected.samples, wp.vec2),
+        ],
+        [
+            warp_view(radiance.diffuse, wp.vec3), warp_view(radiance.specular, wp.vec3),
+            warp_view(radiance.diffuse_variance), warp_view(radiance.specular_variance),
+        ],
+        warp_device(samples),
+    )  # fmt: skip
 
 
 def remember(radiance: Radiance, gbuffer: GBuffer, camera: Camera, samples: Tensor, reprojected: Reprojected | None) -> History:
@@ -223,11 +269,7 @@ def remember(radiance: Radiance, gbuffer: GBuffer, camera: Camera, samples: Tens
         radiance: with history blended in, not filtered. samples: (height, width) of the frame's own.
         reprojected: the history that was blended in.
     """
-    assert radiance.diffuse_variance is not None and radiance.specular_variance is not None
-    factors = reflectances(gbuffer)
-    scales = [f.square().mean(-1) for f in factors]
-    variance = torch.stack([radiance.diffuse_variance / scales[0], radiance.specular_variance / scales[1]], -1)
-    behind = samples[..., None].expand(*samples.shape, 2)
+    behind = samples[..., None].expand(*samples.shape, 2).contiguous()
     if reprojected is not None:
-        behind = behind + reprojected.samples * (1 - samples / FADE_SAMPLES).clamp(min=0)[..., None]
-    return History(camera, gbuffer, radiance.diffuse / factors[0], radiance.specular / factors[1], variance, behind)
+        behind += reprojected.samples * (1 - samples / FADE_SAMPLES).clamp(min=0)[..., None]
+    return History(camera, gbuffer, *without_reflectance(radiance, gbuffer), behind)

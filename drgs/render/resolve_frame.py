@@ -8,18 +8,22 @@ from dataclasses import asdict, replace
 from weakref import WeakKeyDictionary
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from drgs.render.converge import mean_variance, tile_errors
 from drgs.render.denoise import denoise
 from drgs.render.denoise_oidn import denoise_oidn
+from drgs.render.environment_table import EnvironmentLight, lookup_radiance, table_place
 from drgs.render.frame_state import FrameState, samples_a_pass
-from drgs.render.image_tiles import Window, spread_over_pixels, tile_grid
+from drgs.render.image_tiles import TILE, Window, spread_over_pixels, tile_grid
 from drgs.render.records import Frame, GBuffer, Radiance
 from drgs.render.reproject import History, blend_history, remember
 from drgs.render.tonemap import tonemap
-from drgs.scene.camera import pixel_rays_world
-from drgs.scene.environment import Environment, environment_radiance
+from drgs.scene.camera import world_from_pixel
+from drgs.warp_torch import launch, warp_array, warp_device, warp_view
+
+wp.set_module_options({"enable_backward": False})
 
 
 def resolve_frame(state: FrameState) -> Frame:
@@ -131,32 +135,97 @@ def _blended(state: FrameState) -> Radiance:
     """Straight (alpha-normalised) radiance of the window, with what history adds; the variance is that of the mean of one pixel's passes."""
     if state in _blends:
         return _blends[state]
-    weight, passes = _part(state, "weight").clamp(min=1), _passes(state)
-    scatter = _part(state, "scatter")[..., 1:] / (weight * weight)[..., None]
-    radiance = Radiance(
-        _part(state, "diffuse") / weight[..., None],
-        _part(state, "specular") / weight[..., None],
-        _variance(state, passes) * (passes.clamp(min=1) / weight) ** 2,
-        _part(state, "visibility") / weight,
-        state.passes * samples_a_pass(state.settings, state.fixed is None).total,
-        scatter[..., 0],
-        scatter[..., 1],
-    )
+    names = ("diffuse", "specular", "weight", "luminance", "luminance_squared", "scatter", "visibility")
+    dtypes = (wp.vec3, wp.vec3, None, None, None, wp.vec3, None)
+    sums = [warp_view(_part(state, name), dtype) for name, dtype in zip(names, dtypes, strict=True)]
+    window, own = state.window, _own_samples(state)
+    height, width = own.shape
+    vectors = [own.new_empty(height, width, 3) for _ in range(2)]
+    scalars = [own.new_empty(height, width) for _ in range(4)]
+    inputs = [
+        width,
+        tile_grid(window.width, window.height)[0],
+        *(side.start for side in window.tiles),
+        warp_array(state.tile_passes),
+        *sums,
+    ]
+    outputs = [*(warp_array(values, wp.vec3) for values in vectors), *(warp_array(values) for values in scalars)]
+    launch(mean_over_passes, height * width, inputs, outputs, warp_device(own))
+    diffuse, specular, (variance, visibility, diffuse_variance, specular_variance) = *vectors, scalars
+    samples = state.passes * samples_a_pass(state.settings, state.fixed is None).total
+    radiance = Radiance(diffuse, specular, variance, visibility, samples, diffuse_variance, specular_variance)
     if state.reprojected is not None:
-        radiance = blend_history(radiance, state.reprojected, window_gbuffer(state), _own_samples(state))
+        blend_history(radiance, state.reprojected, window_gbuffer(state), own)
     _blends[state] = radiance
     return radiance
 
 
+@wp.kernel
+def mean_over_passes(
+    first: int,
+    width: int,
+    tiles_across: int,
+    tile_row: int,
+    tile_column: int,
+    tile_passes: wp.array[wp.int64],
+    diffuse_sum: wp.array2d[wp.vec3],
+    specular_sum: wp.array2d[wp.vec3],
+    weight: wp.array2d[float],
+    luminance: wp.array2d[float],
+    luminance_squared: wp.array2d[float],
+    scatter: wp.array2d[wp.vec3],
+    open_sum: wp.array2d[float],
+    # outputs
+    diffuse: wp.array2d[wp.vec3],
+    specular: wp.array2d[wp.vec3],
+    variance: wp.array2d[float],
+    visibility: wp.array2d[float],
+    diffuse_variance: wp.array2d[float],
+    specular_variance: wp.array2d[float],
+):
+    """Of a window that begins at a tile's corner. Variance: converge.mean_variance, of passes that found a surface."""
+    i = first + wp.tid()
+    y = i / width
+    x = i - y * width
+    passes = float(tile_passes[(tile_row + y / TILE) * tiles_across + tile_column + x / TILE])
+    count = wp.max(passes, 1.0)
+    w = wp.max(weight[y, x], 1.0)
+    diffuse[y, x] = diffuse_sum[y, x] / w
+    specular[y, x] = specular_sum[y, x] / w
+    visibility[y, x] = open_sum[y, x] / w
+    within = scatter[y, x]
+    of_mean = within[0]
+    if passes > 1.0:
+        mean = luminance[y, x] / count
+        of_mean = wp.max(luminance_squared[y, x] / count - mean * mean, 0.0) / (count - 1.0)
+    variance[y, x] = of_mean * (count / w) * (count / w)
+    diffuse_variance[y, x] = within[1] / (w * w)
+    specular_variance[y, x] = within[2] / (w * w)
+
+
 def _background(state: FrameState) -> Tensor | None:
-    background, scene = state.settings.background, state.scene
+    background = state.settings.background
     if background == "transparent":
         return None
     if background != "environment":
         return torch.tensor(background, device=state.diffuse.device)
-    _, direction = pixel_rays_world(state.camera)
-    angle = torch.tensor(scene.environment_rotation_degrees).deg2rad()
-    cos, sin = torch.cos(angle), torch.sin(angle)
-    x, y, z = direction.to(state.diffuse.device).unbind(-1)
-    turned = torch.stack([cos * x + sin * y, cos * y - sin * x, z], -1)
-    return scene.environment_intensity * environment_radiance(Environment(scene.environment.radiance.detach()), turned)
+    camera = state.camera
+    radiance = state.diffuse.new_empty(camera.height, camera.width, 3)
+    inputs = [camera.width, wp.mat33(*world_from_pixel(camera).flatten().tolist()), state.light]
+    launch(environment_behind, camera.height * camera.width, inputs, [warp_array(radiance.view(-1, 3), wp.vec3)], warp_device(radiance))
+    return radiance
+
+
+@wp.kernel
+def environment_behind(
+    first: int,
+    width: int,
+    world_of_pixel: wp.mat33,
+    light: EnvironmentLight,
+    # outputs
+    radiance: wp.array[wp.vec3],
+):
+    i = first + wp.tid()
+    y = i / width
+    direction = world_of_pixel * wp.vec3(float(i - y * width) + 0.5, float(y) + 0.5, 1.0)
+    radiance[i] = lookup_radiance(light, table_place(light, wp.normalize(direction)))

@@ -43,6 +43,11 @@ def opengl_from_camera(camera: Camera) -> Tensor:
     return torch.linalg.inv(camera.camera_from_world.double()) @ opencv_from_opengl
 
 
+def world_from_pixel(camera: Camera) -> Tensor:
+    """(3, 3): takes (x, y, 1) of a place on the image [pixels; centres at + 0.5] to its viewing direction, not of unit length."""
+    return camera.camera_from_world[:3, :3].T @ torch.linalg.inv(camera.intrinsics)
+
+
 def pixel_rays_world(camera: Camera) -> tuple[Tensor, Tensor]:
     """Origin (3,) and unit directions (height, width, 3) through the pixel centres.
 
@@ -54,7 +59,5 @@ def pixel_rays_world(camera: Camera) -> tuple[Tensor, Tensor]:
     pixels = torch.stack(
         [x.expand(camera.height, -1), y[:, None].expand(-1, camera.width), torch.ones(camera.height, camera.width, device=device)], -1
     )
-    camera_from_pixel = torch.linalg.inv(camera.intrinsics)
-    world_from_camera_rotation = camera.camera_from_world[:3, :3].T
-    directions = pixels @ (world_from_camera_rotation @ camera_from_pixel).T
+    directions = pixels @ world_from_pixel(camera).T
     return camera.center_world, torch.nn.functional.normalize(directions, dim=-1)

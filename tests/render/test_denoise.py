@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from drgs.reference import denoise as reference
+from drgs.reference.denoise import reflectances
 from drgs.render.accumulate import RenderSettings
-from drgs.render.denoise import denoise, denoise_svgf, filter_maps, filter_maps_simd, levels_for, reflectances
+from drgs.render.denoise import denoise, denoise_svgf, filter_maps, filter_maps_simd, levels_for
 from drgs.render.records import GBuffer, Radiance
 from drgs.render.render_frame import render_frame
 from drgs.render.trace_primary import trace_primary

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from drgs.reference import reproject as reference
+from drgs.reference.denoise import reflectances
 from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, start_frame
-from drgs.render.records import GBuffer
+from drgs.render.records import GBuffer, Radiance
 from drgs.render.render_frame import render_frame
-from drgs.render.reproject import FADE_SAMPLES, MOST_SAMPLES, History, history_weights, reproject
+from drgs.render.reproject import FADE_SAMPLES, MOST_SAMPLES, History, Reprojected, blend_history, remember, reproject
 from drgs.render.trace_primary import trace_primary
 from drgs.render.trace_rays import build_tracer
 from drgs.scene.camera import Camera, camera_from_opengl
@@ -97,12 +98,45 @@ def test_history_is_worth_nothing_on_a_mirror_and_little_more_than_asked_anywher
     assert worth[0.05] < 1e-3 * MOST_SAMPLES and worth[0.8] > 0.5 * MOST_SAMPLES
 
 
-def test_the_share_of_history_falls_to_nothing_as_samples_grow() -> None:
-    found = reproject(
-        history_of(trace_primary(sphere_mesh(), camera_at(0)), camera_at(0), 64.0), trace_primary(sphere_mesh(), camera_at(0)), camera_at(0)
+def radiance_like(gbuffer: GBuffer, value: float, variance: float) -> Radiance:
+    vectors = [torch.full_like(gbuffer.albedo, value) for _ in range(2)]
+    scalars = [torch.full_like(gbuffer.coverage, variance) for _ in range(2)]
+    return Radiance(*vectors, scalars[0].clone(), torch.ones_like(scalars[0]), 8, *scalars)
+
+
+def test_the_share_of_history_falls_to_nothing_as_samples_grow(device: str) -> None:
+    camera = camera_at(0)
+    gbuffer = moved_to(trace_primary(sphere_mesh(), camera), device)
+    history = History(
+        camera, gbuffer, *(torch.zeros(SIZE, SIZE, n, device=device) for n in (3, 3, 2)), torch.full((SIZE, SIZE, 2), 64.0, device=device)
     )
-    shares = [float(history_weights(found, torch.full((SIZE, SIZE), n))[..., 0].max()) for n in (8.0, 64.0, FADE_SAMPLES)]
+    found = reproject(history, gbuffer, camera)
+    shares = []
+    for samples in (8.0, 64.0, FADE_SAMPLES):
+        mean = radiance_like(gbuffer, 1.0, 0.0)
+        blend_history(mean, found, gbuffer, torch.full((SIZE, SIZE), samples, device=device))
+        shares.append(1 - float(mean.diffuse.min()))
     assert shares[0] > 0.8 and shares[0] > shares[1] > shares[2] == 0
+
+
+def test_history_is_blended_by_its_worth_and_remembered_without_reflectance(device: str) -> None:
+    camera = camera_at(0)
+    gbuffer = moved_to(trace_primary(two_spheres(), camera), device)
+    old = Reprojected(*(torch.rand(SIZE, SIZE, n, device=device) for n in (3, 3, 2)), 64 * torch.rand(SIZE, SIZE, 2, device=device))
+    mean, own = radiance_like(gbuffer, 0.7, 0.2), torch.full((SIZE, SIZE), 16.0, device=device)
+    blend_history(mean, old, gbuffer, own)
+    share = old.samples * (1 - 16 / FADE_SAMPLES)
+    share = share / (share + 16)
+    kept = remember(mean, gbuffer, camera, own, old)
+    parts = ((mean.diffuse, mean.diffuse_variance), (mean.specular, mean.specular_variance))
+    for k, ((color, variance), before, factor) in enumerate(zip(parts, (old.diffuse, old.specular), reflectances(gbuffer), strict=True)):
+        w, square = share[..., k], factor.square().mean(-1)
+        torch.testing.assert_close(color, torch.lerp(torch.full_like(color, 0.7), before * factor, w[..., None]))
+        assert variance is not None
+        torch.testing.assert_close(variance, (1 - w).square() * 0.2 + w.square() * old.variance[..., k] * square)
+        torch.testing.assert_close((kept.diffuse, kept.specular)[k], color / factor)
+        torch.testing.assert_close(kept.variance[..., k], variance / square)
+    torch.testing.assert_close(kept.samples, 16 + old.samples * (1 - 16 / FADE_SAMPLES))
 
 
 SCENE = PosedScene(None, sphere_mesh(4, roughness=0.6), sunny_sky(sun=20.0))
