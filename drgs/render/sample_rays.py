@@ -51,20 +51,6 @@ def sample_counts(total: int) -> SampleCounts:
     return SampleCounts(max(1, total - 2 * quarter), quarter, quarter)
 
 
-def shading_points(gbuffer: GBuffer) -> ShadingPoints:
-    """The covered pixels of a G-buffer, packed in row-major order; differentiable."""
-    pixel = torch.nonzero(gbuffer.coverage.reshape(-1) > MIN_COVERAGE).squeeze(-1)
-    return ShadingPoints(
-        gbuffer.position_world.reshape(-1, 3)[pixel],
-        gbuffer.normal_world.reshape(-1, 3)[pixel],
-        gbuffer.wo_world.reshape(-1, 3)[pixel],
-        gbuffer.albedo.reshape(-1, 3)[pixel],
-        gbuffer.roughness.reshape(-1)[pixel],
-        gbuffer.metallic.reshape(-1)[pixel],
-        pixel.int(),
-    )
-
-
 @wp.struct
 class PointArrays:
     """ShadingPoints as kernels see them."""
@@ -92,6 +78,30 @@ class SampleSet:
     round: int
     """Samples already taken: rounds of the same counts."""
     seed: wp.uint32
+
+
+@wp.kernel
+def gather_points(
+    first: int,
+    pixel: wp.array[wp.int64],
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    metallic: wp.array[float],
+    # outputs
+    points: PointArrays,
+):
+    i = first + wp.tid()
+    p = int(pixel[i])
+    points.position[i] = position[p]
+    points.normal[i] = normal[p]
+    points.wo[i] = wo[p]
+    points.albedo[i] = albedo[p]
+    points.roughness[i] = roughness[p]
+    points.metallic[i] = metallic[p]
+    points.pixel[i] = p
 
 
 @wp.func
@@ -218,6 +228,21 @@ def point_arrays(points: ShadingPoints, rounds: torch.Tensor | None = None) -> A
     arrays.pixel = warp_array(points.pixel.int())
     arrays.round = warp_array(points.pixel[:0].int() if rounds is None else rounds)
     return arrays
+
+
+def shading_points(gbuffer: GBuffer) -> ShadingPoints:
+    """The covered pixels of a G-buffer, packed in row-major order; differentiable."""
+    pixel = torch.nonzero(gbuffer.coverage.reshape(-1) > MIN_COVERAGE).squeeze(-1)
+    vectors = [v.reshape(-1, 3) for v in (gbuffer.position_world, gbuffer.normal_world, gbuffer.wo_world, gbuffer.albedo)]
+    numbers = [v.reshape(-1) for v in (gbuffer.roughness, gbuffer.metallic)]
+    if torch.is_grad_enabled() and any(values.requires_grad for values in (*vectors, *numbers)):
+        return ShadingPoints(*(values[pixel] for values in (*vectors, *numbers)), pixel.int())
+    points = ShadingPoints(
+        *(values.new_empty(len(pixel), *values.shape[1:]) for values in (*vectors, *numbers)), torch.empty_like(pixel, dtype=torch.int32)
+    )
+    arrays = [*(warp_array(values, wp.vec3) for values in vectors), *(warp_array(values) for values in numbers)]
+    launch(gather_points, len(pixel), [warp_array(pixel), *arrays], [point_arrays(points)], warp_device(pixel))
+    return points
 
 
 def sample_set(counts: SampleCounts, seed: int, samples_round: int = 0, by_material: bool = False) -> Any:

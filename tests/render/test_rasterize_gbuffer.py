@@ -6,7 +6,15 @@ import torch
 
 from drgs.reference.rasterize_gbuffer import look_at_camera
 from drgs.render.rasterize_gbuffer import RasterSettings
-from drgs.render.rasterize_gbuffer.gbuffer import LEAST_FACING, MIN_COVERAGE, face_camera, facing_normals, rasterize_gbuffer
+from drgs.render.rasterize_gbuffer.gbuffer import (
+    LEAST_FACING,
+    MIN_COVERAGE,
+    differentiable_gbuffer,
+    face_camera,
+    facing_normals,
+    near_plane,
+    rasterize_gbuffer,
+)
 from drgs.scene.camera import Camera, pixel_rays_world
 from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.materials import Materials
@@ -164,3 +172,52 @@ def test_nothing_nearer_than_the_near_plane_is_drawn():
     gbuffer = rasterize_gbuffer(surfels, camera, RasterSettings(near=2.0))
     torch.testing.assert_close(gbuffer.albedo[8, 8], torch.tensor([0.0, 1.0, 0.0]), atol=1e-5, rtol=0)
     assert math.isclose(float(gbuffer.depth[8, 8]), 4.0, rel_tol=1e-4)
+
+
+def scattered_surfels(count: int, device: str) -> PosedSurfels:
+    """Of any size, shape, transparency and facing, around the origin."""
+    centers, tangents = 0.5 * torch.randn(count, 3), 0.1 * torch.randn(count, 3, 2)
+    # A little outside 0..1, where edits leave values that the maps must not show.
+    materials = Materials(torch.rand(count, 3) * 1.2 - 0.1, torch.rand(count) * 1.2 - 0.1, torch.rand(count) * 1.2 - 0.1)
+    materials = Materials(*(values.to(device) for values in vars(materials).values()))
+    return PosedSurfels(centers.to(device), tangents.to(device), torch.rand(count).to(device), materials)
+
+
+def seen_in_part_and_nowhere(device: str) -> dict[str, tuple[PosedSurfels, Camera]]:
+    camera = look_at_camera(53, 39, focal=60.0).to(device)  # neither side a multiple of the tile's
+    none = scattered_surfels(0, device)
+    away = scattered_surfels(20, device)
+    behind = PosedSurfels(away.centers + 100 * camera.center_world, away.tangents, away.opacities, away.materials)
+    return {
+        "partial cover, backs and fronts": (scattered_surfels(300, device), camera),
+        "a few surfels in a corner of the picture": (scattered_surfels(5, device), look_at_camera(160, 128, focal=60.0).to(device)),
+        "closed and opaque": (sphere(0.9, device), look_at_camera(48, 32, focal=60.0).to(device)),
+        "behind the camera": (behind, camera),
+        "no surfels": (none, camera),
+    }
+
+
+def test_kernels_write_the_maps_that_torch_writes(device: str):
+    # Sums of up to hundreds of float32 terms differ in nothing: the blending is the same. What is left is a few roundings a pixel, grown by
+    # the division where coverage, and by normalising where the blended normal, is small.
+    for name, (surfels, camera) in seen_in_part_and_nowhere(device).items():
+        kernels = rasterize_gbuffer(surfels, camera)
+        by_torch = differentiable_gbuffer(surfels, camera, RasterSettings(near=near_plane(surfels.centers)))
+        covered = by_torch.coverage >= MIN_COVERAGE
+        assert bool(covered.any()) == (name not in ("behind the camera", "no surfels")), name
+        for field in vars(kernels):
+            mine, twin = getattr(kernels, field), getattr(by_torch, field)
+            torch.testing.assert_close(mine, twin, atol=2e-5, rtol=1e-5, msg=lambda text, at=(name, field): f"{at}: {text}")
+            if field not in ("coverage", "wo_world"):
+                assert torch.equal(mine[~covered], torch.full_like(mine[~covered], torch.inf if field == "depth" else 0.0)), (name, field)
+
+
+def test_maps_carry_gradients_only_where_they_are_asked_for():
+    camera = front_camera(24)
+    surfels = disc_before(camera, [4.0], [0.6], [(0.9, 0.2, 0.1)])
+    surfels.materials.roughness.requires_grad_(True)
+    assert rasterize_gbuffer(surfels, camera).roughness.requires_grad
+    with torch.no_grad():
+        assert not rasterize_gbuffer(surfels, camera).roughness.requires_grad
+    surfels.materials.roughness.requires_grad_(False)
+    assert not rasterize_gbuffer(surfels, camera).roughness.requires_grad

@@ -8,8 +8,8 @@ import torch
 
 from drgs.reference import sample_rays as reference
 from drgs.render.environment_table import build_environment_table
-from drgs.render.records import ShadingPoints
-from drgs.render.sample_rays import SampleCounts, sample_counts, sample_rays
+from drgs.render.records import GBuffer, ShadingPoints
+from drgs.render.sample_rays import SampleCounts, sample_counts, sample_rays, shading_points
 from drgs.scene.environment import Environment
 from tests.render.closed_form_scenes import constant_sky, points_seen_at, sunny_sky
 
@@ -73,3 +73,20 @@ def test_points_seen_from_below_get_no_samples() -> None:
 def test_default_split_is_two_to_one_to_one() -> None:
     assert sample_counts(32) == SampleCounts(16, 8, 8) == SampleCounts()
     assert sample_counts(512) == SampleCounts(256, 128, 128)
+
+
+def test_shading_points_are_the_covered_pixels_with_and_without_gradients(device: str) -> None:
+    coverage = torch.rand(13, 21, device=device).round()
+    wide = torch.rand(13, 30, 14, device=device)[:, 4:25]  # lies in memory with gaps
+    gbuffer = GBuffer(coverage, wide[..., 0], wide[..., :3], wide[..., 3:6], wide[..., 6:9], wide[..., 9:12], wide[..., 12], wide[..., 13])
+    points = shading_points(gbuffer)
+    learnt = shading_points(dataclasses.replace(gbuffer, roughness=gbuffer.roughness.clone().requires_grad_(True)))
+    assert learnt.roughness.requires_grad and not points.roughness.requires_grad
+    y, x = torch.nonzero(coverage == 1).unbind(-1)
+    assert 0 < len(x) < coverage.numel()
+    assert torch.equal(points.pixel, (21 * y + x).int())
+    for name in set(vars(points)) - {"pixel"}:
+        assert torch.equal(getattr(points, name), getattr(gbuffer, name)[y, x]), name
+        assert torch.equal(getattr(points, name), getattr(learnt, name).detach()), name
+    nothing = shading_points(dataclasses.replace(gbuffer, coverage=torch.zeros_like(coverage)))
+    assert {tuple(values.shape) for values in vars(nothing).values()} == {(0, 3), (0,)} and nothing.pixel.dtype == torch.int32

@@ -1,24 +1,108 @@
-"""The G-buffer of posed surfels: material, normal and depth maps divided by coverage (Eq. 2 of the paper)."""
+"""The G-buffer of posed surfels: material, normal and depth maps divided by coverage (Eq. 2 of the paper).
+
+What comes before and after blending is written twice: in torch, where somebody asks for gradients, and as two kernels where nobody
+does, which is every frame that is shown. A test compares the two.
+"""
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from drgs.render.image_tiles import TILE, window_of_tiles
 from drgs.render.rasterize_gbuffer.rasterize import RasterSettings, rasterize
 from drgs.render.records import GBuffer
-from drgs.scene.camera import Camera, pixel_rays_world
+from drgs.scene.camera import Camera, pixel_rays_world, world_from_pixel
 from drgs.scene.posed_scene import PosedSurfels
+from drgs.warp_torch import launch, warp_array, warp_device, warp_view
+
+wp.set_module_options({"enable_backward": False})
 
 MIN_COVERAGE = 1.0 / 255.0
 """Pixels below carry no surface; the division by coverage is guarded here."""
-
-
 SEEN_FROM_BEHIND = 0.3
 """Cosine between a surfel's normal and the viewing ray above which the surfel is taken to show its back."""
 NEAR_SHARE = 0.01
 """Distance of the near plane in half sides of the surfels' box; builds fit with about the same."""
 LEAST_FACING = 0.02
 """Blended normals face the camera at least by this cosine."""
+
+
+@wp.kernel
+def write_features(
+    first: int,
+    center: wp.array[wp.vec3],
+    tangents: wp.array2d[float],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    metallic: wp.array[float],
+    camera_center: wp.vec3,
+    # outputs
+    features: wp.array2d[float],
+):
+    i = first + wp.tid()
+    across = wp.vec3(tangents[i, 0], tangents[i, 2], tangents[i, 4])
+    down = wp.vec3(tangents[i, 1], tangents[i, 3], tangents[i, 5])
+    normal = wp.normalize(wp.cross(across, down))
+    if wp.dot(normal, wp.normalize(center[i] - camera_center)) > SEEN_FROM_BEHIND:
+        normal = -normal
+    base = albedo[i]
+    for k in range(3):
+        features[i, k] = normal[k]
+        features[i, 3 + k] = base[k]
+    features[i, 6] = roughness[i]
+    features[i, 7] = metallic[i]
+
+
+@wp.kernel
+def write_gbuffer(
+    first: int,
+    width: int,
+    ray_from_pixel: wp.mat33,
+    camera_center: wp.vec3,
+    view_axis: wp.vec3,
+    depth_origin: float,
+    feature_sum: wp.array3d[float],
+    coverage_sum: wp.array2d[float],
+    depth_sum: wp.array2d[float],
+    # outputs
+    coverage: wp.array[float],
+    depth: wp.array[float],
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    metallic: wp.array[float],
+):
+    i = first + wp.tid()
+    y = i // width
+    x = i - y * width
+    direction = wp.normalize(ray_from_pixel * wp.vec3(float(x) + 0.5, float(y) + 0.5, 1.0))
+    wo[i] = -direction
+    share = coverage_sum[y, x]
+    coverage[i] = share
+    if not (share >= MIN_COVERAGE):
+        nowhere = wp.vec3(0.0, 0.0, 0.0)
+        depth[i] = wp.inf
+        position[i] = nowhere
+        normal[i] = nowhere
+        albedo[i] = nowhere
+        roughness[i] = 0.0
+        metallic[i] = 0.0
+        return
+    inverse = 1.0 / share
+    along = depth_sum[y, x] * inverse + depth_origin
+    depth[i] = along
+    position[i] = camera_center + direction * (along / wp.dot(direction, view_axis))
+    unit = wp.normalize(wp.vec3(feature_sum[0, y, x], feature_sum[1, y, x], feature_sum[2, y, x]) * inverse)
+    lacking = wp.max(LEAST_FACING + wp.dot(unit, direction), 0.0)
+    normal[i] = wp.normalize(unit - lacking * direction)
+    red = wp.clamp(feature_sum[3, y, x] * inverse, 0.0, 1.0)
+    green = wp.clamp(feature_sum[4, y, x] * inverse, 0.0, 1.0)
+    blue = wp.clamp(feature_sum[5, y, x] * inverse, 0.0, 1.0)
+    albedo[i] = wp.vec3(red, green, blue)
+    roughness[i] = wp.clamp(feature_sum[6, y, x] * inverse, 0.0, 1.0)
+    metallic[i] = wp.clamp(feature_sum[7, y, x] * inverse, 0.0, 1.0)
 
 
 def facing_normals(normals: Tensor, centers: Tensor, camera: Camera) -> Tensor:
@@ -58,6 +142,40 @@ def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSet
         settings: None: the near plane follows the surfels' span.
     """
     settings = settings or RasterSettings(near=near_plane(surfels.centers))
+    device, materials = surfels.centers.device, surfels.materials
+    inputs = (surfels.centers, surfels.tangents, surfels.opacities, *vars(materials).values(), camera.camera_from_world, camera.intrinsics)
+    if torch.is_grad_enabled() and any(values.requires_grad for values in inputs):
+        return differentiable_gbuffer(surfels, camera, settings)
+    warp, center = warp_device(surfels.centers), wp.vec3(*camera.center_world.tolist())
+    features = torch.empty(len(surfels.centers), 8, device=device)
+    launch(
+        write_features,
+        len(features),
+        [warp_array(surfels.centers, wp.vec3), warp_array(surfels.tangents.reshape(-1, 6)), warp_array(materials.albedo, wp.vec3),
+         warp_array(materials.roughness), warp_array(materials.metallic), center],
+        [warp_array(features)],
+        warp,
+    )  # fmt: skip
+    maps = rasterize(surfels.centers, surfels.tangents, surfels.opacities, features, camera, settings)
+    assert maps.depth_sum is not None
+    size = (camera.height, camera.width)
+    coverage, depth, roughness, metallic = (torch.empty(size, device=device) for _ in range(4))
+    position, normal, wo, albedo = (torch.empty(*size, 3, device=device) for _ in range(4))
+    launch(
+        write_gbuffer,
+        camera.height * camera.width,
+        [camera.width, wp.mat33(*world_from_pixel(camera).flatten().tolist()), center, wp.vec3(*camera.camera_from_world[2, :3].tolist()),
+         maps.depth_origin, *(warp_view(sums) for sums in (maps.features, maps.coverage, maps.depth_sum))],
+        [warp_array(coverage.view(-1)), warp_array(depth.view(-1)),
+         *(warp_array(vectors.view(-1, 3), wp.vec3) for vectors in (position, normal, wo, albedo)),
+         warp_array(roughness.view(-1)), warp_array(metallic.view(-1))],
+        warp,
+    )  # fmt: skip
+    return GBuffer(coverage, depth, position, normal, wo, albedo, roughness, metallic)
+
+
+def differentiable_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSettings) -> GBuffer:
+    """rasterize_gbuffer in torch, whose gradients reach surfels and materials; the twin of its kernels."""
     materials = surfels.materials
     crosses = torch.linalg.cross(surfels.tangents[:, :, 0], surfels.tangents[:, :, 1])
     normals = facing_normals(torch.nn.functional.normalize(crosses, dim=-1, eps=1e-20), surfels.centers, camera)
@@ -73,7 +191,7 @@ def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSet
     origin, all_directions = pixel_rays_world(camera)
     directions = window.crop(all_directions)
     along_axis = directions @ camera.camera_from_world[2, :3]
-    position = origin + directions * (torch.where(covered, depth, torch.zeros_like(depth)) / along_axis)[..., None]
+    position = (origin + directions * (torch.where(covered, depth, torch.zeros_like(depth)) / along_axis)[..., None]) * covered[..., None]
     return GBuffer(
         coverage=maps.coverage,
         depth=window.pad(depth, torch.inf),
