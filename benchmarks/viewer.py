@@ -4,7 +4,8 @@
 
 edit_to_pixel_ms: from a slider's event to the first changed picture on the screen, which the browser draws itself; edit_to_traced_ms: to the
 first traced picture of that edit. local_fps: pictures a second that the browser draws while the camera turns, 800x600. traced_fps: pictures
-a second from the server while the camera turns, 400x400. reconnect_s: from the server answering again to the page showing it.
+a second from the server while the camera turns, 400x400. reconnect_s: from the server answering again to the page showing that it is there;
+picture_back_s: to its next picture, for which it first imports the renderer and loads the asset.
 bundle_gz_kb: all built files, gzipped. Medians of the repeats.
 """
 
@@ -148,16 +149,20 @@ def _measure_edits_and_local(browser: Browser, server: RunningServer, mesh: Path
     fps = _turn(page, "localFrames")
     server.stop()
     page.get_by_text("Reconnecting…").wait_for(timeout=WAIT_MS)
+    shown = page.evaluate("Number(document.querySelector('.stage').dataset.tracedFrames)")
     server.start()
     answering = time.perf_counter()
     page.get_by_text("Reconnecting…").wait_for(state="hidden", timeout=WAIT_MS)
     reconnect = time.perf_counter() - answering
+    _wait(page, f"Number(document.querySelector('.stage').dataset.tracedFrames) > {shown}")
+    picture_back = time.perf_counter() - answering
     page.close()
     return {
         "edit_to_pixel_ms": round(statistics.median(entry["pixel"] for entry in times), 1),
         "edit_to_traced_ms": round(statistics.median(entry["traced"] for entry in times), 1),
         "local_fps": round(fps, 1),
         "reconnect_s": round(reconnect, 2),
+        "picture_back_s": round(picture_back, 2),
     }
 
 

@@ -5,6 +5,8 @@ core for one picture, so a second render thread would only make both slower.
 """
 
 import logging
+import os
+import sys
 import threading
 import time
 from collections import deque
@@ -21,6 +23,18 @@ LONGEST_WAIT_SECONDS = 1.0
 PAUSE_AFTER_ERROR_SECONDS = 2.0
 SETTLE_AFTER_SLICES = (1, 30)
 """The first pictures load kernels and all that they need."""
+
+
+MODESTY = 5
+"""Nice value of threads that compute for long."""
+
+
+def give_way() -> None:
+    """Let the calling thread, and those it starts, wait where the cores are busy: rendering takes all it gets, and the event loop, which answers
+    within milliseconds, and a browser on the same machine, which draws sixty pictures a second, need little. Linux only, where a thread has
+    a priority of its own."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), MODESTY)
 
 
 class RenderThread:
@@ -74,6 +88,7 @@ class RenderThread:
             self._wake.notify()
 
     def _run(self) -> None:
+        give_way()
         while True:
             viewer = None
             with self._wake:

@@ -24,7 +24,7 @@ from server.environments import EnvironmentStore
 from server.metrics import Metrics
 from server.problems import ProblemError, artifact_problem
 from server.render_session import AbstractLoadedAsset, AbstractRenderer
-from server.render_thread import RenderThread
+from server.render_thread import RenderThread, give_way
 from server.settings import Limits
 from server.settle_memory import settle_memory
 from server.viewer import Posed, Viewer
@@ -107,7 +107,7 @@ class SessionRegistry:
         self._loaded: OrderedDict[str, AbstractLoadedAsset] = OrderedDict()
         self._loading = asyncio.Lock()
         # Loading and posing may take long (a simulation up to a late moment); the render thread goes on with other sessions meanwhile.
-        self._posing = ThreadPoolExecutor(POSING_THREADS, thread_name_prefix="pose")
+        self._posing = ThreadPoolExecutor(POSING_THREADS, thread_name_prefix="pose", initializer=give_way)
 
     def close(self) -> None:
         """Poses under way are finished, those that wait are not begun."""

@@ -2,7 +2,9 @@
 
 import io
 import json
+import os
 import queue
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +20,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from server import messages
 from server.messages import FLAG_ALPHA, FLAG_CONVERGED, FLAG_MOVING, FrameHeader, unpack_frame
+from server.render_thread import MODESTY
 
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
 PATIENCE_SECONDS = 60.0
@@ -152,6 +155,14 @@ def test_a_new_number_of_the_camera_marks_the_frames_that_show_new_settings(serv
         last = client.frame(FLAG_CONVERGED)
         assert last.flags >> 8 == 2
         assert [header.flags >> 8 for header, _ in client.frames[before:]] == [2] * (len(client.frames) - before)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have a priority of their own on Linux only")
+def test_rendering_gives_way_to_what_answers(service: Service) -> None:
+    def priority() -> int:
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    assert service.context.render_thread.call(priority).result(10) == priority() + MODESTY
 
 
 def test_rendering_runs_on_the_render_thread_only(service: Service) -> None:

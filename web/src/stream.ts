@@ -28,7 +28,7 @@ import {
 
 const CAMERA_INTERVAL_MS = 25;
 const RECONNECT_FIRST_MS = 200;
-const RECONNECT_LONGEST_MS = 500;
+const RECONNECT_LONGEST_MS = 400;
 
 export type Connection = 'connecting' | 'open' | 'lost' | 'closed';
 type Ordered = EditMessage | SpliceMessage | UndoMessage | RedoMessage;
@@ -198,6 +198,10 @@ export class Stream {
         if (document.hidden) this.onVisibility();
         for (const waiting of this.outbox) this.send(waiting);
         return;
+      case 'status':
+        // The server is there again, though the asset may take it a moment: the page says that it loads, no longer that nobody answers.
+        if (!this.ready) this.events.connection('open');
+        break;
       case 'picked':
         this.picks.get(message.id)?.(message);
         this.picks.delete(message.id);
