@@ -66,7 +66,7 @@ def build(force: bool = False) -> bool:
     wanted = source_hash()
     if not force and STAMP.exists() and STAMP.read_text() == wanted:
         return False
-    npm, environment = _install()
+    npm, environment = install()
     _run(npm, ["run", "--silent", "build", "--", "--logLevel=warn"], environment)
     STAMP.write_text(wanted)
     return True
@@ -78,11 +78,11 @@ def check() -> None:
     Raises:
         RuntimeError: a sentence; what is wrong has been printed.
     """
-    npm, environment = _install()
+    npm, environment = install()
     _run(npm, ["run", "--silent", "check"], environment)
 
 
-def _install() -> tuple[list[str], dict[str, str]]:
+def install() -> tuple[list[str], dict[str, str]]:
     """Bring node_modules to what the lock file says; how to call npm."""
     npm, environment = npm_command()
     lock = hashlib.sha256((WEB / "package-lock.json").read_bytes()).hexdigest()

@@ -1,0 +1,196 @@
+"""What others' readers make of exported files: Khronos' glTF validator, and splat-transform, which reads PLY for SuperSplat.
+
+Each check is also run on files with one thing wrong in them, which must not pass.
+"""
+
+import importlib.util
+import json
+import shutil
+import struct
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from drgs.build.export_asset import display_sh, export_asset
+from drgs.exchange import texture_atlas
+from drgs.exchange.gaussian_ply import decode_gaussian_ply
+from drgs.exchange.glb import GlbMesh, encode_glb
+from drgs.exchange.ply import encode_ply, parse_ply
+from drgs.maths.frames import rotation_from_quat_wxyz
+from drgs.maths.spherical_harmonics import evaluate_sh
+from drgs.scene.asset import Asset, save_asset
+from tests.build.test_export_asset import ball_asset
+from tests.web.browser import ROOT
+
+WARNING, INFORMATION = 1, 2
+"""The validator's severities; an error is 0, a hint 3."""
+TURN_DEGREES, ENLARGED = (20.0, 30.0, 40.0), 2.0
+"""Splats are read, turned around x, then y, then z, made larger and written: only who knows what every column means can."""
+
+
+@pytest.fixture(scope="module")
+def run_node() -> Callable[..., str]:
+    """Runs a script of web/ with arguments in the Node that builds the viewer; what it printed."""
+    spec = importlib.util.spec_from_file_location("build_viewer", ROOT / "web" / "build.py")
+    assert spec is not None and spec.loader is not None
+    build_viewer = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build_viewer)
+    _, environment = build_viewer.install()
+    node = shutil.which("node", path=environment["PATH"])
+    assert node is not None
+
+    def run(script: str, *arguments: object) -> str:
+        command = [node, ROOT / "web" / script, *map(str, arguments)]
+        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=60).stdout
+
+    return run
+
+
+def findings(run_node: Callable[..., str], folder: Path, **files: bytes) -> dict[str, list[dict]]:
+    """The validator's messages by file."""
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    said = json.loads(run_node("tests/validate_glb.mjs", *(folder / name for name in files)))
+    return dict(zip(files, said, strict=True))
+
+
+def test_the_gltf_validator_finds_no_fault_in_an_exported_glb(run_node, tmp_path, monkeypatch):
+    asset = ball_asset()
+    save_asset(asset, tmp_path / "asset")
+    export_asset(asset, tmp_path / "charts.glb", "glb")
+    monkeypatch.setattr(texture_atlas, "MAX_UNWRAP_FACES", 0)
+    export_asset(asset, tmp_path / "cells.glb", "glb")
+    paths = {"charts": tmp_path / "charts.glb", "cells": tmp_path / "cells.glb", "stored": tmp_path / "asset" / "mesh.glb"}
+    said = findings(run_node, tmp_path, **{name: path.read_bytes() for name, path in paths.items()})
+    told = {(message["code"], message["severity"]) for message in said.pop("cells")}
+    assert told <= {("IMAGE_NPOT_DIMENSIONS", INFORMATION)}, "cells fill what they need, not a power of two"
+    assert said == {"charts": [], "stored": []}
+
+
+def test_the_gltf_validator_finds_what_is_missing_or_wrong(run_node, tmp_path):
+    corners, faces = np.eye(4, 3, dtype=np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    up = np.repeat(np.array([[0, 0, 1]], np.float32), 4, 0)
+    good = encode_glb(GlbMesh({"POSITION": corners, "NORMAL": up}, faces))
+
+    def edited(old: bytes, new: bytes) -> bytes:
+        """With another word of the same length in its JSON."""
+        end = 20 + struct.unpack_from("<I", good, 12)[0]
+        assert len(old) == len(new) and old in good[:end]
+        return good[:end].replace(old, new) + good[end:]
+
+    said = findings(
+        run_node,
+        tmp_path,
+        good=good,
+        long_normals=encode_glb(GlbMesh({"POSITION": corners, "NORMAL": 2 * up}, faces)),
+        no_texture=encode_glb(GlbMesh({"POSITION": corners, "NORMAL": up}, faces, {"baseColorTexture": {"index": 0}})),
+        wrong_bound=edited(b'"max":[1.0', b'"max":[2.0'),
+        no_bound=edited(b'"min"', b'"mim"'),
+    )
+    faults = {name: {message["code"] for message in messages if message["severity"] <= WARNING} for name, messages in said.items()}
+    assert faults["good"] == set()
+    assert "ACCESSOR_VECTOR3_NON_UNIT" in faults["long_normals"]
+    assert "UNRESOLVED_REFERENCE" in faults["no_texture"]
+    assert "ACCESSOR_MAX_MISMATCH" in faults["wrong_bound"]
+    assert "MESH_PRIMITIVE_POSITION_ACCESSOR_WITHOUT_BOUNDS" in faults["no_bound"]
+
+
+def check_splats(run_node: Callable[..., str], path: Path, given: dict[str, np.ndarray], model: str) -> None:
+    """AssertionError where splat-transform does not read a PLY as it was meant.
+
+    Args:
+        given: what was meant, by the names of `encode_gaussian_ply`.
+        model: what it should be taken for, `2dgs` or `default` (3D Gaussians).
+    """
+    turned_path = path.with_name("turned.ply")
+    turn = ",".join(map(str, TURN_DEGREES))
+    options = ("--quiet", "--overwrite", path, "--stats", "json", "--rotate", turn, "--scale", ENLARGED, turned_path)
+    said = json.loads(run_node("node_modules/@playcanvas/splat-transform/bin/cli.mjs", *options))
+    assert said["gaussian"], "not taken for splats"
+    assert (said["model"], said["shBands"], said["numGaussians"]) == (model, 3, len(given["centers"]))
+    extras = {extra["name"] for extra in said["extraColumns"]}
+    assert extras == {"nx", "ny", "nz", "base_color_0", "base_color_1", "base_color_2", "metallic", "roughness"}, "other columns"
+    (level,) = said["stats"]
+    largest = dict(zip(level["columns"], level["data"]["max"], strict=True))
+    if model == "2dgs":
+        assert level["data"]["infCount"][level["columns"].index("scale_2")] == said["numGaussians"], "no thickness: log 0"
+    else:
+        assert 0 < largest["scale_2"] < 1e-5 * np.ptp(given["centers"], axis=0).max(), "flat"
+    assert largest["scale_0"] == pytest.approx(np.exp(given["log_scales"][:, 0]).max(), rel=1e-4)
+    assert largest["opacity"] == pytest.approx(1 / (1 + np.exp(-given["opacity_logits"].max())), rel=1e-4)
+
+    found = decode_gaussian_ply(turned_path.read_bytes())
+    turn_matrix = turn_of_supersplat()
+    assert np.allclose(found["centers"], ENLARGED * given["centers"] @ turn_matrix.T, atol=1e-5)
+    assert np.allclose(found["log_scales"], given["log_scales"] + np.log(ENLARGED), atol=1e-5)
+    assert np.allclose(rotations(found), turn_matrix @ rotations(given), atol=1e-5), "other rotations"
+    directions = np.random.default_rng(0).normal(size=given["centers"].shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert np.allclose(radiance(found, directions @ turn_matrix.T), radiance(given, directions), atol=1e-5), "other colours"
+    assert all(np.array_equal(found[name], given[name]) for name in ("opacity_logits", "albedo", "roughness", "metallic"))
+
+
+def turn_of_supersplat() -> np.ndarray:
+    """(3, 3) of TURN_DEGREES in the file's frame: SuperSplat shows a PLY upside down, half a turn around z, and turns it there."""
+    turn = np.eye(3)
+    for axis, degrees in enumerate(TURN_DEGREES):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        step = np.eye(3)
+        step[i, i], step[i, j], step[j, i], step[j, j] = c, -s, s, c
+        turn = step @ turn
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    return half_turn @ turn @ half_turn
+
+
+def rotations(splats: dict[str, np.ndarray]) -> np.ndarray:
+    return rotation_from_quat_wxyz(torch.from_numpy(splats["quats_wxyz"]).double()).numpy()
+
+
+def radiance(splats: dict[str, np.ndarray], directions: np.ndarray) -> np.ndarray:
+    return evaluate_sh(torch.from_numpy(splats["sh"]).double(), torch.from_numpy(directions)).numpy()
+
+
+def meant(asset: Asset) -> dict[str, np.ndarray]:
+    """What the PLY of an asset should say."""
+    arrays = {key: values.numpy() for key, values in vars(asset.gaussians).items()}
+    return arrays | {"sh": display_sh(asset.gaussians.sh).numpy()}
+
+
+@pytest.mark.parametrize(("format", "model"), [("ply", "2dgs"), ("ply3", "default")])
+def test_supersplats_reader_takes_every_column_of_an_exported_ply_as_it_was_meant(run_node, tmp_path, format, model):
+    asset = ball_asset()
+    export_asset(asset, tmp_path / "a.ply", format)
+    check_splats(run_node, tmp_path / "a.ply", meant(asset), model)
+
+
+SPOILED = {
+    "a rotation's last number is missing": (lambda columns: without(columns, "rot_3"), "not taken for splats"),
+    "metallic is missing": (lambda columns: without(columns, "metallic"), "other columns"),
+    "there is a third scale": (lambda columns: columns | {"scale_2": columns["scale_1"] - 9}, "default"),
+    "w comes last": (lambda columns: columns | {f"rot_{k}": columns[f"rot_{(k + 1) % 4}"] for k in range(4)}, "other rotations"),
+    "colours alternate": (
+        lambda columns: columns | {f"f_rest_{k}": columns[f"f_rest_{k % 3 * 15 + k // 3}"] for k in range(45)},
+        "other colours",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", SPOILED)
+def test_a_ply_that_says_something_else_does_not_pass(run_node, tmp_path, what):
+    asset = ball_asset()
+    export_asset(asset, tmp_path / "a.ply", "ply")
+    ply = parse_ply((tmp_path / "a.ply").read_bytes())
+    spoil, complaint = SPOILED[what]
+    # Without the comment that names the model: columns alone must tell.
+    (tmp_path / "a.ply").write_bytes(encode_ply({"vertex": spoil(ply.elements["vertex"].scalars)}))
+    with pytest.raises(AssertionError, match=complaint):
+        check_splats(run_node, tmp_path / "a.ply", meant(asset), "2dgs")
+
+
+def without(columns: dict, name: str) -> dict:
+    return {key: values for key, values in columns.items() if key != name}
