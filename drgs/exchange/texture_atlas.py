@@ -43,16 +43,24 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_face: int = TEXEL
     if len(faces) > MAX_UNWRAP_FACES:
         return _cells(faces)
     atlas = xatlas.Atlas()
-    atlas.add_mesh(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32))
+    atlas.add_mesh(_with_faces_of_unit_area(vertices, faces), np.ascontiguousarray(faces, np.uint32))
     options = xatlas.PackOptions()
     options.resolution, options.padding = int(size * 0.85), GUTTER  # the packer overshoots its resolution by up to a sixth
     atlas.generate(xatlas.ChartOptions(), options)
     vertex_of, atlas_faces, uv = atlas.get_mesh(0)
-    if not np.array_equal(vertex_of[atlas_faces], faces):
+    if not np.array_equal(vertex_of[atlas_faces], faces) or not np.isfinite(uv).all():
         return _cells(faces)  # xatlas left faces out or moved corners: it does so with faces of no area
     # Charts keep their texels where they fit into the power of two, and shrink a little where they do not.
     uv = uv * np.array([atlas.width, atlas.height]) / max(size, atlas.width, atlas.height)
     return Atlas(vertex_of.astype(np.int64), atlas_faces.astype(np.int32), uv.astype(np.float32), size, size)
+
+
+def _with_faces_of_unit_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(vertex, 3) float32, moved and scaled: xatlas takes what is small in absolute numbers for nothing, whatever the unit."""
+    points = np.asarray(vertices, np.float64) - np.mean(vertices, axis=0, dtype=np.float64)
+    corners = points[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).mean() / 2
+    return np.ascontiguousarray(points / np.sqrt(area) if area > 0 else points, np.float32)
 
 
 def _cells(faces: np.ndarray) -> Atlas:

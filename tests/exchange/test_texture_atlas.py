@@ -30,6 +30,15 @@ def test_the_atlas_keeps_faces_corners_and_the_unit_square(sphere):
     assert atlas.uv.min() >= 0 and atlas.uv.max() <= 1
 
 
+@pytest.mark.parametrize(("radius", "center"), [(1e-5, 0.0), (0.01, 0.0), (1e6, 0.0), (0.01, 5.0)])
+def test_an_object_of_any_size_fills_its_picture(radius, center):
+    mesh = trimesh.creation.icosphere(3, radius)
+    atlas = unwrap(np.asarray(mesh.vertices + center, np.float32), np.asarray(mesh.faces, np.int32))
+    first, second = np.moveaxis(np.diff(atlas.uv[atlas.faces].astype(float), axis=1), 1, 0)
+    covered = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).sum() / 2
+    assert covered > 0.4 and len(atlas.uv) < 1.5 * len(mesh.vertices), "charts, not single faces"
+
+
 def test_no_two_faces_share_a_place_in_the_picture(sphere):
     vertices, faces = sphere
     atlas = unwrap(vertices, faces)
