@@ -13,7 +13,8 @@ import numpy as np
 from drgs.exchange.ply import encode_ply, parse_ply
 
 FLATNESS = 1e-6
-"""scale_2 of a 3DGS file, as a part of the object's extent."""
+"""scale_2 of a 3DGS file, as a part of the object's extent, and at most THINNEST of the surfel's own smaller scale."""
+THINNEST = 1e-3
 
 
 def encode_gaussian_ply(
@@ -34,7 +35,8 @@ def encode_gaussian_ply(
     columns |= _numbered("scale_", arrays["log_scales"])
     if third_scale:
         extent = float(np.ptp(arrays["centers"], axis=0).max(initial=0.0)) if len(arrays["centers"]) else 1.0
-        columns["scale_2"] = np.full(len(arrays["centers"]), math.log(FLATNESS * max(extent, 1e-12)), np.float32)
+        flat = math.log(FLATNESS * max(extent, 1e-12))
+        columns["scale_2"] = np.minimum(flat, arrays["log_scales"].min(1) + math.log(THINNEST))
     columns |= _numbered("rot_", arrays["quats_wxyz"])
     columns |= _numbered("base_color_", arrays["albedo"])
     columns |= {"metallic": arrays["metallic"], "roughness": arrays["roughness"]}

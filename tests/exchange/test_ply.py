@@ -144,6 +144,13 @@ def test_the_variant_for_3dgs_viewers_has_a_flat_third_scale_and_reads_back():
     assert np.array_equal(decode_gaussian_ply(data)["log_scales"], arrays["log_scales"])
 
 
+def test_surfels_far_smaller_than_the_object_stay_flat_for_3dgs_viewers():
+    arrays = gaussian_arrays()
+    arrays["log_scales"][:, 0] = np.log(1e-5 * np.ptp(arrays["centers"], axis=0).max())
+    data = encode_gaussian_ply(arrays, np.zeros((7, 3), np.float32), third_scale=True)
+    assert np.array_equal(decode_gaussian_ply(data)["log_scales"], arrays["log_scales"])
+
+
 def test_round_gaussians_missing_columns_and_nan_are_refused():
     arrays = gaussian_arrays()
     normals = np.zeros((7, 3), np.float32)
