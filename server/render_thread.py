@@ -33,8 +33,12 @@ def give_way() -> None:
     """Let the calling thread, and those it starts, wait where the cores are busy: rendering takes all it gets, and the event loop, which answers
     within milliseconds, and a browser on the same machine, which draws sixty pictures a second, need little. Linux only, where a thread has
     a priority of its own."""
-    if sys.platform == "linux":
+    if sys.platform != "linux":
+        return
+    try:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), MODESTY)
+    except OSError as error:  # a sandbox may forbid it; pictures are made all the same
+        logging.getLogger(__name__).warning("rendering keeps the priority of the server: %s", error)
 
 
 class RenderThread:

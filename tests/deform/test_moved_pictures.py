@@ -13,6 +13,7 @@ from drgs.scene.camera import camera_from_opengl
 from drgs.scene.environment import Environment
 from tests.deform.test_hold_handles import handles
 from tests.deform.test_pose_scene import plate_asset, pose
+from tests.deform.test_simulate import ball_asset
 
 DEGREES = 40.0
 TURN = rotation_from_quat_wxyz(torch.tensor([math.cos(math.radians(DEGREES / 2)), 0, 0, math.sin(math.radians(DEGREES / 2))]))
@@ -63,3 +64,22 @@ def test_a_rigid_motion_of_object_light_and_camera_changes_no_picture(driver, pr
     torch.testing.assert_close(after.gbuffer.normal_world[covered], before.gbuffer.normal_world[covered] @ TURN.T, atol=1e-3, rtol=0)
     difference = (after.rgba_srgb - before.rgba_srgb)[covered].abs()
     assert float(difference.mean()) < 1e-3, f"mean {float(difference.mean()):.1e}, largest {float(difference.max()):.1e}"
+
+
+def test_a_free_fall_before_a_camera_that_falls_along_changes_no_picture():
+    """Particles carry the surfels: how far they fell is the scheme's, that nothing else happened is asked here."""
+    asset = replace(ball_asset(), environment=soft_sky())
+    scene = pose(asset, {"op": "simulate", "scene": {"particles": 400, "duration": 0.5, "fps": 20, "floor": None}, "time": 0.2})
+    fallen = (scene.mesh.vertices - asset.mesh.vertices).mean(0)
+    assert float(fallen[2]) < -0.1
+    eye = torch.eye(4, dtype=torch.float64)
+    eye[:3, 3] = torch.tensor([2.0, -1.0, 8.0])
+    intrinsics = torch.tensor([[100.0, 0, 24], [0, 100, 24], [0, 0, 1]])
+    settings = RenderSettings(samples_per_pixel=2048, bounces=0, primary="mesh")
+    before = render_frame(pose(asset), camera_from_opengl(eye, intrinsics, 48, 48), settings)
+    eye[:3, 3] += fallen
+    after = render_frame(scene, camera_from_opengl(eye, intrinsics, 48, 48), settings)
+    covered = (before.gbuffer.coverage == 1) & (after.gbuffer.coverage == 1)
+    assert float(covered.float().mean()) > 0.2
+    torch.testing.assert_close(after.gbuffer.normal_world[covered], before.gbuffer.normal_world[covered], atol=1e-2, rtol=0)
+    assert float((after.rgba_srgb - before.rgba_srgb)[covered].abs().mean()) < 1e-3

@@ -20,7 +20,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from server import messages
 from server.messages import FLAG_ALPHA, FLAG_CONVERGED, FLAG_MOVING, FrameHeader, unpack_frame
-from server.render_thread import MODESTY
+from server.render_thread import MODESTY, give_way
 
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
 PATIENCE_SECONDS = 60.0
@@ -163,6 +163,16 @@ def test_rendering_gives_way_to_what_answers(service: Service) -> None:
         return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
 
     assert service.context.render_thread.call(priority).result(10) == priority() + MODESTY
+
+
+def test_rendering_goes_on_where_priorities_are_forbidden(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def refuse(*_: int) -> None:
+        raise PermissionError("not in this sandbox")
+
+    monkeypatch.setattr("server.render_thread.sys.platform", "linux")
+    monkeypatch.setattr("server.render_thread.os.setpriority", refuse, raising=False)
+    give_way()
+    assert "keeps the priority" in caplog.text
 
 
 def test_rendering_runs_on_the_render_thread_only(service: Service) -> None:
