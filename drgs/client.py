@@ -326,6 +326,10 @@ class RemoteSession:
         """A new version of the asset with the edits in force put into it."""
         return self._client._call("POST", f"/api/sessions/{self.id}/save", AssetInfo, json={"name": name}, timeout=600)
 
+    def export(self, format: Literal["ply", "ply3", "glb", "usd", "env", "zip"], out: Path) -> None:
+        """Write the object with the edits in force put into it as a file for other programs; the server keeps nothing of it."""
+        self._client._download(f"/api/sessions/{self.id}/export", out, params={"format": format})
+
     def frame(
         self,
         width: int = 512,
@@ -333,12 +337,13 @@ class RemoteSession:
         spp: int = 128,
         world_from_camera: list[list[float]] | None = None,
         fov_y_degrees: float | None = None,
-        format: Literal["png", "jpg"] = "png",
+        format: Literal["png", "jpg", "exr"] = "png",
         **settings: Any,
     ) -> bytes:
         """One finished picture.
 
         Args:
+            format: exr holds linear radiance.
             world_from_camera: 4x4 OpenGL camera-to-world; the start view when absent.
             settings: exposure_stops, background, channel, bounces, denoise.
         """

@@ -25,6 +25,7 @@ from server.render_session import (
     AbstractRenderer,
     Bounds,
     Explanation,
+    LinearPixels,
     Picked,
     Pixels,
     view_of_bounds,
@@ -46,6 +47,8 @@ REFINE_SECONDS = 0.03
 """A refinement lasts about this long, so that a new input need not wait; never less than one pass."""
 CHANNEL_SAMPLES = 32
 """Behind a picture of albedo, normals ...: passes are its antialiasing."""
+_MAPS = {"normal": "normal_world"}
+"""Names that the G-buffer has for channels, where they differ."""
 
 
 class DrgsRenderer(AbstractRenderer):
@@ -191,6 +194,21 @@ class Picture(AbstractPicture):
         from drgs.render.accumulate import resolve_frame
 
         return _pixels(resolve_frame(self._state), self._settings)
+
+    def linear(self) -> LinearPixels:
+        import torch
+
+        from drgs.render.accumulate import linear_picture, resolve_frame
+
+        channel = self._settings.channel
+        if channel == "final":
+            return linear_picture(self._state).cpu().numpy()
+        maps = resolve_frame(self._state).gbuffer
+        values = getattr(maps, _MAPS.get(channel, channel))
+        values = (values if values.ndim == 3 else values[..., None]).expand(-1, -1, 3)
+        nothing = torch.inf if channel == "depth" else 0.0
+        covered = maps.coverage[..., None] > 0
+        return torch.cat([torch.where(covered, values, nothing), maps.coverage.clamp(0, 1)[..., None]], -1).cpu().numpy()
 
     def pick(self, x: float, y: float) -> Picked | None:
         from drgs.render.accumulate import resolve_frame

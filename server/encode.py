@@ -1,4 +1,4 @@
-"""Pixels to picture files. JPEG while things move (about 1 ms for 800x800), PNG for the last, lossless frame."""
+"""Pixels to picture files. JPEG while things move (about 1 ms for 800x800), PNG for the last, lossless frame, EXR for further work."""
 
 import io
 
@@ -6,7 +6,8 @@ import numpy as np
 import simplejpeg
 from PIL import Image
 
-from server.render_session import Pixels
+from drgs.exchange.exr import encode_exr
+from server.render_session import LinearPixels, Pixels
 
 MOVING_QUALITY = 80
 STILL_QUALITY = 92
@@ -39,3 +40,9 @@ def encode_png(pixels: Pixels) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(pixels if has_alpha(pixels) else np.ascontiguousarray(pixels[..., :3])).save(stream, "PNG", compress_level=1)
     return stream.getvalue()
+
+
+def encode_exr_still(pixels: LinearPixels, exposure_stops: float) -> bytes:
+    """Channels R G B, and A where a pixel is not opaque; the exposure scales R, G and B."""
+    channels = {name: pixels[..., k] * np.float32(2.0**exposure_stops) for k, name in enumerate("RGB")}
+    return encode_exr(channels | ({"A": pixels[..., 3]} if (pixels[..., 3] < 1).any() else {}))

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from drgs.scene.edits import Edit
+from worker.requests import MAX_PICTURE_SAMPLES
 
 PROTOCOL_VERSION = 1
 """A client of another version is told so and closed with 1002."""
@@ -24,6 +25,9 @@ CLOSE_POLICY = 1008
 MAX_SIDE = 4096
 """Largest width or height that a viewer may ask for [pixels]."""
 MAX_PIXELS = 4_194_304
+MAX_STILL_PIXELS = 4096 * 2160
+"""Of one picture over REST, which is rendered once: what its sums fill of the memory is the limit."""
+MAX_STILL_SAMPLES = MAX_PICTURE_SAMPLES
 MAX_SPP_TARGET = 65535
 """The header holds 16 bits."""
 

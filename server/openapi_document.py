@@ -118,7 +118,8 @@ FILES: dict[str, tuple[str, ...]] = {
     "/api/assets/{asset_id}/export": ("application/octet-stream",),
     "/api/environments/{name}": ("image/x-exr",),
     "/api/environments/{name}/thumb.jpg": ("image/jpeg",),
-    "/api/sessions/{session_id}/frame.{suffix}": ("image/jpeg", "image/png"),
+    "/api/sessions/{session_id}/frame.{suffix}": ("image/jpeg", "image/png", "image/x-exr"),
+    "/api/sessions/{session_id}/export": ("application/octet-stream",),
 }
 """What a GET of these paths answers."""
 TEXTS = {

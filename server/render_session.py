@@ -17,6 +17,10 @@ from worker.start_view import FOV_Y_DEGREES, start_view
 
 Pixels: TypeAlias = np.ndarray
 """(height, width, 4) uint8, sRGB, straight alpha."""
+LinearPixels: TypeAlias = np.ndarray
+"""(height, width, 4) float32: linear values and coverage."""
+LINEAR_CHANNELS = ("final", "albedo", "roughness", "metallic", "normal", "depth")
+"""Of which there are values to work with, not only a picture to look at."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,11 @@ class AbstractPicture(ABC):
     @abstractmethod
     def resolve(self) -> Pixels:
         """What there is so far."""
+
+    @abstractmethod
+    def linear(self) -> LinearPixels:
+        """The values behind it, for one of LINEAR_CHANNELS. `final`: radiance before exposure and tone curve, multiplied with its coverage.
+        Others: as they are, with the coverage; 0 where nothing is, depth +inf."""
 
     @abstractmethod
     def pick(self, x: float, y: float) -> Picked | None:

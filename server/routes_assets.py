@@ -4,6 +4,7 @@ import json
 import shutil
 import tempfile
 import uuid
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +15,7 @@ from sqlalchemy.orm import Session
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 
+from drgs.scene.edits import Edit
 from server.answers import asset_info
 from server.context import ServerContext, context_of
 from server.problems import ProblemError
@@ -172,12 +174,26 @@ def read_asset_environment(asset_id: str, context: Context) -> FileResponse:
 @router.get("/assets/{asset_id}/export")
 async def export_asset(asset_id: str, format: ExportFormat, context: Context) -> FileResponse:
     """A download in another program's format, or the asset itself as a zip."""
+    return await write_export(context, asset_id, format, ())
+
+
+async def write_export(context: ServerContext, asset_id: str, format: ExportFormat, edits: Sequence[Edit]) -> FileResponse:
+    """A download of an asset with edits put into it.
+
+    Raises:
+        ProblemError: no such asset, it has nothing that the format holds, or the edits no longer apply.
+    """
     row = await run_in_threadpool(_read_row, context, asset_id)
     folder = Path(tempfile.mkdtemp(prefix=".export-", dir=context.directory.uploads))
-    out = folder / f"asset{_EXPORT_SUFFIXES[format]}"
+    out, listed = folder / f"asset{_EXPORT_SUFFIXES[format]}", folder / "edits.json"
     try:
         asset = await run_in_threadpool(bring_asset, context.directory, row.id)
-        await _run_tool("export", str(asset), str(out), format)
+        changes: tuple[str, ...] = ()
+        if edits:
+            listed.write_text(json.dumps([plain_edit(edit) for edit in edits]))
+            await run_in_threadpool(bring_edit_files, context.directory, edits)
+            changes = (str(listed), str(context.directory.environments), str(row.version + 1))
+        await _run_tool("export", str(asset), str(out), format, *changes)
     except (ProblemError, ArtifactError):
         shutil.rmtree(folder, ignore_errors=True)
         raise

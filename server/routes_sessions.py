@@ -5,17 +5,17 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Header, Query
 from fastapi import Path as PathParameter
-from fastapi.responses import Response
+from fastapi.responses import FileResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drgs.scene.edits import Edit
 from server.answers import session_info, snapshot_info
 from server.context import ServerContext, context_of
 from server.edit_log import EventKind
-from server.encode import encode_jpeg, encode_png
-from server.messages import CameraMessage, EditLog, Settings
+from server.encode import encode_exr_still, encode_jpeg, encode_png
+from server.messages import MAX_SIDE, MAX_STILL_PIXELS, MAX_STILL_SAMPLES, CameraMessage, EditLog, Settings
 from server.problems import ProblemError
-from server.render_session import Pixels
+from server.render_session import LINEAR_CHANNELS
 from server.rest_records import (
     AssetInfo,
     EditRequest,
@@ -27,7 +27,7 @@ from server.rest_records import (
     SnapshotInfo,
     SnapshotList,
 )
-from server.routes_assets import save_version
+from server.routes_assets import ExportFormat, save_version, write_export
 
 router = APIRouter(prefix="/api/sessions", tags=["sessions"])
 
@@ -36,8 +36,7 @@ Context = Annotated[ServerContext, Depends(context_of)]
 ClientKeyHeader = Annotated[str | None, Header(alias="Idempotency-Key", min_length=1, max_length=64)]
 SnapshotName = Annotated[str, PathParameter(min_length=1, max_length=80, pattern=r"^[^/\\x00-\\x1f]+$")]
 
-MAX_WORK = 4096 * 4096 * 64
-"""Pixels times samples of one picture."""
+_MEDIA_TYPES = {"jpg": "image/jpeg", "png": "image/png", "exr": "image/x-exr"}
 
 
 @router.post("", status_code=201)
@@ -120,13 +119,20 @@ async def save_session(session_id: str, context: Context, body: SaveRequest | No
     return await save_version(context, session, body.name if body else None)
 
 
+@router.get("/{session_id}/export")
+async def export_session(session_id: str, format: ExportFormat, context: Context) -> FileResponse:
+    """A download of the object as it is now, with the edits in force put into it. Nothing of it is kept; `save` keeps a version."""
+    session = await context.sessions.get(session_id)
+    return await write_export(context, session.asset_id, format, session.log.done)
+
+
 class FrameQuery(BaseModel):
     """Of one picture."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    width: Annotated[int, Field(ge=16, le=4096)] = 512
-    height: Annotated[int, Field(ge=16, le=4096)] = 512
+    width: Annotated[int, Field(ge=16, le=MAX_SIDE)] = 512
+    height: Annotated[int, Field(ge=16, le=MAX_SIDE)] = 512
     spp: Annotated[int, Field(ge=1, le=65535)] = 128
     bounces: Annotated[int, Field(ge=0, le=8)] = 1
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
@@ -139,10 +145,18 @@ class FrameQuery(BaseModel):
 
 
 @router.get("/{session_id}/frame.{suffix}")
-async def read_frame(session_id: str, suffix: Literal["jpg", "png"], context: Context, query: Annotated[FrameQuery, Query()]) -> Response:
-    """One finished picture."""
-    if query.width * query.height * query.spp > MAX_WORK:
-        raise ProblemError(422, f"A picture costs at most {MAX_WORK} samples in all; ask for fewer pixels or a smaller spp.")
+async def read_frame(
+    session_id: str, suffix: Literal["jpg", "png", "exr"], context: Context, query: Annotated[FrameQuery, Query()]
+) -> Response:
+    """One finished picture. PNG and JPEG show it as a screen does (sRGB). EXR holds the light itself: linear Rec.709 radiance as 32-bit
+    floats, scaled by the exposure and nothing else; with a transparent background also A, which R, G and B are multiplied with. Of a
+    channel other than `final` it holds the values themselves (normals in the world, depth in world units), not multiplied, and A."""
+    if suffix == "exr" and query.channel not in LINEAR_CHANNELS:
+        raise ProblemError(422, f"An EXR holds one of {', '.join(LINEAR_CHANNELS)}; ask for a PNG of {query.channel}.")
+    if query.width * query.height > MAX_STILL_PIXELS:
+        raise ProblemError(422, f"A picture has at most {MAX_STILL_PIXELS} pixels, as 4096x2160 has; found {query.width}x{query.height}.")
+    if query.width * query.height * query.spp > MAX_STILL_SAMPLES:
+        raise ProblemError(422, f"A picture costs at most {MAX_STILL_SAMPLES} samples in all; ask for fewer pixels or a smaller spp.")
     session = await context.sessions.get(session_id)
     posed = await context.sessions.load(session)
     assert session.loaded is not None
@@ -153,12 +167,13 @@ async def read_frame(session_id: str, suffix: Literal["jpg", "png"], context: Co
                 "type": "camera",
                 "world_from_camera": _matrix(query.world_from_camera) if query.world_from_camera else start.world_from_camera,
                 "fov_y_degrees": query.fov_y_degrees or start.fov_y_degrees,
-                "width": query.width,
-                "height": query.height,
+                "width": 16,
+                "height": 16,
             }
         )
     except ValidationError as error:
         raise ProblemError(422, f"{error.errors()[0]['msg']}.") from error
+    camera = camera.model_copy(update={"width": query.width, "height": query.height})  # may be larger than what is streamed
     settings = Settings(
         exposure_stops=query.exposure_stops,
         background=query.background,
@@ -175,11 +190,14 @@ async def read_frame(session_id: str, suffix: Literal["jpg", "png"], context: Co
         await asyncio.sleep(0)
 
     def finish() -> bytes:
-        pixels: Pixels = picture.resolve()
+        if suffix == "exr":
+            return encode_exr_still(picture.linear(), query.exposure_stops if query.channel == "final" else 0.0)
+        pixels = picture.resolve()
         return encode_png(pixels) if suffix == "png" else encode_jpeg(pixels, moving=False)
 
-    media_type = "image/png" if suffix == "png" else "image/jpeg"
-    return Response(await asyncio.wrap_future(call(finish)), media_type=media_type, headers={"x-drgs-revision": str(posed.revision)})
+    return Response(
+        await asyncio.wrap_future(call(finish)), media_type=_MEDIA_TYPES[suffix], headers={"x-drgs-revision": str(posed.revision)}
+    )
 
 
 def _matrix(text: str) -> tuple[tuple[float, ...], ...]:

@@ -4,13 +4,14 @@ The server calls it (`run_file_tool`), so that a decoder that crashes or swallow
 Exit code 2 and one sentence on stderr for wrong input. Commands:
     asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
     environment SOURCE OUT      EXR or Radiance HDR -> EXR
-    export ASSET OUT FORMAT     asset folder -> ply, ply3, glb, env (file formats) or zip (the asset itself)
+    export ASSET OUT FORMAT [EDITS ENVIRONMENTS N]      asset folder, with the edits put into it -> ply, ply3, glb, usd, env, or zip (the asset itself)
     version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
 """
 
 import asyncio
 import resource
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,12 +85,18 @@ def thumbnail(asset: "Asset") -> bytes:
 
 
 def make_version(asset_folder: Path, out: Path, edits: Path, environments: Path, version: int) -> None:
-    from drgs.scene.asset import load_asset, save_asset
+    from drgs.scene.asset import save_asset
+
+    made = edited_asset(asset_folder, edits, environments, version)
+    save_asset(made, out, thumbnail_jpeg=thumbnail(made))
+
+
+def edited_asset(asset_folder: Path, edits: Path, environments: Path, version: int) -> "Asset":
+    from drgs.scene.asset import load_asset
     from drgs.scene.edits import load_edits
     from worker.save_version import with_edits
 
-    made = with_edits(load_asset(asset_folder), load_edits(edits), environments, version)
-    save_asset(made, out, thumbnail_jpeg=thumbnail(made))
+    return with_edits(load_asset(asset_folder), load_edits(edits), environments, version)
 
 
 def make_environment(source: Path, out: Path) -> None:
@@ -101,12 +108,21 @@ def make_environment(source: Path, out: Path) -> None:
 def export(asset_folder: Path, out: Path, format: Any) -> None:
     from drgs.scene.asset import load_asset
 
-    asset = load_asset(asset_folder)
+    picture = asset_folder / "thumb.jpg"
+    write_export(load_asset(asset_folder), out, format, lambda: picture.read_bytes() if picture.exists() else None)
+
+
+def export_edited(asset_folder: Path, out: Path, format: Any, edits: Path, environments: Path, version: int) -> None:
+    made = edited_asset(asset_folder, edits, environments, version)
+    write_export(made, out, format, lambda: thumbnail(made))
+
+
+def write_export(asset: "Asset", out: Path, format: Any, picture: Callable[[], bytes | None]) -> None:
+    """`picture` is asked for where the format keeps one."""
     if format == "zip":
         from drgs.scene.asset import save_asset
 
-        picture = asset_folder / "thumb.jpg"
-        save_asset(asset, out, thumbnail_jpeg=picture.read_bytes() if picture.exists() else None)
+        save_asset(asset, out, thumbnail_jpeg=picture())
     else:
         from drgs.build.export_asset import export_asset
 
@@ -123,6 +139,8 @@ def main(arguments: list[str]) -> int:
                 make_environment(Path(source), Path(out))
             case ["export", asset, out, format]:
                 export(Path(asset), Path(out), format)
+            case ["export", asset, out, format, edits, environments, version]:
+                export_edited(Path(asset), Path(out), format, Path(edits), Path(environments), int(version))
             case ["version", asset, out, edits, environments, version]:
                 make_version(Path(asset), Path(out), Path(edits), Path(environments), int(version))
             case _:

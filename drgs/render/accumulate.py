@@ -26,7 +26,7 @@ from drgs.render.ray_memory import RayMemory
 from drgs.render.records import GBuffer, ShadingPoints
 from drgs.render.refresh_materials import refresh_gbuffer, refresh_points, refresh_primary
 from drgs.render.reproject import brighten, reproject
-from drgs.render.resolve_frame import frame_errors, frame_history, resolve_frame, window_gbuffer
+from drgs.render.resolve_frame import frame_errors, frame_history, linear_picture, resolve_frame, window_gbuffer
 from drgs.render.sample_rays import PointArrays, point_arrays, shading_points
 from drgs.render.shade import RayStarts, shade
 from drgs.render.trace_primary import PrimaryPoints, trace_primary_points
@@ -36,7 +36,16 @@ from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedScene
 from drgs.warp_torch import launch, thread_count, warp_array, warp_device
 
-__all__ = ["FrameState", "RenderSettings", "passes_needed", "refine_frame", "resolve_frame", "samples_a_pass", "start_frame"]
+__all__ = [
+    "FrameState",
+    "RenderSettings",
+    "linear_picture",
+    "passes_needed",
+    "refine_frame",
+    "resolve_frame",
+    "samples_a_pass",
+    "start_frame",
+]
 
 wp.set_module_options({"enable_backward": False})
 

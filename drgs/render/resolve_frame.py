@@ -64,6 +64,19 @@ def resolve_frame(state: FrameState) -> Frame:
     return Frame(rgba, linear, gbuffer, shown, metadata)
 
 
+def linear_picture(state: FrameState) -> Tensor:
+    """(height, width, 4) the light behind the picture so far, before exposure and tone curve.
+
+    Radiance is multiplied with the coverage, the last channel, as OpenEXR defines alpha. Over a background the coverage is 1.
+    """
+    frame, background = resolve_frame(state), _background(state)
+    alpha = frame.gbuffer.coverage.clamp(0, 1)[..., None]
+    color = torch.where(alpha > 0, alpha * frame.radiance_linear, 0.0)
+    if background is not None:
+        color, alpha = color + (1 - alpha) * background, torch.ones_like(alpha)
+    return torch.cat([color, alpha], -1)
+
+
 def _horizons(state: FrameState) -> dict[str, float]:
     """How far the search for rays that need no tracing has come, and what it found."""
     horizons = state.tracer.horizons if state.settings.skip else None

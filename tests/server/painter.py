@@ -16,6 +16,7 @@ from server.render_session import (
     AbstractRenderer,
     Bounds,
     Explanation,
+    LinearPixels,
     Picked,
     Pixels,
     view_of_bounds,
@@ -78,6 +79,12 @@ class Painting(AbstractPicture):
         pixels = np.empty((self.height, self.width, 4), np.uint8)
         alpha = 0 if self.settings.background == "transparent" else 255
         pixels[:] = (self.pose.edit_count, int(128 + 10 * self.settings.exposure_stops), min(self.samples, 255), alpha)
+        return pixels
+
+    def linear(self) -> LinearPixels:
+        pixels = np.empty((self.height, self.width, 4), np.float32)
+        transparent = self.settings.background == "transparent"
+        pixels[:] = (self.pose.edit_count, 0.25, min(self.samples, 255), 0.5 if transparent else 1.0)
         return pixels
 
     def explain(self) -> Explanation:

@@ -20,6 +20,23 @@ def opened(service: Service) -> tuple[str, str]:
     return asset, session
 
 
+def test_an_export_of_a_session_holds_its_edits_and_keeps_no_version(service: Service, tmp_path: Path) -> None:
+    asset, session = opened(service)
+    plain, edited = (service.client.get(f"/api/{which}/export?format=zip") for which in (f"assets/{asset}", f"sessions/{session}"))
+    assert edited.status_code == 200, edited.text
+    assert "four.zip" in edited.headers["content-disposition"]
+    roughness = []
+    for name, answer in (("plain", plain), ("edited", edited)):
+        (tmp_path / f"{name}.zip").write_bytes(answer.content)
+        roughness.append(float(load_asset(tmp_path / f"{name}.zip").mesh.roughness.max()))
+    assert roughness[0] > roughness[1] == 0.25
+    assert service.client.get(f"/api/sessions/{session}/export?format=glb").content[:4] == b"glTF"
+    refused = service.client.get(f"/api/sessions/{session}/export?format=ply")
+    assert refused.status_code == 422 and "Gaussians" in refused.json()["detail"]
+    assert service.client.get("/api/assets").json()["total"] == 1
+    assert list(service.context.directory.uploads.iterdir()) == []
+
+
 def files_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
