@@ -1,4 +1,5 @@
-"""The stored environments: EXR files in one folder, each with a small tone-mapped picture beside it."""
+"""The stored environments: EXR files in one folder, each with a small tone-mapped picture beside it. Some are computed rather than uploaded
+(made_environments.py): they are in the list of every installation, and written when they are first asked for."""
 
 import logging
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import simplejpeg
 
+from server.made_environments import LISTED, SIZE, is_made, make_environment
 from server.problems import artifact_problem
 from server.rest_records import EnvironmentInfo
 from worker.artifact_store import ArtifactError, ArtifactMissing, StoreAway
@@ -62,11 +64,29 @@ class EnvironmentStore:
         if _NAME.fullmatch(name) is None:
             return False
         try:
-            return bring_environment(self._directory, name).is_file()
+            if bring_environment(self._directory, name).is_file():
+                return True
         except ArtifactMissing:
-            return False
+            pass  # in no folder yet; it may be one of those that are computed
         except ArtifactError as error:
             raise artifact_problem(error) from error
+        if not is_made(name):
+            return False
+        self._make(name)
+        return True
+
+    def _make(self, name: str) -> None:
+        """Compute an environment, shared before it is seen; raises ProblemError where the store is away."""
+        with self._making:
+            if (self._folder / name).is_file():
+                return
+            draft = self._folder / f".{name}.new"
+            draft.write_bytes(make_environment(name))
+            try:
+                keep(self._directory, "environments", name, draft)
+            except ArtifactError as error:
+                raise artifact_problem(error) from error
+            draft.rename(self._folder / name)
 
     def path(self, name: str) -> Path:
         """
@@ -78,7 +98,7 @@ class EnvironmentStore:
         return self._folder / name
 
     def all(self) -> list[EnvironmentInfo]:
-        """By name; files that are no readable environments are left out."""
+        """By name; files that are no readable environments are left out, and of computed ones all but those that stand for their kind."""
         if self._directory.store is not None:
             return self._described({path.name for path in self._folder.glob("*.exr")} | set(self._directory.store.list("environments")))
         stamp = self._folder.stat().st_mtime_ns
@@ -88,7 +108,7 @@ class EnvironmentStore:
 
     def _described(self, names: set[str]) -> list[EnvironmentInfo]:
         found = []
-        for name in sorted(names):
+        for name in sorted({name for name in names if not is_made(name)} | set(LISTED)):
             try:
                 found.append(self.info(name))
             except (KeyError, ValueError):  # no name of ours, or not readable
@@ -101,6 +121,8 @@ class EnvironmentStore:
             KeyError: there is none of this name.
             ValueError: it cannot be read.
         """
+        if name in LISTED:  # which need not be there to be described
+            return EnvironmentInfo(name=name, title=LISTED[name], width=SIZE[0], height=SIZE[1])
         path = self.path(name)
         if name not in self._sizes:
             self._sizes[name] = exr_size(path)
@@ -108,8 +130,10 @@ class EnvironmentStore:
         return EnvironmentInfo(name=name, title=path.stem.replace("_", " ").replace("-", " ").capitalize(), width=width, height=height)
 
     def _free_name(self, wanted: str) -> str:
-        """A name of the wanted kind that no file has."""
+        """A name of the wanted kind that no file has, nor one that is computed."""
         stem = re.sub(r"[^A-Za-z0-9_-]+", "-", wanted).strip("-_")[:60] or "environment"
+        if stem.startswith(tuple(Path(name).stem for name in LISTED)):
+            stem = f"my-{stem}"
         candidates = (f"{stem}.exr", *(f"{stem}-{k}.exr" for k in range(2, 10_000)))
         return next(name for name in candidates if not self.has(name))
 

@@ -11,6 +11,8 @@ import pytest
 from conftest import Service
 from sqlalchemy.orm import Session
 
+from drgs.exchange.exr import decode_environment
+from server.made_environments import SIZE, is_made
 from server.routes_assets import remove_deleted_assets
 from worker.asset_folder import count_asset_folder
 from worker.database import AssetRow, JobRow, now
@@ -144,12 +146,36 @@ def exr(height: int, width: int) -> bytes:
     return stream.getvalue()
 
 
+def uploaded_environments(service: Service) -> list[str]:
+    """Names, without those that every service computes."""
+    listed = [found["name"] for found in service.client.get("/api/environments").json()["environments"]]
+    return [name for name in listed if not is_made(name)]
+
+
+def test_computed_environments_are_listed_by_every_service_and_made_when_asked_for(service: Service) -> None:
+    folder = service.context.directory.environments
+    listed = {found["name"]: found for found in service.client.get("/api/environments").json()["environments"]}
+    assert listed["sun-and-sky.exr"]["title"] == "Sun and sky" and "three-point-lights.exr" in listed
+    assert list(folder.iterdir()) == []
+    for name in (*listed, "sun-and-sky-12.exr"):
+        assert service.client.get(f"/api/environments/{name}/thumb.jpg").content.startswith(b"\xff\xd8")
+        made = decode_environment(service.client.get(f"/api/environments/{name}").content)
+        assert made.shape == (SIZE[1], SIZE[0], 3)
+    assert len(list(folder.glob("*.exr"))) == 3
+    # Of one sky's many heights the list holds the usual one.
+    assert uploaded_environments(service) == [] and len(service.client.get("/api/environments").json()["environments"]) == 2
+    is_problem(service.client.get("/api/environments/sun-and-sky-89.exr"), 404)
+    # An upload never takes the name of what is computed.
+    response = service.client.post("/api/environments", files={"file": ("sun and sky.exr", exr(8, 16))})
+    assert response.json()["name"] == "my-sun-and-sky.exr"
+
+
 def test_an_environment_is_uploaded_listed_and_shown(service: Service) -> None:
     for wanted in ("my-sky.exr", "my-sky-2.exr"):
         response = service.client.post("/api/environments", files={"file": ("../../My sky.exr", exr(8, 16))}, data={"name": "my sky"})
         assert response.status_code == 201, response.text
         assert response.json() == {"name": wanted, "title": wanted[:-4].replace("-", " ").capitalize(), "width": 16, "height": 8}
-    assert [found["name"] for found in service.client.get("/api/environments").json()["environments"]] == ["my-sky-2.exr", "my-sky.exr"]
+    assert uploaded_environments(service) == ["my-sky-2.exr", "my-sky.exr"]
     assert service.client.get("/api/environments/my-sky.exr/thumb.jpg").content.startswith(b"\xff\xd8")
     assert service.client.get("/api/environments/my-sky.exr").content[:4] == b"\x76\x2f\x31\x01"
 
@@ -158,7 +184,7 @@ def test_a_wrong_environment_is_refused_by_name(service: Service) -> None:
     sentence = is_problem(service.client.post("/api/environments", files={"file": ("sky.exr", exr(8, 8))}), 422)
     assert "twice as wide" in sentence and str(service.context.directory.root) not in sentence
     is_problem(service.client.post("/api/environments", files={"file": ("sky.exr", b"\x80\x04pickle")}), 422)
-    assert left_on_disk(service) == [] and service.client.get("/api/environments").json() == {"environments": []}
+    assert left_on_disk(service) == [] and uploaded_environments(service) == []
 
 
 def test_a_wrong_asset_is_refused(service: Service) -> None:

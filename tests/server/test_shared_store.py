@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from conftest import Service
 from painter import PaintedAsset, Painter
-from test_rest import exr, is_problem, zipped
+from test_rest import exr, is_problem, uploaded_environments, zipped
 
 from server.routes_assets import remove_deleted_assets
 from server.settings import Limits
@@ -66,7 +66,7 @@ def test_what_one_server_has_the_other_shows(pair: tuple[Service, Service]) -> N
     name = first.client.post("/api/environments", files={"file": ("sky.exr", exr(8, 16))}).json()["name"]
     body = {"edit": {"op": "environment", "file": name}}
     assert second.client.post(f"/api/sessions/{session}/edits", json=body).status_code == 200
-    assert [found["name"] for found in second.client.get("/api/environments").json()["environments"]] == [name]
+    assert uploaded_environments(second) == [name]
     again = second.client.post("/api/environments", files={"file": ("sky.exr", exr(8, 16))}).json()["name"]
     assert again == "sky-2.exr" and first.client.get(f"/api/environments/{again}").status_code == 200
 
@@ -83,7 +83,7 @@ def test_a_store_that_is_away_is_a_problem_that_passes(pair: tuple[Service, Serv
         ):
             assert "does not answer" in is_problem(answer, 503)
         assert first.client.get(f"/api/assets/{ASSET}/mesh.glb").status_code == 200  # it has the folder
-    assert first.client.get("/api/environments").json() == {"environments": []}
+    assert uploaded_environments(first) == []
     assert first.client.post("/api/environments", files={"file": ("sky.exr", exr(8, 16))}).status_code == 201
     assert second.client.get(f"/api/sessions/{session}/frame.jpg?spp=4").status_code == 200
 
