@@ -124,9 +124,11 @@ class Pose(AbstractPose):
     scene: "PosedScene"
     tracer: "AbstractTracer"
 
-    def region_at(self, position_world: "Tensor") -> int:
+    def vertex_at(self, position_world: "Tensor") -> int:
         """Selections refer to the object at rest, whose vertices have the numbers of the moved ones."""
-        vertex = int((self.scene.mesh.vertices - position_world).square().sum(-1).argmin())
+        return int((self.scene.mesh.vertices - position_world).square().sum(-1).argmin())
+
+    def region_of(self, vertex: int) -> int:
         return int(self._regions[vertex])
 
     @cached_property
@@ -217,13 +219,15 @@ class Picture(AbstractPicture):
         column, row = min(int(x * self.width), self.width - 1), min(int(y * self.height), self.height - 1)
         if float(maps.coverage[row, column]) < 0.5:
             return None
+        vertex = self.pose.vertex_at(maps.position_world[row, column])
         return Picked(
             position=tuple(maps.position_world[row, column].tolist()),
             normal=tuple(maps.normal_world[row, column].tolist()),
             albedo=tuple(maps.albedo[row, column].clamp(0, 1).tolist()),
             roughness=float(maps.roughness[row, column]),
             metallic=float(maps.metallic[row, column]),
-            region=self.pose.region_at(maps.position_world[row, column]),
+            region=self.pose.region_of(vertex),
+            rest=tuple(self.pose.asset.mesh.vertices[vertex].tolist()),
         )
 
     def explain(self) -> Explanation:

@@ -305,6 +305,8 @@ class PickedMessage(_Answer):
     metallic: float | None = None
     region: Annotated[int | None, Field(json_schema_extra={"x-optional": True})] = None
     """What a selection's `region` says for the patch of material here."""
+    rest: Annotated[Vector | None, Field(json_schema_extra={"x-optional": True})] = None
+    """The mesh's nearest vertex, where it is on the object at rest [world units]: what selections and grips refer to."""
 
 
 class SkippedWork(_Answer):

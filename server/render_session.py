@@ -42,6 +42,8 @@ class Picked:
     metallic: float
     region: int | None = None
     """Patch of material, as selections number them."""
+    rest: tuple[float, float, float] | None = None
+    """Where this place lies on the object at rest, up to the size of a face."""
 
 
 @dataclass(frozen=True)

@@ -300,6 +300,7 @@ class Connection:
                     roughness=picked.roughness,
                     metallic=picked.metallic,
                     region=picked.region,
+                    rest=picked.rest,
                 )
             )
 

@@ -203,7 +203,7 @@ def _apply_deformations(asset: Asset, edits: list[ShapeEdit], files: _Files) -> 
                 centers, tangents = drive_surfels(
                     mesh.vertices, vertices, mesh.faces, gradient, asset.binding, gaussians.centers, rest_tangents
                 )
-        elif edit.handles is not None:
+        elif edit.handles is not None and edit.handles.drag:
             handles, points = edit.handles, vertices if centers is None else torch.cat([vertices, centers])
             # What is held is prepared once for all targets that a drag passes through.
             grips = ("handles", *_shape_texts(edits[:index], files), _text_of_grips(edit))

@@ -145,8 +145,15 @@ class Handle(Grip):
 class Handles(_Plain):
     """What is dragged and what is held in place; the rest follows as rigidly as it can. Parts without a grip stay."""
 
-    drag: Annotated[list[Handle], Field(min_length=1, max_length=64)]
+    drag: Annotated[list[Handle], Field(max_length=64)] = []
     pin: Annotated[list[Grip], Field(max_length=64)] = []
+    """Alone, without anything dragged, they change nothing."""
+
+    @model_validator(mode="after")
+    def _holds_something(self) -> "Handles":
+        if not self.drag and not self.pin:
+            raise ValueError("handles drag or pin at least one part; found neither")
+        return self
 
 
 class DeformEdit(_Plain):

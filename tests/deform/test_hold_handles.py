@@ -107,13 +107,19 @@ def test_a_drag_prepares_the_object_once_and_leaves_no_trace(monkeypatch):
     assert len(made) == 3  # without its pin it is held otherwise
 
 
+def test_pins_alone_leave_the_very_same_object():
+    asset = bar_asset()
+    scene = pose(asset, handles(pin=[TOP, BOTTOM]))
+    assert scene.mesh.vertices is asset.mesh.vertices and scene.surfels.centers is asset.gaussians.centers
+
+
 @pytest.mark.parametrize(
     ("drag", "sentence"),
     [
         ([{"vertices": [10**6], "target": [0, 0, 0]}], "names vertex 1000000; the mesh has"),
         ([TOP | {"vertices": [1], "target": [0, 0, 0]}], "either vertices or point"),
         ([TOP], "target"),
-        ([], "drag"),
+        ([], "drag or pin at least one part"),
         ([TOP | {"target": [0, 0, float("nan")]}], "finite"),
         ([TOP | {"target": [1e300, 0, 0]}, BOTTOM | {"target": [0, 0, 0]}], "infinity|too far"),
     ],

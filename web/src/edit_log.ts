@@ -111,6 +111,7 @@ export function describeEdit(edit: Edit): string {
       return parts.join(', ');
     }
     case 'deform':
+      if (edit.handles) return `Handles: ${edit.handles.drag?.length ?? 0} moved, ${edit.handles.pin?.length ?? 0} held`;
       return edit.map ? `Deform: ${edit.map.type}` : 'Deform: vertices';
     case 'pose':
       return `Pose: ${edit.clip} at ${rounded(edit.time)} s`;

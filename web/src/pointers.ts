@@ -2,6 +2,7 @@
 
 import CameraControls from 'camera-controls';
 import { editLight, newKey } from './session';
+import { shapeTool } from './shaping';
 import { flying, light, tool } from './state';
 
 const DEGREES_PER_PIXEL = 0.4;
@@ -16,6 +17,10 @@ export interface PointerActions {
   select(event: PointerEvent): void;
   /** False where the brush met nothing: the drag then is the camera's. */
   paint(event: PointerEvent): boolean;
+  /** True where the gizmo took hold of something: the drag then is its own. */
+  grab(event: PointerEvent): boolean;
+  drag(event: PointerEvent): void;
+  release(event: PointerEvent): void;
   focus(event: MouseEvent): void;
 }
 
@@ -24,14 +29,20 @@ export function listenToPointers(stage: HTMLElement, controls: CameraControls, o
   let turning: { pointer: number; x: number; rotation: number; key: string } | null = null;
   let pressed: { pointer: number; x: number; y: number; at: number } | null = null;
   let painting: number | null = null;
+  let grabbing: number | null = null;
+  const brushes = () => shapeTool.value === 'pins' || (shapeTool.value === 'none' && tool.value === 'brush');
+  const clicks = () => shapeTool.value === 'handles' || (shapeTool.value === 'none' && tool.value !== 'all' && tool.value !== 'brush');
   stage.addEventListener(
     'pointerdown',
     (event) => {
       const turns = (event.button === 0 && event.altKey) || (event.button === 2 && event.shiftKey);
       pressed = event.button === 0 && event.isPrimary ? { pointer: event.pointerId, x: event.clientX, y: event.clientY, at: event.timeStamp } : null;
-      if (event.button === 0 && tool.value === 'brush' && !turns && on.paint(event)) painting = event.pointerId;
-      controls.enabled = !turns && painting === null;
-      if (painting !== null) stage.setPointerCapture(event.pointerId);
+      if (event.button === 0 && event.isPrimary && !turns && on.grab(event)) {
+        grabbing = event.pointerId;
+        pressed = null;
+      } else if (event.button === 0 && brushes() && !turns && on.paint(event)) painting = event.pointerId;
+      controls.enabled = !turns && painting === null && grabbing === null;
+      if (painting !== null || grabbing !== null) stage.setPointerCapture(event.pointerId);
       controls.mouseButtons.middle = event.shiftKey ? ACTION.TRUCK : event.ctrlKey ? ACTION.DOLLY : ACTION.ROTATE;
       if (!turns) return;
       turning = { pointer: event.pointerId, x: event.clientX, rotation: light.value.rotation, key: newKey() };
@@ -42,18 +53,20 @@ export function listenToPointers(stage: HTMLElement, controls: CameraControls, o
   );
   stage.addEventListener('pointermove', (event) => {
     if (event.pointerId === painting) on.paint(event);
+    if (event.pointerId === grabbing) on.drag(event);
     if (!turning || event.pointerId !== turning.pointer) return;
     const degrees = turning.rotation + (event.clientX - turning.x) * DEGREES_PER_PIXEL;
     editLight({ rotation: Math.round((((degrees % 360) + 360) % 360) * 10) / 10 }, turning.key);
   });
-  const release = () => {
-    turning = painting = pressed = null;
+  const release = (event: PointerEvent) => {
+    if (event.pointerId === grabbing) on.release(event);
+    turning = painting = grabbing = pressed = null;
     controls.enabled = true;
   };
   stage.addEventListener('pointerup', (event) => {
     const isClick = pressed?.pointer === event.pointerId && Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) < CLICK_PIXELS && event.timeStamp - pressed.at < CLICK_MS;
-    if (isClick && !event.altKey && tool.value !== 'all' && tool.value !== 'brush') on.select(event);
-    release();
+    if (isClick && !event.altKey && clicks()) on.select(event);
+    release(event);
   });
   stage.addEventListener('pointercancel', release);
   stage.addEventListener('contextmenu', (event) => event.preventDefault());

@@ -272,7 +272,7 @@ export interface Handle {
 
 /** What is dragged and what is held in place; the rest follows as rigidly as it can. Parts without a grip stay. */
 export interface Handles {
-  drag: Handle[];
+  drag?: Handle[];
   pin?: Grip[];
 }
 
@@ -379,6 +379,8 @@ export interface PickedMessage {
   metallic: number | null;
   /** What a selection's `region` says for the patch of material here. */
   region?: number | null;
+  /** The mesh's nearest vertex, where it is on the object at rest [world units]: what selections and grips refer to. */
+  rest?: [number, number, number] | null;
 }
 
 export interface PoseEdit {

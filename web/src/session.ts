@@ -233,23 +233,30 @@ export function useCapturedLight(): void {
 
 export const isTwin = (edit: Edit) => (other: Edit) => edit.op === 'deform' && other.op === 'deform' && edit.map != null && edit.map.type === other.map?.type;
 
-let nextTime: Edit | null = null;
-let timeKey = '';
+interface Change {
+  after(edits: Edit[]): Edit[];
+  key: string;
+}
+/** The newest one that is not sent yet. */
+let waiting: Change | null = null;
 
-/** Another moment of what moves, in place of the last one; with one key, a film is one step of undo. Moments that the server has no time for are left out. */
-export function editTime(edit: Edit, key: string): void {
-  timeKey = key;
-  const waits = nextTime !== null;
-  nextTime = edit;
-  if (!splicing) playNext();
-  else if (!waits) later.push(playNext);
+/**
+ * Change the log as the server takes it: with one key, a film or a drag is one step of undo. Changes that the server has no time for are
+ * left out, so each one must say all that the last one said.
+ */
+export function changeFlowing(after: (edits: Edit[]) => Edit[], key: string): void {
+  if (waiting?.key === key) return void (waiting.after = after);
+  if (!splicing) return replaceEdits(after(edits.value), key);
+  const change: Change = { after, key };
+  waiting = change; // the last one of a gesture that is over keeps its own place
+  later.push(() => {
+    if (waiting === change) waiting = null;
+    replaceEdits(change.after(edits.value), change.key);
+  });
 }
 
-function playNext(): void {
-  const edit = nextTime;
-  nextTime = null;
-  if (edit) replaceEdits(withReplaced(edits.value, edit, (other) => other.op === edit.op), timeKey);
-}
+/** Another moment of what moves, in place of the last one. */
+export const editTime = (edit: Edit, key: string) => changeFlowing((now) => withReplaced(now, edit, (other) => other.op === edit.op), key);
 
 // ---- edits that take an earlier one's place ------------------------------------------------------------------------------
 
@@ -304,7 +311,7 @@ function endSplice(): void {
 
 /** What is waiting to become of the log is wanted no more, or can't be. */
 function dropSplice(): void {
-  splicing = null;
+  splicing = waiting = null;
   later = [];
   draft.value = null;
 }

@@ -1,17 +1,26 @@
 /** Where deform edits move points: the twin of drgs/deform/maps.py, for the local picture and for sliders. */
 
+import type { Triple } from './color';
 import type { BendMap, Edit, LatticeMap, StretchMap, TwistMap } from './protocol.gen';
 
 export type AnalyticMap = TwistMap | BendMap | StretchMap | LatticeMap;
 
-/** Whether the browser can follow: simulations, clips and files of vertices are known to the server only. */
+/** Whether the browser can follow: simulations, clips, files of vertices and dragged handles are known to the server only. */
 export function isAnalytic(edits: Edit[]): boolean {
-  return edits.every((edit) => edit.op === 'material' || edit.op === 'environment' || (edit.op === 'deform' && edit.map != null));
+  return edits.every((edit) => edit.op === 'material' || edit.op === 'environment' || (edit.op === 'deform' && (edit.map != null || (edit.handles != null && !edit.handles.drag?.length))));
 }
+
+const mapsOf = (edits: Edit[]) => edits.flatMap((edit) => (edit.op === 'deform' && edit.map ? [edit.map] : []));
+
+/** Where the maps among these edits take a point. */
+export const movePoint = (point: Triple, edits: Edit[]): Triple => mapsOf(edits).reduce((at, map) => mover(map)(...at), point);
+
+/** The point that they take there. */
+export const unmovePoint = (place: Triple, edits: Edit[]): Triple => mapsOf(edits).reduceRight((at, map) => unmoved(map, at), place);
 
 /** Moved points, three numbers each; the same array where no edit moves anything. */
 export function deformPoints(points: Float32Array, edits: Edit[]): Float32Array {
-  const maps = edits.flatMap((edit) => (edit.op === 'deform' && edit.map ? [edit.map] : []));
+  const maps = mapsOf(edits);
   if (maps.length === 0) return points;
   const result = points.slice();
   for (const map of maps) {
@@ -21,7 +30,7 @@ export function deformPoints(points: Float32Array, edits: Edit[]): Float32Array 
   return result;
 }
 
-type Mover = (x: number, y: number, z: number) => [number, number, number];
+type Mover = (x: number, y: number, z: number) => Triple;
 
 /** sin(t) / t. */
 const sinc = (t: number) => (Math.abs(t) < 1e-6 ? 1 - (t * t) / 6 : Math.sin(t) / t);
@@ -48,6 +57,43 @@ function mover(map: AnalyticMap): Mover {
   }
 }
 
+function unmoved(map: AnalyticMap, place: Triple): Triple {
+  const [x, y, z] = place;
+  switch (map.type) {
+    case 'twist':
+      return mover({ type: 'twist', rate: -map.rate })(x, y, z);
+    case 'bend': {
+      const k = map.curvature;
+      if (Math.abs(k) < 1e-9) return place;
+      return [(1 - Math.hypot(k * z, 1 - k * x)) / k, y, Math.atan2(k * z, 1 - k * x) / k];
+    }
+    case 'stretch':
+      return mover({ type: 'stretch', factor: 1 / map.factor })(x, y, z);
+    case 'lattice':
+      return solve(latticeMover(map), place, (map.maximum[2] - map.minimum[2]) * 1e-4);
+  }
+}
+
+/** The point that `move` takes to `place`, by Newton's method from there; slopes are differences over `step`. */
+function solve(move: Mover, place: Triple, step: number): Triple {
+  let at = place;
+  for (let round = 0; round < 20; round++) {
+    const here = move(...at);
+    const miss = place.map((value, axis) => value - here[axis]!) as Triple;
+    if (Math.hypot(...miss) < 1e-3 * step) break;
+    const columns = [0, 1, 2].map((axis) => {
+      const beside = move(...(at.map((value, k) => (k === axis ? value + step : value)) as Triple));
+      return beside.map((value, k) => (value - here[k]!) / step) as Triple;
+    }) as [Triple, Triple, Triple];
+    const volume = determinant(...columns);
+    if (Math.abs(volume) < 1e-9) break; // flattened: no one point goes there
+    at = at.map((value, axis) => value + determinant(...(columns.with(axis, miss) as [Triple, Triple, Triple])) / volume) as Triple;
+  }
+  return at;
+}
+
+const determinant = (a: Triple, b: Triple, c: Triple) => a[0] * (b[1] * c[2] - b[2] * c[1]) - b[0] * (a[1] * c[2] - a[2] * c[1]) + c[0] * (a[1] * b[2] - a[2] * b[1]);
+
 function latticeMover({ minimum, maximum, control_points: grid }: LatticeMap): Mover {
   const sizes = [grid.length, grid[0]!.length, grid[0]![0]!.length];
   return (...point) => {
@@ -72,11 +118,9 @@ function bernstein(t: number, degree: number): number[] {
   return values;
 }
 
-// ---- the lattice that the sliders show: eight corners, each level a scaled and shifted rectangle -------------------------
-
 export interface Bounds {
-  minimum: [number, number, number];
-  maximum: [number, number, number];
+  minimum: Triple;
+  maximum: Triple;
 }
 
 export function boundsOf(points: Float32Array): Bounds {
@@ -86,34 +130,4 @@ export function boundsOf(points: Float32Array): Bounds {
     if (value > result.maximum[i % 3]!) result.maximum[i % 3] = value;
   });
   return result;
-}
-
-/** Widths of top and foot as factors; how far the top leans, in heights. */
-export interface Lattice {
-  top: number;
-  foot: number;
-  leanX: number;
-  leanY: number;
-}
-
-export function latticeOf({ top, foot, leanX, leanY }: Lattice, { minimum, maximum }: Bounds): LatticeMap {
-  const height = maximum[2] - minimum[2];
-  const lean = [leanX * height, leanY * height];
-  const corner = (i: number, j: number, k: number): [number, number, number] => {
-    const at = [i, j].map((side, axis) => {
-      const [low, high] = [minimum[axis]!, maximum[axis]!];
-      return (low + high) / 2 + (side - 0.5) * (high - low) * (k ? top : foot) + (k ? lean[axis]! : 0);
-    });
-    return [at[0]!, at[1]!, k ? maximum[2] : minimum[2]];
-  };
-  return { type: 'lattice', minimum, maximum, control_points: [0, 1].map((i) => [0, 1].map((j) => [0, 1].map((k) => corner(i, j, k)))) };
-}
-
-export function readLattice({ minimum, maximum, control_points: grid }: LatticeMap): Lattice {
-  const width = Math.max(1e-9, maximum[0] - minimum[0]);
-  const height = Math.max(1e-9, maximum[2] - minimum[2]);
-  const at = (i: number, j: number, k: number) => grid.at(-i)!.at(-j)!.at(-k)!; // 0: first, 1: last
-  const span = (k: number) => (at(1, 0, k)[0] - at(0, 0, k)[0]) / width;
-  const lean = (axis: 0 | 1) => ((at(0, 0, 1)[axis] + at(1, 1, 1)[axis]) / 2 - (minimum[axis] + maximum[axis]) / 2) / height;
-  return { top: span(1), foot: span(0), leanX: lean(0), leanY: lean(1) };
 }

@@ -1,7 +1,7 @@
 /** The one table of keys: it feeds the keyboard handler, the tool-tips and the `?` help. Pointer rows are for the help only. */
 
 export interface Shortcut {
-  group: 'Camera' | 'Light' | 'Edit' | 'View' | 'Panels';
+  group: 'Camera' | 'Light' | 'Edit' | 'Shape' | 'View' | 'Panels';
   /** As `chordOf` writes it, e.g. `mod+shift+z`; several chords may do the same. Empty for pointer gestures. */
   chords: string[];
   /** What the help shows for a gesture without keys. */
@@ -12,7 +12,7 @@ export interface Shortcut {
 
 export type ActionName =
   | 'frame' | 'home' | 'undo' | 'redo' | 'help' | 'escape' | 'local' | 'theme' | 'library' | 'inspector'
-  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'still' | 'before' | 'fly' | 'all' | 'copy' | 'paste' | 'show';
+  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'still' | 'remove' | 'turn' | 'before' | 'fly' | 'all' | 'copy' | 'paste' | 'show';
 
 export const shortcuts: Shortcut[] = [
   { group: 'Camera', chords: [], gesture: 'Left drag, one finger', text: 'Orbit' },
@@ -33,6 +33,9 @@ export const shortcuts: Shortcut[] = [
   { group: 'Edit', chords: ['mod+v'], text: 'Paste the material', action: 'paste' },
   { group: 'Edit', chords: ['b'], gesture: 'B, held', text: 'See the object as captured', action: 'before' },
   { group: 'Edit', chords: [], gesture: 'Double-click a slider', text: 'Take that value’s edits back' },
+  { group: 'Shape', chords: [], gesture: 'Click, handles on', text: 'Put a handle, or choose one' },
+  { group: 'Shape', chords: ['delete', 'backspace'], text: 'Remove the chosen handle', action: 'remove' },
+  { group: 'Shape', chords: ['r'], text: 'Move or turn it', action: 'turn' },
   { group: 'View', chords: ['1'], text: 'Final picture', action: 'channel1' },
   { group: 'View', chords: ['2'], text: 'Albedo', action: 'channel2' },
   { group: 'View', chords: ['3'], text: 'Roughness', action: 'channel3' },
@@ -45,7 +48,7 @@ export const shortcuts: Shortcut[] = [
   { group: 'Panels', chords: ['i'], text: 'Inspector', action: 'inspector' },
   { group: 'Panels', chords: ['t'], text: 'Dark or light theme', action: 'theme' },
   { group: 'Panels', chords: ['?'], text: 'This list', action: 'help' },
-  { group: 'Panels', chords: ['escape'], text: 'Close what is open', action: 'escape' },
+  { group: 'Panels', chords: ['escape'], text: 'Close what is open, let go of the chosen handle', action: 'escape' },
 ];
 
 const isApple = /Mac|iPhone|iPad/.test(navigator.platform);
@@ -61,7 +64,7 @@ export function chordOf(event: KeyboardEvent): string {
 }
 
 export function chordText(chord: string): string {
-  const names: Record<string, string> = isApple ? { mod: '⌘', shift: '⇧', alt: '⌥', escape: 'Esc' } : { mod: 'Ctrl', shift: 'Shift', alt: 'Alt', escape: 'Esc' };
+  const names: Record<string, string> = isApple ? { mod: '⌘', shift: '⇧', alt: '⌥', escape: 'Esc', delete: 'Del', backspace: '⌫' } : { mod: 'Ctrl', shift: 'Shift', alt: 'Alt', escape: 'Esc', delete: 'Del', backspace: 'Backspace' };
   return chord.split('+').map((part) => names[part] ?? part.toUpperCase()).join(isApple ? '' : '+');
 }
 

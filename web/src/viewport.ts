@@ -11,12 +11,14 @@ import { Box3, Matrix4, MOUSE, PerspectiveCamera, Quaternion, Raycaster, Sphere,
 import * as api from './api';
 import { Flight } from './flight';
 import { frameBox } from './framing';
+import { Gizmo } from './gizmo';
 import { LocalPace } from './local_pace';
 import { LocalPicture } from './local_picture';
 import { FLAG_CONVERGED, FLAG_MOVING, MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from './protocol.gen';
 import { listen, pick, sendCamera } from './session';
 import { listenToPointers } from './pointers';
 import { paint, selectAt } from './selecting';
+import { choose, putHandle, shapeTool } from './shaping';
 import { viewNow, type Row, type View } from './viewpoint';
 import { deformPoints, isAnalytic } from './shape';
 import { balls, ballsWanted, before, capturedLight, draft, edits, flash, flying, light, localPicture, log, materials, mesh, notify, pending, resolution, selectionWeights, session, settings, tool } from './state';
@@ -57,6 +59,7 @@ export class Viewport {
   private flashedAt = -Infinity;
   private readonly stillMotion = matchMedia('(prefers-reduced-motion: reduce)').matches;
   private readonly flight: Flight;
+  private readonly gizmo: Gizmo;
 
   constructor(
     private readonly stage: HTMLElement,
@@ -76,11 +79,15 @@ export class Viewport {
       notify('This browser offers no WebGL 2, so the instant local picture is off; traced pictures work.', 'info');
       localPicture.value = false;
     }
+    this.gizmo = new Gizmo(stage);
     this.flight = new Flight(this.camera, this.controls, this.bounds);
     listen(this.onHello, this.onFrame);
     listenToPointers(stage, this.controls, {
       select: (event) => this.selectAt(event),
       paint: (event) => this.paintAt(event),
+      grab: (event) => this.gizmo.grab(event),
+      drag: (event) => this.gizmo.drag(event),
+      release: (event) => this.gizmo.release(event),
       focus: (event) => this.focusAt(event),
     });
     new ResizeObserver(this.onResize).observe(stage);
@@ -230,7 +237,7 @@ export class Viewport {
       if (ballsWanted.value && mesh.value) this.drawBalls();
     });
     effect(() => {
-      this.stage.dataset.tool = tool.value;
+      this.stage.dataset.tool = shapeTool.value === 'none' ? tool.value : shapeTool.value;
     });
     effect(() => {
       const { background } = settings.value;
@@ -304,6 +311,7 @@ export class Viewport {
     }
     this.sendPose();
     this.drawLocal(now, moved);
+    this.drawGizmo();
     this.stage.dataset.moving = String(now - this.movedAt < MOVING_MS);
   };
 
@@ -330,6 +338,13 @@ export class Viewport {
     const { rotation, intensity } = light.value;
     this.local!.render(this.camera, Math.max(0.002 * radius, distance - 1.5 * radius), distance + 1.5 * radius, rotation, intensity, settings.value.exposure_stops, strength, overlay);
     this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
+  }
+
+  private drawGizmo(): void {
+    const { radius, center } = this.bounds;
+    const distance = this.camera.position.distanceTo(center);
+    // Handles may be taken far from the object.
+    this.gizmo.draw(this.camera, 0.002 * radius, distance + 1000 * radius, this.stage.clientWidth, this.stage.clientHeight, pixelRatio());
   }
 
   private resizeLocal(): void {
@@ -381,8 +396,20 @@ export class Viewport {
   }
 
   private selectAt(event: MouseEvent): void {
+    if (shapeTool.value === 'handles') return this.putHandleAt(event);
     const hit = this.pickLocally(event);
     if (hit) selectAt({ point: hit.rest, vertex: hit.vertex });
+  }
+
+  /** The server knows where dragged surfaces are at rest. */
+  private putHandleAt(event: MouseEvent): void {
+    const [x, y] = this.shareAt(event);
+    const hit = isAnalytic(edits.value) ? this.local?.pick(this.camera, 2 * x - 1, 1 - 2 * y) : null;
+    if (hit) return putHandle(hit.rest);
+    void pick(x, y)?.then((picked) => {
+      if (picked.hit && picked.rest) putHandle(picked.rest);
+      else choose(null);
+    });
   }
 
   private paintAt(event: PointerEvent): boolean {

@@ -1,6 +1,8 @@
 import { expect, it } from 'vitest';
+import { adjusted, cornersOf, edgesOf, latticeOf, readLattice, restLattice, withCorner } from '../src/lattice';
+import type { Edit } from '../src/protocol.gen';
 import type { AnalyticMap } from '../src/shape';
-import { boundsOf, deformPoints, latticeOf, readLattice } from '../src/shape';
+import { boundsOf, deformPoints, movePoint, unmovePoint } from '../src/shape';
 
 const moved = (map: AnalyticMap, ...point: number[]) => [...deformPoints(Float32Array.from(point), [{ op: 'deform', map }])];
 const close = (found: number[], wanted: number[]) => found.forEach((value, i) => expect(value).toBeCloseTo(wanted[i]!, 5));
@@ -28,4 +30,21 @@ it('a lattice at rest moves nothing, and its sliders can be read back', () => {
 it('without deformations the same array comes back', () => {
   const points = new Float32Array(3);
   expect(deformPoints(points, [{ op: 'environment' }])).toBe(points);
+});
+
+it('maps one behind the other can be taken back', () => {
+  const bounds = boundsOf(Float32Array.from([-1, -2, 0, 1, 2, 3]));
+  const lattice = withCorner(latticeOf({ top: 0.6, foot: 1.2, leanX: 0.3, leanY: 0 }, bounds), 7, [1.4, 1.1, 3.5]);
+  const edits: Edit[] = ([{ type: 'twist', rate: 2 }, { type: 'bend', curvature: 0.4 }, { type: 'stretch', factor: 1.5 }, lattice] as AnalyticMap[]).map((map) => ({ op: 'deform', map }));
+  for (const point of [[0.5, -1, 2.5], [-0.9, 0.2, 0.1]] as [number, number, number][]) close(unmovePoint(movePoint(point, edits), edits), point);
+});
+
+it('a corner moves alone, and the sliders leave it its own way', () => {
+  const map = restLattice(boundsOf(Float32Array.from([0, 0, 0, 1, 1, 1])));
+  const moved = withCorner(map, 7, [1.5, 1, 1]);
+  expect(cornersOf(moved).filter(({ place, rest }) => place.some((value, axis) => value !== rest[axis])).map(({ number }) => number)).toEqual([7]);
+  const leaning = adjusted(moved, { leanX: readLattice(moved).leanX + 0.5 });
+  close(cornersOf(leaning)[7]!.place, [2, 1, 1]);
+  close(cornersOf(leaning)[1]!.place, [0.5, 0, 1]);
+  expect(edgesOf(map)).toHaveLength(12);
 });

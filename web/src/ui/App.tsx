@@ -3,6 +3,7 @@
 import { useEffect, useRef, useState } from 'preact/hooks';
 import { redo, undo, changeSettings } from '../session';
 import { selectAll } from '../selecting';
+import { choose, removeChosen, turning } from '../shaping';
 import { listenForKeys, titleFor, type Actions } from '../shortcuts';
 import { assets, before, dismiss, flash, flying, helpOpen, inspectorOpen, libraryOpen, localPicture, log, notices, notify, session, theme } from '../state';
 import type { Viewport } from '../viewport';
@@ -41,11 +42,14 @@ export function App() {
       help: () => (helpOpen.value = !helpOpen.value),
       escape: () => {
         helpOpen.value = flying.value = false;
+        choose(null);
         (document.activeElement as HTMLElement | null)?.blur();
       },
       fly: () => session.value && (flying.value = !flying.value),
       all: selectAll,
       show: () => flash.value++,
+      remove: removeChosen,
+      turn: () => (turning.value = !turning.value),
       copy: copyMaterial,
       paste: pasteMaterial,
       before: () => (before.value = true),

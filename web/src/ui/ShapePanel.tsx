@@ -1,14 +1,14 @@
-/** Twist, bend, stretch, a lattice of eight corners, and matter that falls. */
+/** Twist, bend, stretch, handles, a lattice of eight corners, and matter that falls. */
 
-import { computed } from '@preact/signals';
+import { readLattice, type Lattice } from '../lattice';
 import type { Edit } from '../protocol.gen';
-import { boundsOf, latticeOf, readLattice, type AnalyticMap, type Lattice } from '../shape';
+import type { AnalyticMap } from '../shape';
+import { adjustLattice, bounds, chooseShapeTool, lattice, shapeTool } from '../shaping';
 import { commitDraft, draftEdit, isTwin, replaceEdits } from '../session';
-import { edits, mesh } from '../state';
-import { Section, Slider } from './fields';
+import { edits } from '../state';
+import { Section, Slider, Switch } from './fields';
+import { Grabbed, Handles } from './Handles';
 import { Simulation } from './Simulation';
-
-const bounds = computed(() => boundsOf(mesh.value?.positions ?? new Float32Array(3)));
 
 type Kind = AnalyticMap['type'];
 const newest = <K extends Kind>(type: K): Extract<AnalyticMap, { type: K }> | null => {
@@ -27,6 +27,7 @@ export function ShapePanel() {
   return (
     <>
       <Maps />
+      <Handles />
       <Corners />
       <Simulation height={bounds.value.maximum[2] - bounds.value.minimum[2]} foot={bounds.value.minimum[2]} />
     </>
@@ -55,15 +56,16 @@ function Maps() {
 }
 
 function Corners() {
-  const map = newest('lattice');
-  const lattice = map ? readLattice(map) : { top: 1, foot: 1, leanX: 0, leanY: 0 };
+  const map = lattice.value;
+  const now = map ? readLattice(map) : { top: 1, foot: 1, leanX: 0, leanY: 0 };
   const slider = (label: string, key: keyof Lattice, min: number, max: number, unit: string) => (
-    <Slider label={label} unit={unit} value={lattice[key]} min={min} max={max} step={0.01} unset={!map} onChange={(value) => deform(latticeOf({ ...lattice, [key]: value }, map ?? bounds.value))} onCommit={commitDraft} onReset={map ? () => resetCorner(key) : undefined} />
+    <Slider label={label} unit={unit} value={now[key]} min={min} max={max} step={0.01} unset={!map} onChange={(value) => adjustLattice({ [key]: value })} onCommit={commitDraft} onReset={map ? () => resetCorner(key) : undefined} />
   );
   const resetCorner = (key: keyof Lattice) => {
-    deform(latticeOf({ ...lattice, [key]: key === 'top' || key === 'foot' ? 1 : 0 }, map!));
+    adjustLattice({ [key]: key === 'top' || key === 'foot' ? 1 : 0 });
     commitDraft();
   };
+  const shown = shapeTool.value === 'lattice';
   return (
     <Section title="Lattice" open={false}>
       {slider('Top', 'top', 0.1, 3, '×')}
@@ -71,6 +73,13 @@ function Corners() {
       {slider('Lean X', 'leanX', -1, 1, '')}
       {slider('Lean Y', 'leanY', -1, 1, '')}
       <p class="hint">Widths of top and foot, and how far the top leans, in heights of the object.</p>
+      <Switch label="Corners on the picture" value={shown} onChange={(on) => chooseShapeTool(on ? 'lattice' : 'none')} />
+      {shown && <Grabbed name="Corner" hint="Drag a corner, or choose one and enter where it goes. The object follows at once; the traced picture when you let go." />}
+      {map && (
+        <div class="buttons">
+          <button onClick={without('lattice')}>Remove the lattice</button>
+        </div>
+      )}
     </Section>
   );
 }

@@ -167,6 +167,37 @@ export function ColorField({ label, value, unset, onChange, onCommit, onReset }:
   );
 }
 
+interface PlaceProps {
+  label: string;
+  value: Triple;
+  step: number;
+  unit?: string;
+  onEnter(value: Triple): void;
+}
+
+/** Three numbers: a place, or a turn. */
+export function PlaceField({ label, value, step, unit, onEnter }: PlaceProps) {
+  const digits = Math.max(0, Math.ceil(-Math.log10(step) - 1e-9));
+  return (
+    <div class="numbers" role="group" aria-label={label}>
+      <span>{unit ? `${label} ${unit}` : label}</span>
+      {(['x', 'y', 'z'] as const).map((name, i) => (
+        <Entry
+          type="number"
+          aria-label={`${label} ${name}`}
+          title={name}
+          step={step}
+          value={value[i]!.toFixed(digits)}
+          onEnter={(text) => {
+            const number = Number(text);
+            if (text.trim() !== '' && Number.isFinite(number)) onEnter(value.with(i, number) as Triple);
+          }}
+        />
+      ))}
+    </div>
+  );
+}
+
 interface ChoiceProps<T extends string> {
   label: string;
   /** Null: none of them. */
