@@ -16,8 +16,9 @@ import simplejpeg
 
 from drgs.scene.edits import EnvironmentEdit, PoseEdit
 from worker.builders import BuildProgress, BuildStopped
+from worker.camera_path import path_views
 from worker.job_run import AbstractJobRun, JobContext
-from worker.requests import OWN_LIGHT, RenderRequest, RenderVariant
+from worker.requests import FILM_FPS, OWN_LIGHT, RenderRequest, RenderVariant
 from worker.start_view import FILL, FOV_Y_DEGREES, start_view
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 SLICE_SECONDS = 0.4
 """Of rendering between two looks at the cancel flag."""
-CLIP_FPS = 24
 PREVIEW_SIDE = 256
 
 
@@ -89,6 +89,9 @@ class RenderRun(AbstractJobRun):
                 (f"{k:04d}", turntable_view(low, high, 360 * table.turns * k / table.frames, table.elevation_degrees), FOV_Y_DEGREES)
                 for k in range(table.frames)
             ]
+        elif asked.path is not None:
+            views = path_views(asked.path, asked.video_fps or FILM_FPS)
+            turned = [(f"{k:04d}", matrix, fov) for k, (matrix, fov) in enumerate(views)]
         elif asked.cameras:
             turned = [(camera.name, np.array(camera.world_from_camera), camera.fov_y_degrees) for camera in asked.cameras]
         else:
@@ -135,6 +138,7 @@ class _Renderer:
         settings = RenderSettings(
             samples_per_pixel=asked.spp,
             bounces=asked.bounces,
+            exposure=asked.exposure_stops,
             denoise="svgf" if asked.denoise else "none",
             background="environment" if asked.background == "environment" else "transparent",
         )
@@ -163,7 +167,7 @@ class _Renderer:
             return self._still
         edits, clip = list(self._edits), self._asked.clip
         if clip is not None:
-            edits.append(PoseEdit(op="pose", clip=clip, time=index / (self._asked.video_fps or CLIP_FPS)))
+            edits.append(PoseEdit(op="pose", clip=clip, time=index / (self._asked.video_fps or FILM_FPS)))
         self._job.bring_edit_files(edits)
         scene = pose_scene(self._asset, edits, self._job.directory.environments, confine=True)
         made = scene, build_tracer(scene.mesh)

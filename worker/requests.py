@@ -3,6 +3,7 @@
 Scenes of simulations are checked by the deform package where a job is made (`check_simulation`), since that imports torch.
 """
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -18,6 +19,8 @@ FILE_SUFFIXES: dict[FileFormat, str] = {"ply": ".ply", "ply3": ".ply", "glb": ".
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.]{0,59}$"
 """Of pictures and variants: they become parts of file names, joined by `-`."""
 MAX_PICTURES = 20_000
+FILM_FPS = 24
+"""Of moving pictures, where a request does not say."""
 MAX_PICTURE_SAMPLES = 4096 * 4096 * 64
 """Pixels times samples of one picture."""
 OWN_LIGHT = "own"
@@ -26,6 +29,7 @@ OWN_LIGHT = "own"
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Row = tuple[Finite, Finite, Finite, Finite]
+Point = tuple[Finite, Finite, Finite]
 EnvironmentName = Annotated[str, Field(pattern=r"^(own|[A-Za-z0-9][A-Za-z0-9_-]{0,79}\.exr)$")]
 
 
@@ -95,6 +99,34 @@ class RenderCamera(_Request):
     fov_y_degrees: Annotated[float, Field(gt=0.1, lt=175)] = 40.0
 
 
+class CameraKeyframe(_Request):
+    """A view that a film passes through, with z up."""
+
+    eye: Point
+    target: Point
+    """Straight ahead: what the camera goes round on its way to the next view [world units]."""
+    fov_y_degrees: Annotated[float, Field(gt=0.1, lt=175)] = 40.0
+    seconds: Annotated[float, Field(ge=0.05, le=600)] = 2.0
+    """From the view before to this one; that of the first counts for nothing."""
+
+    @model_validator(mode="after")
+    def _looks_somewhere(self) -> "CameraKeyframe":
+        if math.dist(self.eye, self.target) < 1e-9:
+            raise ValueError("eye and target of a keyframe are the same point")
+        return self
+
+
+class CameraPath(_Request):
+    """A film: the camera passes these views, smoothly in time and around what it looks at."""
+
+    keyframes: Annotated[list[CameraKeyframe], Field(min_length=2, max_length=200)]
+
+
+def path_frames(path: CameraPath, fps: float) -> int:
+    """Pictures of a film, both ends among them."""
+    return math.floor(sum(keyframe.seconds for keyframe in path.keyframes[1:]) * fps + 1e-6) + 1
+
+
 class RenderVariant(_Request):
     """The asset under some edits; environment edits in it are kept where the request's environments do not replace them."""
 
@@ -110,6 +142,8 @@ class RenderRequest(_Job):
     cameras: list[RenderCamera] = Field(default_factory=list, max_length=1000)
     turntable: Turntable | None = None
     """Instead of cameras; with neither, one picture from the start view."""
+    path: CameraPath | None = None
+    """Instead of cameras: a picture every 1 / video_fps (or 1 / 24) seconds."""
     environments: list[EnvironmentName] = Field(default_factory=list, max_length=200)
     """Stored environments, `own` for the asset's; none: the light that the variants' edits say."""
     variants: list[RenderVariant] = Field(default_factory=list, max_length=200)
@@ -120,6 +154,7 @@ class RenderRequest(_Job):
     height: Annotated[int, Field(ge=16, le=4096)] = 600
     spp: Annotated[int, Field(ge=1, le=65535)] = 256
     bounces: Annotated[int, Field(ge=0, le=8)] = 1
+    exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
     denoise: bool = True
     background: Literal["environment", "transparent"] = "environment"
     video_fps: Annotated[int, Field(ge=1, le=120)] | None = None
@@ -127,8 +162,9 @@ class RenderRequest(_Job):
 
     @model_validator(mode="after")
     def _is_bounded_and_clear(self) -> "RenderRequest":
-        if self.cameras and self.turntable:
-            raise ValueError("a render has cameras or a turntable; found both")
+        found = [what for what in ("cameras", "turntable", "path") if getattr(self, what)]
+        if len(found) > 1:
+            raise ValueError(f"a render has cameras, a turntable or a path; found {' and '.join(found)}")
         for what, names in (
             ("cameras", [camera.name for camera in self.cameras]),
             ("variants", [variant.name for variant in self.variants]),
@@ -138,6 +174,8 @@ class RenderRequest(_Job):
             if len({name.casefold() for name in names}) < len(names):
                 raise ValueError(f"two {what} of this render have the same name")
         cameras = self.turntable.frames if self.turntable else max(len(self.cameras), 1)
+        if self.path:
+            cameras = path_frames(self.path, self.video_fps or FILM_FPS)
         pictures = cameras * max(len(self.environments), 1) * max(len(self.variants), 1)
         if pictures > MAX_PICTURES:
             raise ValueError(f"a render makes at most {MAX_PICTURES} pictures; this one {pictures}")

@@ -49,6 +49,8 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
 
 CAMERA = {"name": "a", "world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
 
+VIEW = {"eye": [0, -3, 1], "target": [0, 0, 0]}
+
 
 @pytest.mark.parametrize(
     ("request_", "status", "words"),
@@ -62,7 +64,11 @@ CAMERA = {"name": "a", "world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 
         ({"kind": "export", "asset": ASSET, "formats": ["glb", "glb"]}, 422, "once"),
         (RENDER | {"environments": ["none.exr"]}, 422, "No environment"),
         (RENDER | {"environments": ["../token"]}, 422, "environments"),
-        (RENDER | {"cameras": [CAMERA], "turntable": {}}, 422, "both"),
+        (RENDER | {"cameras": [CAMERA], "turntable": {}}, 422, "found cameras and turntable"),
+        (RENDER | {"path": {"keyframes": [VIEW, VIEW]}, "turntable": {}}, 422, "found turntable and path"),
+        (RENDER | {"path": {"keyframes": [VIEW]}}, 422, "keyframes"),
+        (RENDER | {"path": {"keyframes": [VIEW, VIEW | {"target": VIEW["eye"]}]}}, 422, "same point"),
+        (RENDER | {"path": {"keyframes": [VIEW, *3 * [VIEW | {"seconds": 600}]]}, "video_fps": 24}, 422, "at most 20000"),
         (RENDER | {"cameras": [CAMERA, CAMERA | {"name": "A"}]}, 422, "same name"),
         (RENDER | {"cameras": [CAMERA | {"name": "../a"}]}, 422, "name"),
         (RENDER | {"width": 4096, "height": 4096, "spp": 60000}, 422, "fewer pixels"),

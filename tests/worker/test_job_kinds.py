@@ -153,6 +153,29 @@ def test_a_simulation_that_was_stopped_goes_on_with_the_next_frame(job: Callable
     assert open_clip(context.directory.clip(JOB)).frame_count == 3 and not (context.folder / "frames").exists()
 
 
+def test_a_film_passes_its_views_and_is_as_bright_as_asked(job: Callable[..., JobContext]) -> None:
+    low, high = {"eye": [0, -3, 0], "target": [0, 0, 0]}, {"eye": [0, -2, 2], "target": [0, 0, 0], "seconds": 0.5}
+    context = job(SMALL | {"path": {"keyframes": [low, high]}, "video_fps": 4, "background": "transparent"})
+    run(RenderRun(context))
+    assert sorted(path.name for path in context.files.iterdir()) == [
+        "asset-light-0000.png",
+        "asset-light-0001.png",
+        "asset-light-0002.png",
+        "asset-light.mp4",
+    ]
+    pictures = [np.asarray(Image.open(path)) for path in sorted(context.files.glob("*.png"))]
+    assert not np.array_equal(pictures[0], pictures[1]), "the camera moves"
+    with av.open(str(context.files / "asset-light.mp4")) as film:
+        assert film.streams.video[0].frames == 3 and film.streams.video[0].average_rate == 4
+    there = {"name": "there", "world_from_camera": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]]}
+    run(RenderRun(job(SMALL | {"cameras": [there], "background": "transparent"})))
+    np.testing.assert_array_equal(np.asarray(Image.open(context.files / "asset-light-there.png")), pictures[0])
+    run(RenderRun(job(SMALL | {"cameras": [there | {"name": "dark"}], "background": "transparent", "exposure_stops": -1})))
+    inside = pictures[0][..., 3] == 255
+    darker = np.asarray(Image.open(context.files / "asset-light-dark.png"))[inside].mean() / pictures[0][inside].mean()
+    assert darker < 0.85
+
+
 def test_an_export_writes_each_format(job: Callable[..., JobContext]) -> None:
     context = job({"kind": "export", "asset": ASSET, "formats": ["glb"]})
     run(ExportRun(context))

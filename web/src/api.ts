@@ -80,6 +80,8 @@ export const assetThumb = (asset: AssetInfo) => `/api/assets/${part(asset.id)}/t
 export const assetMesh = (id: string) => `/api/assets/${part(id)}/mesh.glb`;
 export const assetEnvironment = (id: string) => `/api/assets/${part(id)}/environment.exr`;
 export const assetExport = (id: string, format: ExportFormat) => `/api/assets/${part(id)}/export?format=${format}`;
+/** The same with the session's edits put into it. */
+export const sessionExport = (id: string, format: ExportFormat) => `/api/sessions/${part(id)}/export?format=${format}`;
 export type ExportFormat = 'glb' | 'ply' | 'ply3' | 'usd' | 'env' | 'zip';
 
 export function uploadAsset(file: File, onProgress?: (share: number) => void): Promise<AssetInfo> {
@@ -123,7 +125,7 @@ export const getSession = (id: string) => call<SessionInfo>('GET', `/api/session
 export const saveVersion = (session: string) => call<AssetInfo>('POST', `/api/sessions/${part(session)}/save`);
 export const appendEdit = (session: string, edit: Edit) => call<unknown>('POST', `/api/sessions/${part(session)}/edits`, { edit });
 
-/** Query of `frame.png` for a camera; a background colour is the stream's alone. */
+/** Query of `frame.png` and its like for a camera; a background colour is the stream's alone. */
 export function frameQuery(view: View, { width, height }: { width: number; height: number }, settings: Settings, transparent: boolean): string {
   const query = new URLSearchParams({
     width: String(width),
@@ -140,10 +142,22 @@ export function frameQuery(view: View, { width, height }: { width: number; heigh
   return query.toString();
 }
 
-export async function stillPicture(session: string, query: string): Promise<Blob> {
-  const response = await fetch(`/api/sessions/${part(session)}/frame.png?${query}`).catch(() => {
+export type StillFormat = 'png' | 'exr';
+
+export const stillPicture = async (session: string, query: string, format: StillFormat) => (await file(`/api/sessions/${part(session)}/frame.${format}?${query}`)).blob();
+
+/** A file that the server writes when it is asked for, and what it calls it. */
+export async function exportedFile(address: string): Promise<{ content: Blob; name: string }> {
+  const response = await file(address);
+  const said = response.headers.get('Content-Disposition') ?? '';
+  const name = /filename\*=utf-8''([^;]+)/i.exec(said)?.[1] ?? /filename="([^"]+)"/.exec(said)?.[1] ?? 'asset';
+  return { content: await response.blob(), name: decodeURIComponent(name) };
+}
+
+async function file(address: string): Promise<Response> {
+  const response = await fetch(address).catch(() => {
     throw new ApiError(0, UNREACHABLE);
   });
   if (!response.ok) throw new ApiError(response.status, sentenceFor(response.status, await response.text()));
-  return response.blob();
+  return response;
 }

@@ -115,6 +115,16 @@ export interface BuildRequest {
   seed?: number;
 }
 
+/** A view that a film passes through, with z up. */
+export interface CameraKeyframe {
+  eye: [number, number, number];
+  /** Straight ahead: what the camera goes round on its way to the next view [world units]. */
+  target: [number, number, number];
+  fov_y_degrees?: number;
+  /** From the view before to this one; that of the first counts for nothing. */
+  seconds?: number;
+}
+
 /** Where this viewer looks from. Latest wins: a newer one replaces one that was not rendered yet. */
 export interface CameraMessage {
   type: "camera";
@@ -129,6 +139,11 @@ export interface CameraMessage {
   /** Pixels of the picture at rest; while moving the server may send fewer. */
   width: number;
   height: number;
+}
+
+/** A film: the camera passes these views, smoothly in time and around what it looks at. */
+export interface CameraPath {
+  keyframes: CameraKeyframe[];
 }
 
 /** First message of a client; nothing else is answered before it. */
@@ -445,6 +460,8 @@ export interface RenderRequest {
   cameras?: RenderCamera[];
   /** Instead of cameras; with neither, one picture from the start view. */
   turntable?: Turntable | null;
+  /** Instead of cameras: a picture every 1 / video_fps (or 1 / 24) seconds. */
+  path?: CameraPath | null;
   /** Stored environments, `own` for the asset's; none: the light that the variants' edits say. */
   environments?: string[];
   /** None: the asset as it is. */
@@ -455,6 +472,7 @@ export interface RenderRequest {
   height?: number;
   spp?: number;
   bounces?: number;
+  exposure_stops?: number;
   denoise?: boolean;
   background?: "environment" | "transparent";
   /** Also join the pictures of each variant and environment, in the order of the cameras, to an MP4 (H.264). */

@@ -5,6 +5,7 @@ import { lightOf } from './edit_log';
 import { applyMaterials, meanMaterial, selectVertices, type MaterialMean, type RestMesh } from './materials';
 import { presets, type NamedMaterial } from './presets';
 import type { AssetInfo, Edit, EditLog, EnvironmentInfo, JobInfo, Selection, Settings, StatusMessage } from './protocol.gen';
+import type { FilmView } from './film';
 import type { Connection } from './stream';
 
 export const assets = signal<AssetInfo[] | null>(null);
@@ -112,6 +113,8 @@ export const tab = kept<Tab>('tab', 'material');
 export const psnrCurves = kept<Record<string, [number, number][]>>('psnr', {});
 /** Length of clips that this browser ordered, by the job that made them [s]; a clip itself does not tell. */
 export const clipSeconds = kept<Record<string, number>>('clipSeconds', {});
+/** The views of each asset's film. */
+export const films = kept<Record<string, FilmView[]>>('films', {});
 export const savedMaterials = kept<NamedMaterial[]>('materials', []);
 /** Shown in this order, each with a picture once the viewport has drawn it. */
 export const ballsWanted = computed(() => [...presets, ...savedMaterials.value]);

@@ -14,3 +14,15 @@ export interface View {
 
 /** Null until there is a picture. */
 export const viewNow = signal<View | null>(null);
+
+/** Where a camera with z up stands, and the point straight ahead that it turns round. */
+export interface Aim {
+  eye: [number, number, number];
+  target: [number, number, number];
+  fov_y_degrees: number;
+}
+
+/** The same without the shift that keeps the object clear of the panels: for pictures of another shape than the window's. Written with viewNow. */
+export const aimNow = signal<Aim | null>(null);
+/** Where the viewport shall look from next: written by whoever wants it, obeyed by the viewport. */
+export const wantedAim = signal<(Aim & { smooth: boolean }) | null>(null);

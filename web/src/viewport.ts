@@ -19,7 +19,7 @@ import { listen, pick, sendCamera } from './session';
 import { listenToPointers } from './pointers';
 import { paint, selectAt } from './selecting';
 import { choose, putHandle, shapeTool } from './shaping';
-import { viewNow, type Row, type View } from './viewpoint';
+import { aimNow, viewNow, wantedAim, type Row, type View } from './viewpoint';
 import { deformPoints, isAnalytic } from './shape';
 import { balls, ballsWanted, before, capturedLight, draft, edits, flash, flying, light, localPicture, log, materials, mesh, notify, pending, resolution, selectionWeights, session, settings, tool } from './state';
 
@@ -240,6 +240,13 @@ export class Viewport {
       this.stage.dataset.tool = shapeTool.value === 'none' ? tool.value : shapeTool.value;
     });
     effect(() => {
+      const wanted = wantedAim.value;
+      if (!wanted) return;
+      this.camera.fov = wanted.fov_y_degrees;
+      this.camera.updateProjectionMatrix();
+      void this.controls.setLookAt(...wanted.eye, ...wanted.target, wanted.smooth);
+    });
+    effect(() => {
       const { background } = settings.value;
       this.local?.setBackground(background);
       this.stage.dataset.background = Array.isArray(background) ? 'colour' : background;
@@ -359,7 +366,10 @@ export class Viewport {
     const number = sendCamera(pose);
     if (number === null || number === this.cameraNumber) return;
     this.cameraNumber = number;
-    viewNow.value = pose;
+    if (this.framedSession === session.value?.asset) {
+      viewNow.value = pose;
+      aimNow.value = { eye: this.controls.getPosition(new Vector3()).toArray(), target: this.controls.getTarget(new Vector3()).toArray(), fov_y_degrees: this.camera.fov };
+    }
     this.setFresh(this.drawnIsNewest && this.drawn.enough); // its picture may be here already
   }
 

@@ -7,7 +7,7 @@ import { choose, removeChosen, turning } from '../shaping';
 import { listenForKeys, titleFor, type Actions } from '../shortcuts';
 import { assets, before, dismiss, flash, flying, helpOpen, inspectorOpen, libraryOpen, localPicture, log, notices, notify, session, theme } from '../state';
 import type { Viewport } from '../viewport';
-import { download } from './ExportPanel';
+import { download } from '../download';
 import { Help } from './Help';
 import { Hud } from './Hud';
 import { Icon } from './icons';

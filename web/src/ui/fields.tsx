@@ -105,6 +105,36 @@ export function Slider({ label, value, min, max, step, unit, logarithmic, unset,
   );
 }
 
+interface NumberProps {
+  label: string;
+  value: number;
+  min: number;
+  max: number;
+  step: number;
+  unit?: string;
+  title?: string;
+  /** Show no label: what stands beside it says it already. */
+  bare?: boolean;
+  onEnter(value: number): void;
+}
+
+/** A number that is only typed; what is out of bounds becomes the bound. */
+export function NumberField({ label, value, min, max, step, unit, title, bare, onEnter }: NumberProps) {
+  const take = (text: string) => {
+    const number = Number(text);
+    if (text.trim() !== '' && Number.isFinite(number)) onEnter(clamp(number, min, max));
+  };
+  return (
+    <div class="number-field" title={title}>
+      {!bare && <span aria-hidden="true">{label}</span>}
+      <span class="number">
+        <Entry type="number" aria-label={label} min={min} max={max} step={step} value={value} onEnter={take} />
+        {unit && <span class="unit">{unit}</span>}
+      </span>
+    </div>
+  );
+}
+
 function ResetButton({ label, onReset }: { label: string; onReset?: () => void }) {
   return (
     <button class="reset" title={`Reset ${label.toLowerCase()}`} aria-label={`Reset ${label.toLowerCase()}`} disabled={!onReset} onClick={onReset}>
