@@ -2,6 +2,7 @@
 // the head of a native function's body, after the rasteriser's tile_vector.h and `constexpr float MIN_ROUGHNESS`.
 typedef unsigned u16 __attribute__((ext_vector_type(16)));
 const float PI = 3.14159265358979f;
+const u16 LANE_NUMBERS = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 const auto to_float = [](u16 x) -> v16 { return __builtin_convertvector(__builtin_bit_cast(i16, x), v16); };
 const auto floor16 = [](v16 a) { return __builtin_elementwise_floor(a); };
 const auto hash32 = [](u16 x) -> u16 {

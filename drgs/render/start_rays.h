@@ -16,7 +16,34 @@ const float* const albedos = (const float*)points.albedo.data;
 const float* const triangles = (const float*)surface_normals.data;
 alignas(64) float gathered[15][16];
 alignas(64) unsigned pixel_lane[16], index_lane[16], strategy_lane[16];
+u16 pixel16, index16, strategy16;
 int point_lane[16];
+// Most groups stand on one point: what it says is read once.
+const int first_lane_point = (first + base) / count, slot = first + base - first_lane_point * count;
+if (slot + 16 <= count) {
+    const int point = first_lane_point;
+    int split[3];
+    split_at(samples, points, point, split);
+    const int round = samples.round + (points.round.shape[0] > 0 ? points.round.data[point] : 0);
+    const u16 slots = LANE_NUMBERS + (unsigned)slot;
+    const u16 cosine_end = u16((unsigned)split[0]), ggx_end = u16((unsigned)(split[0] + split[1]));
+    const u16 is_ggx = __builtin_bit_cast(u16, slots >= cosine_end), is_table = __builtin_bit_cast(u16, slots >= ggx_end);
+    strategy16 = (is_ggx & 1u) + (is_table & 1u);
+    index16 = slots + (unsigned)(round * split[0]);
+    index16 = is_ggx != 0u ? slots - cosine_end + (unsigned)(round * split[1]) : index16;
+    index16 = is_table != 0u ? slots - ggx_end + (unsigned)(round * split[2]) : index16;
+    pixel16 = u16((unsigned)points.pixel.data[point]);
+    for (int lane = 0; lane < 16; ++lane) point_lane[lane] = point;
+    for (int k = 0; k < 3; ++k) {
+        store16(gathered[k], v16(normals[3 * (long)point + k]));
+        store16(gathered[3 + k], v16(outgoing[3 * (long)point + k]));
+        store16(gathered[6 + k], v16(triangles[3 * (long)point + k]));
+        store16(gathered[11 + k], v16((float)split[k]));
+    }
+    store16(gathered[9], v16(points.roughness.data[point]));
+    store16(gathered[10], v16(points.metallic.data[point]));
+    store16(gathered[14], v16(horizon.shape[0] > 0 ? horizon.data[point] : 2.0f));
+} else {
 for (int lane = 0; lane < 16; ++lane) {
     const int ray = first + base + min_int(lane, lanes - 1), point = ray / count;
     int split[3];
@@ -35,14 +62,18 @@ for (int lane = 0; lane < 16; ++lane) {
     gathered[10][lane] = points.metallic.data[point];
     gathered[14][lane] = horizon.shape[0] > 0 ? horizon.data[point] : 2.0f;
 }
+    strategy16 = *(const u16*)strategy_lane;
+    index16 = *(const u16*)index_lane;
+    pixel16 = *(const u16*)pixel_lane;
+}
 const V3 n = {load16(gathered[0]), load16(gathered[1]), load16(gathered[2])};
 const V3 wo = {load16(gathered[3]), load16(gathered[4]), load16(gathered[5])};
 const Lobes lobes = lobes_of(n, wo, load16(gathered[9]));
-const u16 strategy = *(const u16*)strategy_lane;
+const u16 strategy = strategy16;
 
 // 2. Two numbers a ray.
 v16 u0, u1;
-sobol_pair(*(const u16*)index_lane, hash_combine(hash_combine(u16(samples.seed), *(const u16*)pixel_lane), strategy), u0, u1);
+sobol_pair(index16, hash_combine(hash_combine(u16(samples.seed), pixel16), strategy), u0, u1);
 
 // 3. Directions: cosine and GGX for all lanes, the environment's table for those that ask for it.
 const i16 is_environment = strategy == 2u;
