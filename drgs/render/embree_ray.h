@@ -1,5 +1,5 @@
-// Asking Embree about one ray, CPU only. Placed inside a native function's body that has `question` (address of rtcIntersect1 or
-// rtcOccluded1) and `tree` (address of the scene).
+// Asking Embree about one ray, CPU only. Placed inside a native function's body that has `tree` (address of the scene); `intersect` and
+// `occluded` are the addresses of rtcIntersect1 and rtcOccluded1.
 // RTCRayHit of Embree 4, with room for what builds of it may add behind.
 struct alignas(16) RayHit {
     float origin[3], near, direction[3], time, far;
@@ -19,17 +19,17 @@ const auto prepare = [](RayHit& ray, const float* origin, const float* direction
     ray.id = ray.flags = 0;
 };
 // Whether there is a first hit; it is then in `ray`.
-const auto first_hit = [&](RayHit& ray, const float* origin, const float* direction) -> bool {
+const auto first_hit = [&](unsigned long intersect, RayHit& ray, const float* origin, const float* direction) -> bool {
     prepare(ray, origin, direction);
     ray.triangle = ray.geometry = ~0u;
     for (int k = 0; k < 14; ++k) ray.spare[k] = ~0u;
-    ((Question)question)((void*)tree, &ray, nullptr);
+    ((Question)intersect)((void*)tree, &ray, nullptr);
     return ray.geometry != ~0u;
 };
 // Whether anything is in the way: then Embree sets `far` to minus infinity.
-const auto is_blocked = [&](const float* origin, const float* direction) -> bool {
+const auto is_blocked = [&](unsigned long occluded, const float* origin, const float* direction) -> bool {
     RayHit ray;
     prepare(ray, origin, direction);
-    ((Question)question)((void*)tree, &ray, nullptr);
+    ((Question)occluded)((void*)tree, &ray, nullptr);
     return ray.far < 0.0f;
 };

@@ -167,7 +167,7 @@ const auto draw_environment = [&](const auto& light, v16 u0, v16 u1) -> V3 {
     for (; step > 0; step >>= 1) {
         for (int lane = 0; lane < 16; ++lane) {
             const int probe = row[lane] + step, there = min_int(probe, height);
-            row[lane] += (probe <= height) & (rows[there] <= target[lane]) ? step : 0;
+            row[lane] += ((probe <= height) & (rows[there] <= target[lane])) ? step : 0;
         }
     }
     for (int lane = 0; lane < 16; ++lane) {
@@ -189,7 +189,7 @@ const auto draw_environment = [&](const auto& light, v16 u0, v16 u1) -> V3 {
             const float t = between[lane];
             const int probe = column[lane] + step, there = min_int(probe, width - 1);
             const float sum = upper[there] * (1.0f - t) + upper[width + 1 + there] * t;
-            column[lane] += (probe < width) & (sum <= target[lane]) ? step : 0;
+            column[lane] += ((probe < width) & (sum <= target[lane])) ? step : 0;
         }
     }
     for (int lane = 0; lane < 16; ++lane) {

@@ -1,14 +1,14 @@
 // scatter_hits for 16 paths at once, CPU only. Body of a Warp native function; trace_indirect.py prepends ray_vector.h and what that needs.
 // The Warp kernel scatter_hits in trace_indirect.py says the same path by path; a test keeps both equal.
 //
-// in   base (first path of the group), path_count, path_ray, face, barycentric, ray_direction, throughput, first_point, depth,
+// in   base (first path of the group), paths (how many), path_ray, face, barycentric, ray_direction, throughput, first_point, depth,
 //      points, light, mesh, samples
-// out  either origin, direction, contribution of light rays (paths base .. base + 15) and of BRDF rays (path_count further), next_throughput,
-//      or, where paths end here, their light added to `indirect`
+// out  either origin, direction, contribution of light rays (paths base .. base + 15) and of BRDF rays (`paths` further), next_throughput,
+//      or, asked at once, their light added to `indirect` and, unless paths end here, those that go on, packed in `packed`
 
 // 1. The surfaces that the group's paths met.
 const int count = samples.cosine + samples.ggx + samples.environment;
-const int lanes = min_int(16, path_count - base);
+const int lanes = min_int(16, paths - base);
 const float* const positions = (const float*)mesh.vertices.data;
 const float* const normals = (const float*)mesh.normals.data;
 const float* const albedos = (const float*)mesh.albedo.data;
@@ -99,25 +99,47 @@ const auto put = [&](long at, i16 live, V3 d, const v16* light_there, const v16*
             ((float*)direction.data)[place] = along;
             ((float*)origin.data)[place] = live_lane[lane] != 0 && traced_lane[lane] != 0 ? out[k][lane] : (along < 0.0f ? -1.0e15f : 1.0e15f);
             ((float*)contribution.data)[place] = live_lane[lane] != 0 ? out[6 + k][lane] : 0.0f;
-            if (carried_on != nullptr) ((float*)next_throughput.data)[place - 3 * (long)path_count] = live_lane[lane] != 0 ? out[9 + k][lane] : 0.0f;
+            if (carried_on != nullptr) ((float*)next_throughput.data)[place - 3 * (long)paths] = live_lane[lane] != 0 ? out[9 + k][lane] : 0.0f;
         }
     }
 };
 // ----
+const int side = (depth + 1) % 2;
 float total[16][3] = {};
 const auto put = [&](long, i16 live, V3 d, const v16* light_there, const v16* carried_on) {
-    alignas(64) float out[9][16];
+    alignas(64) float out[12][16];
     alignas(64) int live_lane[16], traced_lane[16];
     *(i16*)live_lane = live;
     *(i16*)traced_lane = dot3(outward, d) <= horizon;
     const V3 start = {position.x + mesh.lift * outward.x, position.y + mesh.lift * outward.y, position.z + mesh.lift * outward.z};
     store16(out[0], start.x); store16(out[1], start.y); store16(out[2], start.z);
     store16(out[3], d.x); store16(out[4], d.y); store16(out[5], d.z);
-    for (int k = 0; k < 3; ++k) store16(out[6 + k], light_there[k]);
+    for (int k = 0; k < 3; ++k) {
+        store16(out[6 + k], light_there[k]);
+        if (carried_on != nullptr) store16(out[9 + k], carried_on[k]);
+    }
     for (int lane = 0; lane < lanes; ++lane) {
         if (live_lane[lane] != 0) {
             const float from[3] = {out[0][lane], out[1][lane], out[2][lane]}, along[3] = {out[3][lane], out[4][lane], out[5][lane]};
-            if (traced_lane[lane] == 0 || !is_blocked(from, along)) {
+            bool met = false;
+            if (traced_lane[lane] != 0 && (ends != 0 || carried_on == nullptr)) {
+                met = is_blocked(occluded, from, along);
+            } else if (traced_lane[lane] != 0) {
+                RayHit found;
+                met = first_hit(intersect, found, from, along);
+                if (met && (out[9][lane] > 0.0f || out[10][lane] > 0.0f || out[11][lane] > 0.0f)) {
+                    const int path = path_count.data[side]++;
+                    packed.ray.data[path] = path_ray.data[base + lane];
+                    packed.face.data[path] = (int)found.triangle;
+                    ((float*)packed.barycentric.data)[2 * path] = found.u;
+                    ((float*)packed.barycentric.data)[2 * path + 1] = found.v;
+                    for (int k = 0; k < 3; ++k) {
+                        ((float*)packed.arriving.data)[3 * path + k] = along[k];
+                        ((float*)packed.throughput.data)[3 * path + k] = out[9 + k][lane];
+                    }
+                }
+            }
+            if (!met) {
                 for (int k = 0; k < 3; ++k) total[lane][k] += out[6 + k][lane];
             }
         }
@@ -158,4 +180,4 @@ for (int k = 0; k < 3; ++k) {
     incoming[k] *= reflected[k] / max16(own + table_pdf, v16(1e-37f));
     onward[k] = select(chance < survival, reflected[k] / max16(own * survival, v16(1e-37f)), v16(0.0f));
 }
-put((long)path_count + base, live, d, incoming, onward);
+put((long)paths + base, live, d, incoming, onward);

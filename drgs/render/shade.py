@@ -16,7 +16,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drgs.render.brdf_warp import PI, alpha_of, specular_brdf
+from drgs.render.brdf_warp import alpha_of, specular_brdf
 from drgs.render.environment_table import EnvironmentLight, lookup_radiance, table_place
 from drgs.render.horizon import BLOCKED
 from drgs.render.ray_memory import RayMemory, note_directions, room_for_rays, trace_batch, usable_rays
@@ -32,19 +32,12 @@ from drgs.render.sample_rays import (
     sampled_direction,
     split_at,
 )
-from drgs.render.trace_indirect import (
-    Paths,
-    far_along,
-    light_hits_simd,
-    mesh_arrays,
-    paths_of_hits,
-    ray_source,
-    scatter_kernel,
-    trace_indirect,
-)
+from drgs.render.shade_embree import shade_chunks, shade_slice
+from drgs.render.sum_samples import sum_samples
+from drgs.render.trace_indirect import far_along, mesh_arrays, paths_of_hits, ray_source, scatter_kernel, trace_indirect
 from drgs.render.trace_rays import over_slices
 from drgs.render.tracer import AbstractTracer
-from drgs.render.tracer_embree import EMBREE_RAY, EmbreeTracer
+from drgs.render.tracer_embree import EmbreeTracer
 from drgs.render.tracer_warp import query_any
 from drgs.warp_torch import in_thread_pool, load_kernel, thread_count, warp_array, warp_device
 
@@ -55,6 +48,8 @@ RAYS_A_BATCH = 65536
 MIN_RAYS_A_BATCH = 8192
 """Fewer are not cut up further to balance threads: launches cost half a millisecond a batch."""
 RAYS_A_BATCH_GPU = 1 << 23
+RAYS_A_SLICE = 1 << 18
+"""Rays of a launch of shade_embree, which keeps none of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,115 +163,6 @@ def start_rays_simd(
     )  # fmt: skip
 
 
-@wp.func_native(EMBREE_RAY + ray_source("start_rays.h", 0, 2))
-def ask_sixteen_rays(
-    question: wp.uint64, tree: wp.uint64, base: int, ray_count: int, first: int,
-    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3), horizon: wp.array(dtype=float),
-    light: EnvironmentLight, samples: SampleSet, keep_dark: int,
-    cosine_weight: wp.array(dtype=float), specular: wp.array(dtype=wp.vec3), radiance: wp.array(dtype=wp.vec3), blocked: wp.array(dtype=wp.bool),
-    path_count: wp.array(dtype=int), path_ray: wp.array(dtype=wp.int64), face: wp.array(dtype=int), barycentric: wp.array(dtype=wp.vec2),
-    arriving: wp.array(dtype=wp.vec3),
-): ...  # fmt: skip
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def ask_rays_simd(
-    question: wp.uint64,
-    tree: wp.uint64,
-    ray_count: int,
-    first: int,
-    points: PointArrays,
-    starts: wp.array[wp.vec3],
-    surface_normals: wp.array[wp.vec3],
-    horizon: wp.array[float],
-    light: EnvironmentLight,
-    samples: SampleSet,
-    keep_dark: int,
-    # outputs
-    cosine_weight: wp.array[float],
-    specular: wp.array[wp.vec3],
-    radiance: wp.array[wp.vec3],
-    blocked: wp.array[wp.bool],
-    path_count: wp.array[int],
-    path_ray: wp.array[wp.int64],
-    face: wp.array[int],
-    barycentric: wp.array[wp.vec2],
-    arriving: wp.array[wp.vec3],
-):
-    """start_rays_simd and Embree's answers in one go: no ray is written down but those that met a surface."""
-    ask_sixteen_rays(
-        question, tree, 16 * wp.tid(), ray_count, first, points, starts, surface_normals, horizon, light, samples, keep_dark,
-        cosine_weight, specular, radiance, blocked, path_count, path_ray, face, barycentric, arriving,
-    )  # fmt: skip
-
-
-@wp.func
-def luminance(c: wp.vec3) -> float:
-    return 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2]
-
-
-@wp.kernel
-def sum_samples(
-    first: int,
-    points: PointArrays,
-    samples: SampleSet,
-    cosine_weight: wp.array[float],
-    specular: wp.array[wp.vec3],
-    radiance: wp.array[wp.vec3],
-    blocked: wp.array[wp.bool],
-    indirect: wp.array[wp.vec3],
-    bounces: int,
-    # outputs
-    diffuse_out: wp.array[wp.vec3],
-    specular_out: wp.array[wp.vec3],
-    variance_out: wp.array[wp.vec3],
-    visibility_out: wp.array[float],
-):
-    i = wp.tid()
-    point = first + i
-    diffuse_brdf = points.albedo[point] * ((1.0 - points.metallic[point]) / PI)
-    diffuse_sum = wp.vec3(0.0, 0.0, 0.0)
-    specular_sum = wp.vec3(0.0, 0.0, 0.0)
-    variance = wp.vec3(0.0, 0.0, 0.0)
-    open_sum = wp.float32(0.0)
-    all_sum = wp.float32(0.0)
-    count = samples.cosine + samples.ggx + samples.environment
-    split = split_at(samples, points, point)
-    slot = wp.int32(0)
-    for strategy in range(3):
-        size = split[strategy]
-        total = wp.vec3(0.0, 0.0, 0.0)
-        total_squares = wp.vec3(0.0, 0.0, 0.0)
-        for _ in range(size):
-            ray = i * count + slot
-            slot += 1
-            w = cosine_weight[ray]
-            incoming = radiance[ray]
-            all_sum += w
-            if blocked[ray]:
-                incoming = wp.vec3(0.0, 0.0, 0.0)
-                if bounces > 0:
-                    incoming = indirect[ray]
-            else:
-                open_sum += w
-            d = w * wp.cw_mul(diffuse_brdf, incoming)
-            s = wp.cw_mul(specular[ray], incoming)
-            diffuse_sum += d
-            specular_sum += s
-            y = wp.vec3(luminance(d + s), luminance(d), luminance(s))
-            total += y
-            total_squares += wp.cw_mul(y, y)
-        if size > 1:  # independent samples would scatter like this; stratified ones do better
-            scatter = total_squares - wp.cw_mul(total, total) / float(size)
-            variance += wp.max(scatter, wp.vec3(0.0, 0.0, 0.0)) * (float(size) / float(size - 1))
-        else:
-            variance += total_squares
-    diffuse_out[point] = diffuse_sum
-    specular_out[point] = specular_sum
-    variance_out[point] = variance
-    visibility_out[point] = wp.where(all_sum > 0.0, open_sum / wp.max(all_sum, 1.0e-30), 1.0)
-
-
 def shade(
     points: ShadingPoints,
     starts: RayStarts,
@@ -328,34 +214,34 @@ def shade(
         warp_array(result.variance, wp.vec3),
         warp_array(result.visibility),
     ]
+    at_once = isinstance(tracer, EmbreeTracer) and known is None and kept is None
     for kernel in (
         start_rays_simd if device.type == "cpu" else start_rays,
         note_directions,
         sum_samples,
         scatter_kernel(device),
         query_any,
-        *((ask_rays_simd, light_hits_simd) if device.type == "cpu" else ()),
+        *((shade_chunks,) if at_once else ()),
     ):
         load_kernel(kernel, warp_dev)
 
     def batch(first: int, last: int) -> None:
+        if isinstance(tracer, EmbreeTracer) and at_once:
+            shade_slice(tracer, first, last, [arrays, *start_arrays, light], mesh, samples, counts.total, bounces, sums)
+            return
         rays = (last - first) * counts.total
         specular, radiance = (torch.empty(rays, 3, device=device) for _ in range(2))
         cosine_weight = torch.empty(rays, device=device)
         vectors = [warp_array(t, wp.vec3) for t in (specular, radiance)]
         inputs = [first * counts.total, arrays, *start_arrays, light, samples, int(bounces > 0)]
-        if isinstance(tracer, EmbreeTracer) and known is None and kept is None:
-            blocked, paths = _ask_at_once(tracer, bounces > 0, rays, inputs, [warp_array(cosine_weight), *vectors])
+        origin, direction = (torch.empty(rays, 3, device=device) for _ in range(2))
+        outputs = [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), warp_array(cosine_weight), *vectors]
+        if device.type == "cpu":
+            wp.launch(start_rays_simd, dim=-(-rays // 16), inputs=[rays, *inputs], outputs=outputs, device=warp_dev)
         else:
-            origin, direction = (torch.empty(rays, 3, device=device) for _ in range(2))
-            outputs = [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), warp_array(cosine_weight), *vectors]
-            if device.type == "cpu":
-                wp.launch(start_rays_simd, dim=-(-rays // 16), inputs=[rays, *inputs], outputs=outputs, device=warp_dev)
-            else:
-                wp.launch(start_rays, dim=rays, inputs=inputs, outputs=outputs, device=warp_dev)
-            hits = trace_batch(origin, direction, first * counts.total, tracer, bounces > 0, known, kept)
-            blocked = hits.hit
-            paths = paths_of_hits(hits, direction) if bounces > 0 else None
+            wp.launch(start_rays, dim=rays, inputs=inputs, outputs=outputs, device=warp_dev)
+        hits = trace_batch(origin, direction, first * counts.total, tracer, bounces > 0, known, kept)
+        paths = paths_of_hits(hits, direction) if bounces > 0 else None
         indirect = radiance
         if paths is not None:
             indirect = trace_indirect(paths, rays, first, arrays, light, mesh, samples, tracer, bounces)
@@ -368,7 +254,7 @@ def shade(
                 samples,
                 warp_array(cosine_weight),
                 *vectors,
-                warp_array(blocked),
+                warp_array(hits.hit),
                 warp_array(indirect, wp.vec3),
                 bounces,
             ],
@@ -376,40 +262,13 @@ def shade(
             device=warp_dev,
         )
 
-    batch_points = max(1, (RAYS_A_BATCH if device.type == "cpu" else RAYS_A_BATCH_GPU) // counts.total)
+    batch_rays = RAYS_A_SLICE if at_once else RAYS_A_BATCH if device.type == "cpu" else RAYS_A_BATCH_GPU
+    batch_points = max(1, batch_rays // counts.total)
     shrinking = device.type == "cpu" and thread_count() > 1 and not in_thread_pool()
     over_slices(point_count, device, batch, batch_points, max(1, MIN_RAYS_A_BATCH // counts.total) if shrinking else None)
     if memory is not None:
         memory.rays = kept
     return result
-
-
-def _ask_at_once(tracer: EmbreeTracer, surfaces: bool, rays: int, inputs: list, outputs: list) -> tuple[Tensor, Paths | None]:
-    """A batch's rays, started and asked about: which of them are blocked, and where they met surfaces if that is wanted.
-
-    Args:
-        inputs, outputs: of ask_rays_simd; without question, tree and number of rays, and without what is met.
-    """
-    room = rays if surfaces else 0
-    blocked, path_count = torch.empty(rays, dtype=torch.bool), torch.zeros(1, dtype=torch.int32)
-    path_ray, face = torch.empty(room, dtype=torch.int64), torch.empty(room, dtype=torch.int32)
-    barycentric, arriving = torch.empty(room, 2), torch.empty(room, 3)
-    packed = [
-        warp_array(path_count),
-        warp_array(path_ray),
-        warp_array(face),
-        warp_array(barycentric, wp.vec2),
-        warp_array(arriving, wp.vec3),
-    ]
-    wp.launch(
-        ask_rays_simd,
-        dim=-(-rays // 16),
-        inputs=[*(tracer.first_hit if surfaces else tracer.any_hit), rays, *inputs],
-        outputs=[*outputs, warp_array(blocked), *packed],
-        device="cpu",
-    )
-    count = int(path_count)
-    return blocked, Paths(path_ray[:count], face[:count], barycentric[:count], arriving[:count]) if surfaces else None
 
 
 def _point_horizons(starts: RayStarts, of_faces: Tensor | None) -> Tensor:

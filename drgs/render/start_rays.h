@@ -5,7 +5,7 @@
 // in   base (first ray of the group in the batch), ray_count (of the batch), first (the batch's first ray among all),
 //      points, starts, surface_normals, horizon (of each point), light, samples, keep_dark
 // out  cosine_weight, specular, radiance of rays base .. base + 15, and either their origin and direction,
-//      or what they met: `blocked`, and for surfaces the rays that met one, packed, with face, barycentric and direction there
+//      or what they met: `blocked`, and with keep_dark the rays that met a surface, packed behind path_count[0] in `packed`
 
 // 1. Gather the points of the group's rays.
 const int count = samples.cosine + samples.ggx + samples.environment;
@@ -145,17 +145,21 @@ for (int lane = 0; lane < lanes; ++lane) {
         const float along[3] = {result[0][lane], result[1][lane], result[2][lane]};
         const float* const start = from + 3 * (long)point_lane[lane];
         if (keep_dark == 0) {
-            met = is_blocked(start, along);
+            met = is_blocked(occluded, start, along);
         } else {
             RayHit found;
-            met = first_hit(found, start, along);
+            met = first_hit(intersect, found, start, along);
             if (met) {
                 const int path = path_count.data[0]++;
-                path_ray.data[path] = ray;
-                face.data[path] = (int)found.triangle;
-                ((float*)barycentric.data)[2 * path] = found.u;
-                ((float*)barycentric.data)[2 * path + 1] = found.v;
-                for (int k = 0; k < 3; ++k) ((float*)arriving.data)[3 * path + k] = along[k];
+                packed.ray.data[path] = ray;
+                packed.face.data[path] = (int)found.triangle;
+                ((float*)packed.barycentric.data)[2 * path] = found.u;
+                ((float*)packed.barycentric.data)[2 * path + 1] = found.v;
+                for (int k = 0; k < 3; ++k) {
+                    ((float*)packed.arriving.data)[3 * path + k] = along[k];
+                    ((float*)packed.throughput.data)[3 * path + k] = 1.0f;
+                    ((float*)indirect.data)[3 * ray + k] = 0.0f;
+                }
             }
         }
     }

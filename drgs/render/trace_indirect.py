@@ -23,7 +23,6 @@ from drgs.render.random_warp import hash_combine, shuffle_index, sobol_2d
 from drgs.render.records import Hits
 from drgs.render.sample_rays import PointArrays, SampleSet, round_at, split_at, strategy_of, strategy_seed
 from drgs.render.tracer import AbstractTracer
-from drgs.render.tracer_embree import EMBREE_RAY, EmbreeTracer
 from drgs.scene.mesh import TriangleMesh
 from drgs.warp_torch import warp_array, warp_device
 
@@ -223,7 +222,7 @@ def ray_source(name: str, *parts: int) -> str:
 
 @wp.func_native(ray_source("scatter_hits.h", 0, 1, 3))
 def scatter_sixteen_hits(
-    base: int, path_count: int,
+    base: int, paths: int,
     path_ray: wp.array(dtype=wp.int64), face: wp.array(dtype=int), barycentric: wp.array(dtype=wp.vec2), ray_direction: wp.array(dtype=wp.vec3),
     throughput: wp.array(dtype=wp.vec3), first_point: int, depth: int,
     points: PointArrays, light: EnvironmentLight, mesh: MeshArrays, samples: SampleSet,
@@ -256,42 +255,6 @@ def scatter_hits_simd(
     scatter_sixteen_hits(
         16 * wp.tid(), path_count, path_ray, face, barycentric, ray_direction, throughput, first_point, depth, points, light, mesh, samples,
         origin, direction, contribution, next_throughput,
-    )  # fmt: skip
-
-
-@wp.func_native(EMBREE_RAY + ray_source("scatter_hits.h", 0, 2, 3))
-def light_sixteen_hits(
-    question: wp.uint64, tree: wp.uint64, base: int, path_count: int,
-    path_ray: wp.array(dtype=wp.int64), face: wp.array(dtype=int), barycentric: wp.array(dtype=wp.vec2), ray_direction: wp.array(dtype=wp.vec3),
-    throughput: wp.array(dtype=wp.vec3), first_point: int, depth: int,
-    points: PointArrays, light: EnvironmentLight, mesh: MeshArrays, samples: SampleSet,
-    indirect: wp.array(dtype=wp.vec3),
-): ...  # fmt: skip
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def light_hits_simd(
-    question: wp.uint64,
-    tree: wp.uint64,
-    path_ray: wp.array[wp.int64],
-    face: wp.array[int],
-    barycentric: wp.array[wp.vec2],
-    ray_direction: wp.array[wp.vec3],
-    throughput: wp.array[wp.vec3],
-    first_point: int,
-    depth: int,
-    path_count: int,
-    points: PointArrays,
-    light: EnvironmentLight,
-    mesh: MeshArrays,
-    samples: SampleSet,
-    # outputs
-    indirect: wp.array[wp.vec3],
-):
-    """scatter_hits_simd, its two shadow rays asked by Embree, and add_contributions, for paths that end there."""
-    light_sixteen_hits(
-        question, tree, 16 * wp.tid(), path_count, path_ray, face, barycentric, ray_direction, throughput, first_point, depth,
-        points, light, mesh, samples, indirect,
     )  # fmt: skip
 
 
@@ -369,10 +332,6 @@ def trace_indirect(
             warp_array(path_ray), warp_array(face), warp_array(barycentric, wp.vec2), warp_array(arriving, wp.vec3),
             warp_array(throughput, wp.vec3), first_point, depth, paths, points, light, mesh, samples,
         ]  # fmt: skip
-        if depth + 1 == bounces and isinstance(tracer, EmbreeTracer):
-            inputs = [*tracer.any_hit, *inputs]
-            wp.launch(light_hits_simd, dim=-(-paths // 16), inputs=inputs, outputs=[warp_array(indirect, wp.vec3)], device=warp_dev)
-            break
         origin, direction, contribution = (torch.empty(2 * paths, 3, device=device) for _ in range(3))
         next_throughput = torch.empty(paths, 3, device=device)
         wp.launch(

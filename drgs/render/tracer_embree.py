@@ -30,7 +30,7 @@ _IS_VOID += "const float along[3] = {direction[0], direction[1], direction[2]};\
     + _IS_VOID
     + """
 RayHit ray;
-const bool met = !is_void && first_hit(ray, from, along);
+const bool met = !is_void && first_hit(question, ray, from, along);
 distance.data[i] = met ? ray.far : __builtin_huge_valf();
 face.data[i] = met ? (int)ray.triangle : -1;
 float* const weights = (float*)barycentric.data + 2 * (long)i;
@@ -44,7 +44,7 @@ def embree_closest(
 ): ...  # fmt: skip
 
 
-@wp.func_native(EMBREE_RAY + _IS_VOID + "blocked.data[i] = !is_void && is_blocked(from, along);")
+@wp.func_native(EMBREE_RAY + _IS_VOID + "blocked.data[i] = !is_void && is_blocked(question, from, along);")
 def embree_occluded(
     question: wp.uint64, tree: wp.uint64, origin: wp.vec3, direction: wp.vec3, i: int, blocked: wp.array(dtype=wp.bool)
 ): ...  # fmt: skip
@@ -89,6 +89,11 @@ class EmbreeTracer(AbstractTracer):
         self._scene = EmbreeScene(mesh.vertices.detach().float().numpy(), mesh.faces.int().numpy())
         for kernel in (ask_closest, ask_occluded):
             load_kernel(kernel, "cpu")  # before threads race for it
+
+    @property
+    def questions(self) -> tuple[int, int, int]:
+        """`intersect`, `occluded` and `tree` for kernels that ask both."""
+        return function_address("rtcIntersect1"), function_address("rtcOccluded1"), self._scene.address
 
     @property
     def first_hit(self) -> tuple[int, int]:
