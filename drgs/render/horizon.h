@@ -2,7 +2,7 @@
 // prepends the rasteriser's tile_vector.h and the constants. A test keeps both equal.
 //
 // in   f (face), lanes (group, 9, 16: corners by coordinate), group_boxes (group of groups, 6, 16), super_boxes (16 of those, 6, 16), corners, lift
-// out  tangent_out[f]
+// out  tangent_out[8 f ..]: of each sector of azimuth, in the order of horizon_sector
 struct P3 { float x, y, z; };
 const auto dot = [](P3 a, P3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; };
 const auto minus = [](P3 a, P3 b) { return P3{a.x - b.x, a.y - b.y, a.z - b.z}; };
@@ -16,17 +16,16 @@ const P3 a = corner[0], b = corner[1], c = corner[2];
 const P3 area = cross(minus(b, a), minus(c, a));
 const float length = __builtin_sqrtf(dot(area, area));
 if (!(length > 0.0f)) {
-    tangent_out.data[f] = 1e30f;
+    for (int k = 0; k < 8; ++k) tangent_out.data[8 * (long)f + k] = 1e30f;
     return;
 }
 const P3 n = scaled(area, 1.0f / length);
 const float base = largest(largest(dot(n, a), dot(n, b)), dot(n, c)) + 0.5f * lift;
-P3 longest = minus(b, a);
-if (dot(minus(c, b), minus(c, b)) > dot(longest, longest)) longest = minus(c, b);
-if (dot(minus(a, c), minus(a, c)) > dot(longest, longest)) longest = minus(a, c);
-const P3 u = unit(longest), v = cross(n, u);
+// The frame of horizon_sector; near the pole, where it turns with the slightest tilt, all sectors get the highest horizon.
+const float across_z = __builtin_sqrtf(n.x * n.x + n.y * n.y);
+const P3 u = unit(across_z > 0.0f ? P3{-n.y, n.x, 0.0f} : P3{1.0f, 0.0f, 0.0f}), v = cross(n, u);
 P3 h[DIRECTIONS];
-float support[DIRECTIONS];
+float support[DIRECTIONS], behind[8];
 const float turn[8][2] = {{1, 0}, {0.70710678f, 0.70710678f}, {0, 1}, {-0.70710678f, 0.70710678f},
                           {-1, 0}, {-0.70710678f, -0.70710678f}, {0, -1}, {0.70710678f, -0.70710678f}};
 for (int k = 0; k < 8; ++k) h[k] = {turn[k][0] * u.x + turn[k][1] * v.x, turn[k][0] * u.y + turn[k][1] * v.y, turn[k][0] * u.z + turn[k][1] * v.z};
@@ -34,8 +33,12 @@ h[8] = unit(cross(minus(b, a), n));
 h[9] = unit(cross(minus(c, b), n));
 h[10] = unit(cross(minus(a, c), n));
 for (int k = 0; k < DIRECTIONS; ++k) support[k] = largest(largest(dot(h[k], a), dot(h[k], b)), dot(h[k], c));
-float tangent = 0.0f;
+for (int k = 0; k < 8; ++k) behind[k] = smallest(smallest(dot(h[k], a), dot(h[k], b)), dot(h[k], c)) - lift;
+float tangents[8] = {0.0f};  // of sector k: azimuths from h[k] to h[k + 1]
+float least = 0.0f;
 const auto absolute = [](float x) { return x < 0.0f ? -x : x; };
+// What lies behind the whole face along a direction within 90 degrees of all of a sector is out of that sector's reach.
+const auto in_sector = [](const i16* passed, int k) -> i16 { return ~(passed[(k + 7) & 7] | passed[k] | passed[(k + 1) & 7] | passed[(k + 2) & 7]); };
 // Which of 16 boxes, (6, 16): lowest and highest corners by coordinate, may hold something above the tangent found so far.
 const auto boxes_above = [&](const float* boxes) -> i16 {
     v16 middle[3], half[3];
@@ -47,12 +50,17 @@ const auto boxes_above = [&](const float* boxes) -> i16 {
     const auto along = [&](P3 d) -> v16 { return d.x * middle[0] + d.y * middle[1] + d.z * middle[2]; };
     const auto across = [&](P3 d) -> v16 { return absolute(d.x) * half[0] + absolute(d.y) * half[1] + absolute(d.z) * half[2]; };
     const v16 above = along(n) + across(n) - base;
-    i16 open = above > 0.0f;
-    for (int k = 0; k < DIRECTIONS && any(open); ++k) {
-        const v16 beyond = along(h[k]) - across(h[k]) - support[k];
-        open &= ~((beyond > 0.0f) & (above <= tangent * beyond));
+    const i16 high = above > 0.0f;
+    if (!any(high)) return high;
+    v16 needed(1e30f);
+    i16 passed[8], open = i16(0);
+    for (int k = 0; k < DIRECTIONS; ++k) {
+        const v16 middle_along = along(h[k]), half_along = across(h[k]), beyond = middle_along - half_along - support[k];
+        needed = min16(needed, select(beyond > 0.0f, above / max16(beyond, v16(1e-30f)), v16(1e30f)));
+        if (k < 8) passed[k] = middle_along + half_along < behind[k];
     }
-    return open;
+    for (int k = 0; k < 8; ++k) open |= in_sector(passed, k) & (needed > tangents[k]);
+    return open & high;
 };
 const auto against = [&](const float* lane) {
     v16 x[3], y[3], z[3], above[3];
@@ -64,46 +72,45 @@ const auto against = [&](const float* lane) {
     }
     i16 open = max16(max16(above[0], above[1]), above[2]) > 0.0f;
     if (!any(open)) return;
-    // First by products alone: most triangles lie below the tangent found so far.
     const float tolerance = 0.1f * lift;
-    for (int k = 0; k < DIRECTIONS; ++k) {
-        i16 below = open;
-        for (int p = 0; p < 3; ++p) {
-            const v16 beyond = h[k].x * x[p] + h[k].y * y[p] + h[k].z * z[p] - support[k];
-            below &= ((above[p] <= 0.0f) & (beyond >= -tolerance)) | ((beyond > 0.0f) & (above[p] <= tangent * beyond));
-        }
-        open &= ~below;
-        if (!any(open)) return;
-    }
     v16 lowest(1e30f);
+    i16 passed[8];
     for (int k = 0; k < DIRECTIONS; ++k) {
-        v16 needed(0.0f);
+        v16 needed(0.0f), farthest(-1e30f);
         for (int p = 0; p < 3; ++p) {
-            const v16 beyond = h[k].x * x[p] + h[k].y * y[p] + h[k].z * z[p] - support[k];
+            const v16 along = h[k].x * x[p] + h[k].y * y[p] + h[k].z * z[p], beyond = along - support[k];
             const v16 under = select(beyond >= -tolerance, v16(0.0f), v16(1e30f));
             const v16 over = select(beyond > 0.0f, above[p] / max16(beyond, v16(1e-30f)), v16(1e30f));
             needed = max16(needed, select(above[p] <= 0.0f, under, over));
+            farthest = max16(farthest, along);
         }
         lowest = min16(lowest, needed);
+        if (k < 8) passed[k] = farthest < behind[k];
     }
-    alignas(64) float found[16];
-    store16(found, select(open, lowest, v16(0.0f)));
-    for (int lane_index = 0; lane_index < 16; ++lane_index) tangent = largest(tangent, found[lane_index]);
+    least = 1e30f;
+    for (int k = 0; k < 8; ++k) {
+        const float found = __builtin_reduce_max(select(open & in_sector(passed, k), lowest, v16(0.0f)));
+        tangents[k] = largest(tangents[k], found);
+        least = smallest(least, tangents[k]);
+    }
 };
 const auto look_into = [&](int super) {
     alignas(64) int open[16];
     *(i16*)open = boxes_above(group_boxes.data + 96 * (long)super);
-    for (int k = 0; k < 16 && tangent < STEEPEST; ++k)
+    for (int k = 0; k < 16 && least < STEEPEST; ++k)
         if (open[k] != 0) against((const float*)lanes.data + 144 * (16 * (long)super + k));
 };
 // The face's own neighbourhood first: it is what most often shows that there is nothing to gain.
 const int blocks = super_boxes.shape[0] / 96, own = f / 256;
 look_into(own);
-for (int step = 0; step < blocks && tangent < STEEPEST; ++step) {
+for (int step = 0; step < blocks && least < STEEPEST; ++step) {
     const int block = (own / 16 + step) % blocks;
     alignas(64) int open[16];
     *(i16*)open = boxes_above(super_boxes.data + 96 * (long)block);
-    for (int k = 0; k < 16 && tangent < STEEPEST; ++k)
+    for (int k = 0; k < 16 && least < STEEPEST; ++k)
         if (open[k] != 0 && 16 * block + k != own) look_into(16 * block + k);
 }
-tangent_out.data[f] = tangent;
+const int order[8] = {0, 4, 5, 1, 3, 7, 6, 2};
+float most = 0.0f;
+for (int k = 0; k < 8; ++k) most = largest(most, tangents[k]);
+for (int k = 0; k < 8; ++k) tangent_out.data[8 * (long)f + order[k]] = across_z < POLE ? most : tangents[k];

@@ -1,9 +1,9 @@
 """How high above each triangle the mesh may rise: rays that leave a triangle above that horizon meet nothing and need not be traced.
 
-In: a mesh. Out: for each face the sine of an elevation over its plane; whatever the mesh has there lies below. A proof, not a
-sample: a triangle counts as below elevation e when one plane that leans outwards at e, and that the whole face lies behind, has it on its
-outer side. Such planes are tried in the directions of the face's edges and eight more, so the horizon errs upwards only. A face of a convex
-mesh has horizon 0, one inside a fold more than 1.
+In: a mesh. Out: for each face and each of SECTORS sectors of azimuth the sine of an elevation over its plane; whatever the mesh has there lies
+below. A proof, not a sample: a triangle counts as below elevation e when one plane that leans outwards at e, and that the whole face lies behind, has
+it on its outer side. Such planes are tried in the directions of the face's edges and eight more, so the horizon errs upwards only. A triangle that lies
+wholly behind the face as seen along a sector concerns other sectors only. A face of a convex mesh has horizon 0, one inside a fold more than 1.
 
 Groups of triangles, neighbours along a space-filling curve, are dismissed by their boxes. The cosine-weighted share of the sky below
 elevation e is sin^2 e.
@@ -26,6 +26,11 @@ GROUP = wp.constant(16)
 SUPER = wp.constant(16)
 """Groups of a group of groups."""
 DIRECTIONS = wp.constant(11)
+SECTORS = 8
+"""Of azimuth, an eighth of a turn each."""
+POLE = wp.constant(0.02)
+"""Sine of the tilt off the z axis below which a face has the same horizon all around: there rounding turns its frame. Above, by less than
+1e-5, and nothing counts as behind a face that does not keep the lift away from it, which is 1e-5 of the mesh's extent."""
 STEEPEST = wp.constant(1.75)
 """Tangent of the elevation above which a horizon is of no use."""
 BLOCKED = 2.0
@@ -47,6 +52,26 @@ WORTHWHILE = 0.1
 
 Planes = wp.types.matrix(shape=(11, 3), dtype=float)
 Supports = wp.types.vector(length=11, dtype=float)
+Tangents = wp.types.vector(length=8, dtype=float)
+Passed = wp.types.vector(length=8, dtype=wp.int32)
+
+
+@wp.func
+def horizon_frame(normal: wp.vec3) -> wp.vec3:
+    """First axis of the frame in which azimuths over a face are counted; the second is normal x first."""
+    across = wp.sqrt(normal[0] * normal[0] + normal[1] * normal[1])
+    if across > 0.0:
+        return wp.vec3(-normal[1] / across, normal[0] / across, 0.0)
+    return wp.vec3(1.0, 0.0, 0.0)
+
+
+@wp.func
+def horizon_sector(normal: wp.vec3, direction: wp.vec3) -> int:
+    """Which of a face's horizons a direction is to be compared with."""
+    u = horizon_frame(normal)
+    x = wp.dot(u, direction)
+    y = wp.dot(wp.cross(normal, u), direction)
+    return wp.where(x < 0.0, 1, 0) + wp.where(y < 0.0, 2, 0) + wp.where(wp.abs(y) > wp.abs(x), 4, 0)
 
 
 @wp.func
@@ -94,20 +119,17 @@ def raise_horizons(
     cross = wp.cross(b - a, c - a)
     area = wp.length(cross)
     if area <= 0.0:
-        tangent_out[f] = 1.0e30
+        for k in range(8):
+            tangent_out[8 * f + k] = 1.0e30
         return
     normal = cross / area
     # Rays start at `lift` above the plane: what stays below half of it is out of their reach.
     base = wp.max(wp.max(wp.dot(normal, a), wp.dot(normal, b)), wp.dot(normal, c)) + 0.5 * lift
-    longest = b - a
-    if wp.length_sq(c - b) > wp.length_sq(longest):
-        longest = c - b
-    if wp.length_sq(a - c) > wp.length_sq(longest):
-        longest = a - c
-    u = wp.normalize(longest)
+    u = horizon_frame(normal)
     v = wp.cross(normal, u)
     planes = Planes()
     supports = Supports()
+    behind = Tangents()
     for k in range(DIRECTIONS):
         angle = 0.78539816339 * float(k)
         h = wp.cos(angle) * u + wp.sin(angle) * v
@@ -121,7 +143,11 @@ def raise_horizons(
         planes[k, 1] = h[1]
         planes[k, 2] = h[2]
         supports[k] = wp.max(wp.max(wp.dot(h, a), wp.dot(h, b)), wp.dot(h, c))
-    tangent = wp.float32(0.0)
+        if k < 8:
+            behind[k] = wp.min(wp.min(wp.dot(h, a), wp.dot(h, b)), wp.dot(h, c)) - lift
+    tangents = Tangents()
+    passed = Passed()
+    tangent = wp.float32(0.0)  # the least of them
     groups = (face_count + GROUP - 1) // GROUP
     supers = (groups + SUPER - 1) // SUPER
     own = f // (GROUP * SUPER)
@@ -144,6 +170,10 @@ def raise_horizons(
                                 above_r = wp.dot(normal, r) - base
                                 if wp.max(wp.max(above_p, above_q), above_r) > 0.0:
                                     lowest = wp.float32(1.0e30)
+                                    for k in range(8):
+                                        h = wp.vec3(planes[k, 0], planes[k, 1], planes[k, 2])
+                                        farthest = wp.max(wp.max(wp.dot(h, p), wp.dot(h, q)), wp.dot(h, r))
+                                        passed[k] = wp.where(farthest < behind[k], 1, 0)
                                     for k in range(DIRECTIONS):
                                         h = wp.vec3(planes[k, 0], planes[k, 1], planes[k, 2])
                                         needed = wp.max(
@@ -154,14 +184,26 @@ def raise_horizons(
                                             ratio(above_r, wp.dot(h, r) - supports[k], 0.1 * lift),
                                         )
                                         lowest = wp.min(lowest, needed)
-                                    tangent = wp.max(tangent, lowest)
-    tangent_out[f] = tangent
+                                    tangent = wp.float32(1.0e30)
+                                    for k in range(8):
+                                        out = passed[(k + 7) % 8] + passed[k] + passed[(k + 1) % 8] + passed[(k + 2) % 8]
+                                        tangents[k] = wp.where(out == 0, wp.max(tangents[k], lowest), tangents[k])
+                                        tangent = wp.min(tangent, tangents[k])
+    most = wp.float32(0.0)
+    for k in range(8):
+        most = wp.max(most, tangents[k])
+    pole = wp.sqrt(normal[0] * normal[0] + normal[1] * normal[1]) < POLE
+    for k in range(8):
+        # Sector k begins at k eighths of a turn; the order is horizon_sector's.
+        angle = 0.78539816339 * (float(k) + 0.5)
+        at = horizon_sector(normal, wp.cos(angle) * u + wp.sin(angle) * v)
+        tangent_out[8 * f + at] = wp.where(pole, most, tangents[k])
 
 
 def _source_of_face_horizon() -> str:
     assert int(GROUP) == int(SUPER) == 16  # the lanes of a vector
     folder = Path(__file__).parent
-    constants = f"constexpr int DIRECTIONS = {int(DIRECTIONS)};\nconstexpr float STEEPEST = {float(STEEPEST)}f;\n"
+    constants = f"constexpr int DIRECTIONS = {int(DIRECTIONS)};\nconstexpr float STEEPEST = {float(STEEPEST)}f, POLE = {float(POLE)}f;\n"
     return constants + (folder / "rasterize_gbuffer" / "tile_vector.h").read_text() + (folder / "horizon.h").read_text()
 
 
@@ -223,7 +265,7 @@ class Horizons:
     """
 
     sine: Tensor
-    """(face,) sine of the elevation over each face's plane below which the mesh stays; BLOCKED where nothing is known."""
+    """(face, SECTORS) sine of the elevation over each face's plane below which the mesh stays; BLOCKED where nothing is known."""
 
     def __init__(self, mesh: TriangleMesh, lift: float) -> None:
         """
@@ -232,7 +274,7 @@ class Horizons:
         """
         corners = mesh.vertices.detach().float()[mesh.faces.long()]
         count = len(corners)
-        self.sine = torch.full((count,), BLOCKED, device=corners.device)
+        self.sine = torch.full((count, SECTORS), BLOCKED, device=corners.device)
         self.found = 0
         """Faces looked at so far."""
         self._lift = lift
@@ -300,14 +342,14 @@ class Horizons:
             padded = torch.cat([self._corners, self._corners[-1:].expand(-count % group, 3, 3)])
             triangles = padded.view(-1, group, 9).transpose(1, 2).contiguous()  # the last triangle repeated changes nothing
             self._lanes = (triangles, _box_lanes(*self._boxes[:2]), _box_lanes(*self._boxes[2:]))
-        tangent = torch.empty(count, device=self.sine.device)
+        tangent = torch.empty(count, SECTORS, device=self.sine.device)
         boxes = [warp_array(box, wp.vec3) for box in self._boxes]
         corners, device = [warp_array(which), warp_array(self._corners.view(-1, 3), wp.vec3)], warp_device(tangent)
         if tangent.is_cuda:
-            launch(raise_horizons, len(which), [*corners, count, *boxes, self._lift], [warp_array(tangent)], device)
+            launch(raise_horizons, len(which), [*corners, count, *boxes, self._lift], [warp_array(tangent.view(-1))], device)
         else:
             lanes = [warp_array(values.view(-1)) for values in self._lanes]
-            launch(raise_horizons_simd, len(which), [*corners, *lanes, self._lift], [warp_array(tangent)], device)
+            launch(raise_horizons_simd, len(which), [*corners, *lanes, self._lift], [warp_array(tangent.view(-1))], device)
         tangent = tangent[which.long()]
         sine = tangent / torch.sqrt(1 + tangent.square().clamp(max=1e12)) + MARGIN
         sine = torch.where(tangent < float(STEEPEST), sine, BLOCKED)
@@ -321,18 +363,20 @@ class Horizons:
 
     def spared(self) -> float:
         """Share of cosine-weighted rays from the faces looked at that need no tracing (each face counting alike)."""
-        return self._open_sky / self.found if self.found else 0.0
+        return self._open_sky / (SECTORS * self.found) if self.found else 0.0
 
 
 def usable_horizons(horizons: Horizons | None, blocked_share: float = 0.0) -> Tensor | None:
-    """(face,) horizons for shade; those of at most `blocked_share` of the cosine-weighted sky are taken for nothing at all."""
+    """(face, SECTORS) horizons for shade; those of faces with at most `blocked_share` of the cosine-weighted sky are taken for nothing."""
     if horizons is None or horizons.found == 0:
         return None
-    return torch.where(horizons.sine.square() <= blocked_share, -1.0, horizons.sine) if blocked_share > 0 else horizons.sine
+    if blocked_share <= 0:
+        return horizons.sine
+    return torch.where(horizons.sine.square().mean(1, keepdim=True) <= blocked_share, -1.0, horizons.sine)
 
 
 def find_horizons(mesh: TriangleMesh, lift: float) -> Tensor:
-    """(face,) horizons of all faces at once."""
+    """(face, SECTORS) horizons of all faces at once."""
     horizons = Horizons(mesh, lift)
     while horizons.found < horizons.faces and not horizons._hopeless():
         horizons.find(horizons.faces)

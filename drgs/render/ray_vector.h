@@ -96,6 +96,13 @@ const auto strategy_of = [](const int* split, int round, int slot, unsigned& str
     const int before = strategy == 0u ? 0 : (strategy == 1u ? split[0] : split[0] + split[1]);
     index = (unsigned)(round * split[strategy] + slot - before);
 };
+// horizon_sector of horizon.py
+const auto horizon_sector = [&](V3 n, V3 d) -> i16 {
+    const v16 scale = 1.0f / sqrt16(max16(n.x * n.x + n.y * n.y, v16(1e-30f)));
+    const V3 u = {-n.y * scale, n.x * scale, v16(0.0f)};
+    const v16 x = dot3(u, d), y = dot3(cross3(n, u), d);
+    return ((x < 0.0f) & 1) | ((y < 0.0f) & 2) | ((__builtin_elementwise_abs(y) > __builtin_elementwise_abs(x)) & 4);
+};
 // A point's lobes seen from wo. `bound` and `stretch` belong to the density of visible normals.
 struct Lobes { V3 n, wo; v16 alpha, alpha2, n_dot_v, bound, stretch; };
 const auto lobes_of = [&](V3 n, V3 wo, v16 roughness) -> Lobes {

@@ -12,10 +12,12 @@ const int lanes = min_int(16, paths - base);
 const float* const positions = (const float*)mesh.vertices.data;
 const float* const normals = (const float*)mesh.normals.data;
 const float* const albedos = (const float*)mesh.albedo.data;
-alignas(64) float corner[3][11][16], given[9][16];
+alignas(64) float corner[3][11][16], given[8][16];
 alignas(64) unsigned pixel_lane[16], index_lane[16], strategy_lane[16];
+int triangles[16];
 for (int lane = 0; lane < 16; ++lane) {
     const int path = base + min_int(lane, lanes - 1), triangle = face.data[path];
+    triangles[lane] = triangle;
     for (int c = 0; c < 3; ++c) {
         const long vertex = mesh.faces.data[3 * (long)triangle + c];
         for (int k = 0; k < 3; ++k) {
@@ -33,7 +35,6 @@ for (int lane = 0; lane < 16; ++lane) {
         given[2 + k][lane] = ((const float*)ray_direction.data)[3 * (long)path + k];
         given[5 + k][lane] = ((const float*)throughput.data)[3 * (long)path + k];
     }
-    given[8][lane] = mesh.horizon.shape[0] > 0 ? mesh.horizon.data[triangle] : 2.0f;
     const int ray = (int)path_ray.data[path], point = first_point + ray / count;
     int split[3];
     split_at(samples, points, point, split);
@@ -47,7 +48,7 @@ const auto edge = [&](int c) -> V3 {
     return {load16(corner[c][0]) - load16(corner[0][0]), load16(corner[c][1]) - load16(corner[0][1]), load16(corner[c][2]) - load16(corner[0][2])};
 };
 const V3 position = {blend(0), blend(1), blend(2)}, n = unit3({blend(3), blend(4), blend(5)}), outward = unit3(cross3(edge(1), edge(2)));
-const v16 albedo[3] = {blend(6), blend(7), blend(8)}, metallic = blend(10), horizon = load16(given[8]);
+const v16 albedo[3] = {blend(6), blend(7), blend(8)}, metallic = blend(10);
 const V3 wo = {-load16(given[2]), -load16(given[3]), -load16(given[4])};
 const Lobes lobes = lobes_of(n, wo, blend(9));
 const i16 outside = (lobes.n_dot_v > 0.0f) & (dot3(outward, wo) > 0.0f);
@@ -81,9 +82,12 @@ const auto reflect = [&](V3 d, v16 n_dot_l, v16* reflected) -> v16 {
 // ----
 const auto put = [&](long at, i16 live, V3 d, const v16* light_there, const v16* carried_on) {
     alignas(64) float out[12][16];
-    alignas(64) int live_lane[16], traced_lane[16];
+    alignas(64) int live_lane[16], traced_lane[16], sector_lane[16];
+    alignas(64) float limit[16];
     *(i16*)live_lane = live;
-    *(i16*)traced_lane = dot3(outward, d) <= horizon;
+    *(i16*)sector_lane = horizon_sector(outward, d);
+    for (int lane = 0; lane < 16; ++lane) limit[lane] = mesh.horizon.shape[0] > 0 ? mesh.horizon.data[8 * (long)triangles[lane] + sector_lane[lane]] : 2.0f;
+    *(i16*)traced_lane = dot3(outward, d) <= load16(limit);
     const V3 start = {position.x + mesh.lift * outward.x, position.y + mesh.lift * outward.y, position.z + mesh.lift * outward.z};
     store16(out[0], start.x); store16(out[1], start.y); store16(out[2], start.z);
     store16(out[3], d.x); store16(out[4], d.y); store16(out[5], d.z);
@@ -108,9 +112,12 @@ const int side = (depth + 1) % 2;
 float total[16][3] = {};
 const auto put = [&](long, i16 live, V3 d, const v16* light_there, const v16* carried_on) {
     alignas(64) float out[12][16];
-    alignas(64) int live_lane[16], traced_lane[16];
+    alignas(64) int live_lane[16], traced_lane[16], sector_lane[16];
+    alignas(64) float limit[16];
     *(i16*)live_lane = live;
-    *(i16*)traced_lane = dot3(outward, d) <= horizon;
+    *(i16*)sector_lane = horizon_sector(outward, d);
+    for (int lane = 0; lane < 16; ++lane) limit[lane] = mesh.horizon.shape[0] > 0 ? mesh.horizon.data[8 * (long)triangles[lane] + sector_lane[lane]] : 2.0f;
+    *(i16*)traced_lane = dot3(outward, d) <= load16(limit);
     const V3 start = {position.x + mesh.lift * outward.x, position.y + mesh.lift * outward.y, position.z + mesh.lift * outward.z};
     store16(out[0], start.x); store16(out[1], start.y); store16(out[2], start.z);
     store16(out[3], d.x); store16(out[4], d.y); store16(out[5], d.z);

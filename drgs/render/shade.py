@@ -18,7 +18,7 @@ from torch import Tensor
 
 from drgs.render.brdf_warp import alpha_of, specular_brdf
 from drgs.render.environment_table import EnvironmentLight, lookup_radiance, table_place
-from drgs.render.horizon import BLOCKED
+from drgs.render.horizon import horizon_sector
 from drgs.render.ray_memory import RayMemory, note_directions, room_for_rays, trace_batch, usable_rays
 from drgs.render.records import ShadingPoints
 from drgs.render.sample_rays import (
@@ -82,6 +82,7 @@ def start_rays(
     points: PointArrays,
     starts: wp.array[wp.vec3],
     surface_normals: wp.array[wp.vec3],
+    start_face: wp.array[int],
     horizon: wp.array[float],
     light: EnvironmentLight,
     samples: SampleSet,
@@ -116,7 +117,9 @@ def start_rays(
             if keep_dark != 0 or wp.max(seen) > 0.0:
                 limit = wp.float32(2.0)
                 if horizon.shape[0] > 0:
-                    limit = horizon[point]
+                    face = start_face[point]
+                    if face >= 0:
+                        limit = horizon[8 * face + horizon_sector(surface_normals[point], candidate)]
                 start = wp.where(wp.dot(surface_normals[point], candidate) <= limit, starts[point], far_along(candidate))
                 wi = candidate
                 w = balance_weight(split, light, wi, wo, n, alpha, place) * wp.dot(n, wi)
@@ -131,7 +134,8 @@ def start_rays(
 @wp.func_native(ray_source("start_rays.h", 0, 1))
 def start_sixteen_rays(
     base: int, ray_count: int, first: int,
-    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3), horizon: wp.array(dtype=float),
+    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3),
+    start_face: wp.array(dtype=int), horizon: wp.array(dtype=float),
     light: EnvironmentLight, samples: SampleSet, keep_dark: int,
     origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), cosine_weight: wp.array(dtype=float),
     specular: wp.array(dtype=wp.vec3), radiance: wp.array(dtype=wp.vec3),
@@ -145,6 +149,7 @@ def start_rays_simd(
     points: PointArrays,
     starts: wp.array[wp.vec3],
     surface_normals: wp.array[wp.vec3],
+    start_face: wp.array[int],
     horizon: wp.array[float],
     light: EnvironmentLight,
     samples: SampleSet,
@@ -158,7 +163,7 @@ def start_rays_simd(
 ):
     """start_rays for sixteen rays a launch index, on the CPU."""
     start_sixteen_rays(
-        16 * wp.tid(), ray_count, first, points, starts, surface_normals, horizon, light, samples, keep_dark,
+        16 * wp.tid(), ray_count, first, points, starts, surface_normals, start_face, horizon, light, samples, keep_dark,
         origin, direction, cosine_weight, specular, radiance,
     )  # fmt: skip
 
@@ -184,7 +189,7 @@ def shade(
         by_material: each point shares its samples out by its material (sample_rays.split_at).
         samples_round: how many estimates of the same counts and seed came before; continues their sequences. (point,) int32 where it differs.
         memory: of an estimate of the same counts from the same starts: rays that are known are not traced, and it then knows these.
-        horizon: (face,) sines (horizon.Horizons); rays above them are not traced.
+        horizon: (face, SECTORS) sines (horizon.Horizons); rays above them are not traced.
     """
     device = points.normal_world.device
     point_count = len(points.pixel)
@@ -205,7 +210,7 @@ def shade(
     start_arrays = [
         warp_array(starts.origin_world, wp.vec3),
         warp_array(starts.surface_normal_world, wp.vec3),
-        warp_array(_point_horizons(starts, horizon)),
+        *(warp_array(values) for values in _horizons_at(starts, horizon)),
     ]
     mesh = mesh_arrays(tracer.mesh, tracer.lift, horizon)
     sums = [
@@ -271,9 +276,8 @@ def shade(
     return result
 
 
-def _point_horizons(starts: RayStarts, of_faces: Tensor | None) -> Tensor:
-    """(point,) horizons; empty where none is known."""
+def _horizons_at(starts: RayStarts, of_faces: Tensor | None) -> tuple[Tensor, Tensor]:
+    """(point,) faces and (face * SECTORS,) their horizons; both empty where none is known."""
     if of_faces is None or starts.face is None:
-        return starts.origin_world.new_empty(0)
-    face = starts.face.long()
-    return torch.where(face >= 0, of_faces[face.clamp(min=0)], BLOCKED)
+        return starts.origin_world.new_empty(0, dtype=torch.int32), starts.origin_world.new_empty(0)
+    return starts.face.int(), of_faces.reshape(-1)

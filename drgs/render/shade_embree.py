@@ -37,7 +37,8 @@ class PathArrays:
 @wp.func_native(EMBREE_RAY + ray_source("start_rays.h", 0, 2))
 def ask_sixteen_rays(
     intersect: wp.uint64, occluded: wp.uint64, tree: wp.uint64, base: int, ray_count: int, first: int,
-    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3), horizon: wp.array(dtype=float),
+    points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3),
+    start_face: wp.array(dtype=int), horizon: wp.array(dtype=float),
     light: EnvironmentLight, samples: SampleSet, keep_dark: int,
     cosine_weight: wp.array(dtype=float), specular: wp.array(dtype=wp.vec3), radiance: wp.array(dtype=wp.vec3), blocked: wp.array(dtype=wp.bool),
     indirect: wp.array(dtype=wp.vec3), path_count: wp.array(dtype=int), packed: PathArrays,
@@ -65,6 +66,7 @@ def shade_chunks(
     points: PointArrays,
     starts: wp.array[wp.vec3],
     surface_normals: wp.array[wp.vec3],
+    start_face: wp.array[int],
     horizon: wp.array[float],
     light: EnvironmentLight,
     mesh: MeshArrays,
@@ -93,8 +95,8 @@ def shade_chunks(
     path_count[0] = 0
     for group in range((rays + 15) // 16):
         ask_sixteen_rays(
-            intersect, occluded, tree, 16 * group, rays, begin * count, points, starts, surface_normals, horizon, light, samples, bounces,
-            cosine_weight, specular, radiance, blocked, indirect, path_count, even,
+            intersect, occluded, tree, 16 * group, rays, begin * count, points, starts, surface_normals, start_face, horizon, light, samples,
+            bounces, cosine_weight, specular, radiance, blocked, indirect, path_count, even,
         )  # fmt: skip
     for depth in range(bounces):
         side = depth % 2
@@ -125,7 +127,7 @@ def shade_slice(
     """Points from `first` to `last`. Runs on the calling thread.
 
     Args:
-        given: PointArrays, starts, surface normals, horizons of the points and EnvironmentLight. mesh, samples: MeshArrays, SampleSet.
+        given: PointArrays, starts, surface normals, faces, horizons of all faces and EnvironmentLight. mesh, samples: MeshArrays, SampleSet.
         sums: where diffuse and specular light, variance and visibility of all points go.
     """
     chunk = max(1, RAYS_A_CHUNK // rays_a_point)

@@ -3,7 +3,7 @@
 // Lanes never look at each other, so a ray's result does not depend on its group.
 //
 // in   base (first ray of the group in the batch), ray_count (of the batch), first (the batch's first ray among all),
-//      points, starts, surface_normals, horizon (of each point), light, samples, keep_dark
+//      points, starts, surface_normals, start_face, horizon (8 of each face), light, samples, keep_dark
 // out  cosine_weight, specular, radiance of rays base .. base + 15, and either their origin and direction,
 //      or what they met: `blocked`, and with keep_dark the rays that met a surface, packed behind path_count[0] in `packed`
 
@@ -14,7 +14,7 @@ const float* const normals = (const float*)points.normal.data;
 const float* const outgoing = (const float*)points.wo.data;
 const float* const albedos = (const float*)points.albedo.data;
 const float* const triangles = (const float*)surface_normals.data;
-alignas(64) float gathered[15][16];
+alignas(64) float gathered[14][16];
 alignas(64) unsigned pixel_lane[16], index_lane[16], strategy_lane[16];
 u16 pixel16, index16, strategy16;
 int point_lane[16];
@@ -42,7 +42,6 @@ if (slot + 16 <= count) {
     }
     store16(gathered[9], v16(points.roughness.data[point]));
     store16(gathered[10], v16(points.metallic.data[point]));
-    store16(gathered[14], v16(horizon.shape[0] > 0 ? horizon.data[point] : 2.0f));
 } else {
 for (int lane = 0; lane < 16; ++lane) {
     const int ray = first + base + min_int(lane, lanes - 1), point = ray / count;
@@ -60,7 +59,6 @@ for (int lane = 0; lane < 16; ++lane) {
     }
     gathered[9][lane] = points.roughness.data[point];
     gathered[10][lane] = points.metallic.data[point];
-    gathered[14][lane] = horizon.shape[0] > 0 ? horizon.data[point] : 2.0f;
 }
     strategy16 = *(const u16*)strategy_lane;
     index16 = *(const u16*)index_lane;
@@ -83,7 +81,8 @@ if (any(is_environment)) {
     d = {select(is_environment, drawn.x, d.x), select(is_environment, drawn.y, d.y), select(is_environment, drawn.z, d.z)};
 }
 d = unit3(d);
-const v16 n_dot_l = dot3(n, d), above = dot3({load16(gathered[6]), load16(gathered[7]), load16(gathered[8])}, d);
+const V3 triangle = {load16(gathered[6]), load16(gathered[7]), load16(gathered[8])};
+const v16 n_dot_l = dot3(n, d), above = dot3(triangle, d);
 i16 live = (lobes.n_dot_v > 0.0f) & (n_dot_l > 0.0f) & (above > 0.0f);
 
 // 4. The environment there.
@@ -108,8 +107,15 @@ store16(result[4], dv * (1.0f - c5));
 store16(result[5], dv * c5);
 for (int k = 0; k < 3; ++k) store16(result[6 + k], select(live, seen[k], v16(0.0f)));
 *(i16*)live_lane = live;
-alignas(64) int traced_lane[16];
-*(i16*)traced_lane = above <= load16(gathered[14]);
+alignas(64) int traced_lane[16], sector_lane[16];
+alignas(64) float limit[16];
+*(i16*)sector_lane = horizon_sector(triangle, d);
+const bool has_horizons = horizon.shape[0] > 0;
+for (int lane = 0; lane < lanes; ++lane) {
+    const int face_there = has_horizons ? start_face.data[point_lane[lane]] : -1;
+    limit[lane] = face_there >= 0 ? horizon.data[8 * (long)face_there + sector_lane[lane]] : 2.0f;
+}
+*(i16*)traced_lane = above <= load16(limit);
 const float* const from = (const float*)starts.data;
 float* const specular_out = (float*)specular.data;
 float* const radiance_out = (float*)radiance.data;

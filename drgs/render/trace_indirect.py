@@ -19,6 +19,7 @@ from torch import Tensor
 from drgs.maths.brdf import MIN_ROUGHNESS
 from drgs.render.brdf_warp import PI, alpha_of, cosine_direction, ggx_direction, ggx_pdf, specular_brdf
 from drgs.render.environment_table import EnvironmentLight, environment_direction, lookup_pdf, lookup_radiance, table_place
+from drgs.render.horizon import horizon_sector
 from drgs.render.random_warp import hash_combine, shuffle_index, sobol_2d
 from drgs.render.records import Hits
 from drgs.render.sample_rays import PointArrays, SampleSet, round_at, split_at, strategy_of, strategy_seed
@@ -42,14 +43,14 @@ class MeshArrays:
     lift: float
     """Of ray origins off the surface."""
     horizon: wp.array[float]
-    """Of each face; empty where none is known."""
+    """Eight of each face (horizon_sector); empty where none is known."""
 
 
 def mesh_arrays(mesh: TriangleMesh, lift: float, horizon: Tensor | None = None) -> Any:
     """The struct that kernels read; shares memory with the tensors.
 
     Args:
-        horizon: (face,) sines; rays above them are not traced.
+        horizon: (face, SECTORS) sines; rays above them are not traced.
     """
     arrays = MeshArrays()
     arrays.vertices = warp_array(mesh.vertices.float(), wp.vec3)
@@ -59,7 +60,7 @@ def mesh_arrays(mesh: TriangleMesh, lift: float, horizon: Tensor | None = None) 
     arrays.roughness = warp_array(mesh.roughness.float())
     arrays.metallic = warp_array(mesh.metallic.float())
     arrays.lift = lift
-    arrays.horizon = warp_array(mesh.roughness[:0].float() if horizon is None else horizon)
+    arrays.horizon = warp_array(mesh.roughness[:0].float() if horizon is None else horizon.reshape(-1))
     return arrays
 
 
@@ -105,6 +106,14 @@ def far_along(direction: wp.vec3) -> wp.vec3:
         wp.where(direction[1] < 0.0, -1.0e15, 1.0e15),
         wp.where(direction[2] < 0.0, -1.0e15, 1.0e15),
     )
+
+
+@wp.func
+def face_limit(mesh: MeshArrays, face: int, normal: wp.vec3, direction: wp.vec3) -> float:
+    """Sine of elevation above which a ray from a face meets nothing; 2 where that is not known."""
+    if mesh.horizon.shape[0] == 0:
+        return 2.0
+    return mesh.horizon[8 * face + horizon_sector(normal, direction)]
 
 
 @wp.func
@@ -175,17 +184,14 @@ def scatter_hits(
     diffuse = (1.0 - surface.metallic) * wp.max(surface.albedo)
     share = wp.clamp(specular / (specular + diffuse), 0.1, 1.0)
     carried = throughput[i]
-    horizon = wp.float32(2.0)
-    if mesh.horizon.shape[0] > 0:
-        horizon = mesh.horizon[face[i]]
-
     wi = environment_direction(light, u_light)
     n_dot_l = wp.dot(n, wi)
     if n_dot_l > 0.0 and wp.dot(surface.face_normal, wi) > 0.0:
         uv = table_place(light, wi)
         density = lookup_pdf(light, uv) + share * ggx_pdf(wi, wo, n, alpha) + (1.0 - share) * n_dot_l / PI
         if density > 0.0:
-            origin[i] = wp.where(wp.dot(surface.face_normal, wi) <= horizon, start, far_along(wi))
+            limit = face_limit(mesh, face[i], surface.face_normal, wi)
+            origin[i] = wp.where(wp.dot(surface.face_normal, wi) <= limit, start, far_along(wi))
             direction[i] = wi
             incoming = lookup_radiance(light, uv)
             contribution[i] = wp.cw_mul(carried, wp.cw_mul(brdf_times_cosine(surface, wi, wo, alpha), incoming)) / density
@@ -200,7 +206,8 @@ def scatter_hits(
         own = share * ggx_pdf(wi, wo, n, alpha) + (1.0 - share) * n_dot_l / PI
         if own > 0.0:
             reflected = wp.cw_mul(carried, brdf_times_cosine(surface, wi, wo, alpha))
-            origin[j] = wp.where(wp.dot(surface.face_normal, wi) <= horizon, start, far_along(wi))
+            limit = face_limit(mesh, face[i], surface.face_normal, wi)
+            origin[j] = wp.where(wp.dot(surface.face_normal, wi) <= limit, start, far_along(wi))
             direction[j] = wi
             contribution[j] = wp.cw_mul(reflected, lookup_radiance(light, uv)) / (own + lookup_pdf(light, uv))
             survival = wp.float32(1.0)

@@ -233,7 +233,7 @@ def test_sixteen_rays_at_once_are_the_rays_one_by_one(by_material: bool, sky: En
     light = environment_light(sky, build_environment_table(sky), rotation_degrees=70.0, intensity=2.0)
     inputs = [
         first, point_arrays(points), warp_array(points.position_world, wp.vec3), warp_array(surface, wp.vec3),
-        warp_array(2 * torch.rand(len(surface))), light, sample_set(counts, 11, 3, by_material), 0,
+        warp_array(torch.arange(len(surface)).int()), warp_array(2 * torch.rand(8 * len(surface))), light, sample_set(counts, 11, 3, by_material), 0,
     ]  # fmt: skip
     results = []
     for kernel, dim, extra in ((start_rays, rays, []), (start_rays_simd, -(-rays // 16), [rays])):
@@ -276,7 +276,7 @@ def test_sixteen_paths_at_once_are_the_paths_one_by_one(depth: int, sky: Environ
     inputs = [
         warp_array(path_ray), warp_array(face), warp_array(barycentric, wp.vec2), warp_array(arriving, wp.vec3),
         warp_array(throughput, wp.vec3), 3, depth, paths, point_arrays(points), light,
-        mesh_arrays(mesh, 1e-4, 2 * torch.rand(len(mesh.faces), generator=numbers)), sample_set(counts, 11, 3, True),
+        mesh_arrays(mesh, 1e-4, 2 * torch.rand(len(mesh.faces), 8, generator=numbers)), sample_set(counts, 11, 3, True),
     ]  # fmt: skip
     results = []
     for kernel, dim in ((scatter_hits, paths), (scatter_hits_simd, -(-paths // 16))):
