@@ -35,7 +35,7 @@ def with_edits(asset: "Asset", edits: Sequence[Edit], environments: Path, versio
     from drgs.scene.environment import Environment, rotate_environment
 
     scene = pose_scene(asset, edits, environments, confine=True)
-    gaussians, binding = asset.gaussians, asset.binding
+    gaussians, binding, horizons = asset.gaussians, asset.binding, scene.horizons
     if gaussians is not None and scene.surfels is not None:
         surfels = scene.surfels
         gaussians = replace(
@@ -52,7 +52,9 @@ def with_edits(asset: "Asset", edits: Sequence[Edit], environments: Path, versio
         environment = Environment(environment.radiance * scene.environment_intensity)
     history = [*asset.provenance.get("versions", ()), {"version": version, "edits": [plain_edit(edit) for edit in edits]}]
     provenance = asset.provenance | {"versions": history}
-    return replace(asset, gaussians=gaussians, mesh=scene.mesh, binding=binding, environment=environment, provenance=provenance)
+    return replace(
+        asset, gaussians=gaussians, mesh=scene.mesh, binding=binding, environment=environment, provenance=provenance, horizons=horizons
+    )
 
 
 def plain_edit(edit: Edit) -> dict:

@@ -37,7 +37,9 @@ from drgs.build.initial_points import initial_points
 from drgs.build.load_views import load_views
 from drgs.build.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
 from drgs.build.report_progress import BuildReporter, Progress, encode_preview
+from drgs.render.horizon import find_horizons, stored_horizons
 from drgs.render.sample_rays import SampleCounts
+from drgs.render.tracer import mesh_extent
 from drgs.scene.asset import Asset, save_asset
 from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
@@ -225,6 +227,7 @@ def build_stages(
                 "mesh": asdict(mesh_report(mesh.vertices, mesh.faces)),
                 "seconds": seconds,
             },
+            horizons=stored_horizons(find_horizons(baked, mesh_extent(baked)[1])),
         )
     save_asset(asset, out, _thumbnail(materials, views.cameras))
     reporter.report("pack", 1.0, "done")

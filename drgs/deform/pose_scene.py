@@ -84,7 +84,7 @@ def pose_scene(
             rotation, intensity = edit.rotation, edit.intensity
             if edit.file is not None:
                 environment = _environment(asset, edit.file, files, environments)
-    return PosedScene(surfels, mesh, environment, rotation, intensity)
+    return PosedScene(surfels, mesh, environment, rotation, intensity, None if deform else asset.horizons)
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,7 +148,7 @@ def start_frame(
         else:
             tracer = previous.tracer if previous.tracer.mesh is scene.mesh else previous.tracer.with_materials(scene.mesh)
     if tracer.horizons is None and settings.skip:
-        tracer.horizons = Horizons(tracer.mesh, tracer.lift)
+        tracer.horizons = Horizons(tracer.mesh, tracer.lift, scene.horizons)
     lap("build_tracer")
     table = build_environment_table(scene.environment) if previous is None or "environment_table" in make else previous.table
     light = environment_light(scene.environment, table, scene.environment_rotation_degrees, scene.environment_intensity)

@@ -39,6 +39,13 @@ float least = 0.0f;
 const auto absolute = [](float x) { return x < 0.0f ? -x : x; };
 // What lies behind the whole face along a direction within 90 degrees of all of a sector is out of that sector's reach.
 const auto in_sector = [](const i16* passed, int k) -> i16 { return ~(passed[(k + 7) & 7] | passed[k] | passed[(k + 1) & 7] | passed[(k + 2) & 7]); };
+// The lowest horizon found so far of the sectors that things are in; 1e30 where they are in none that could still be of use.
+const auto least_around = [&](const i16* passed) -> v16 {
+    v16 least_there(1e30f);
+    for (int k = 0; k < 8; ++k)
+        if (tangents[k] < STEEPEST) least_there = min16(least_there, select(in_sector(passed, k), v16(tangents[k]), v16(1e30f)));
+    return least_there;
+};
 // Which of 16 boxes, (6, 16): lowest and highest corners by coordinate, may hold something above the tangent found so far.
 const auto boxes_above = [&](const float* boxes) -> i16 {
     v16 middle[3], half[3];
@@ -50,17 +57,17 @@ const auto boxes_above = [&](const float* boxes) -> i16 {
     const auto along = [&](P3 d) -> v16 { return d.x * middle[0] + d.y * middle[1] + d.z * middle[2]; };
     const auto across = [&](P3 d) -> v16 { return absolute(d.x) * half[0] + absolute(d.y) * half[1] + absolute(d.z) * half[2]; };
     const v16 above = along(n) + across(n) - base;
-    const i16 high = above > 0.0f;
-    if (!any(high)) return high;
-    v16 needed(1e30f);
-    i16 passed[8], open = i16(0);
+    i16 open = above > 0.0f, passed[8];
+    if (!any(open)) return open;
+    v16 beyond[DIRECTIONS];
     for (int k = 0; k < DIRECTIONS; ++k) {
-        const v16 middle_along = along(h[k]), half_along = across(h[k]), beyond = middle_along - half_along - support[k];
-        needed = min16(needed, select(beyond > 0.0f, above / max16(beyond, v16(1e-30f)), v16(1e30f)));
+        const v16 middle_along = along(h[k]), half_along = across(h[k]);
+        beyond[k] = middle_along - half_along - support[k];
         if (k < 8) passed[k] = middle_along + half_along < behind[k];
     }
-    for (int k = 0; k < 8; ++k) open |= in_sector(passed, k) & (needed > tangents[k]);
-    return open & high;
+    const v16 reach = least_around(passed);
+    for (int k = 0; k < DIRECTIONS; ++k) open &= ~((beyond[k] > 0.0f) & (above <= reach * beyond[k]));
+    return open & (reach < 1e30f);
 };
 const auto against = [&](const float* lane) {
     v16 x[3], y[3], z[3], above[3];
@@ -73,19 +80,36 @@ const auto against = [&](const float* lane) {
     i16 open = max16(max16(above[0], above[1]), above[2]) > 0.0f;
     if (!any(open)) return;
     const float tolerance = 0.1f * lift;
-    v16 lowest(1e30f);
+    v16 beyond[DIRECTIONS][3];
     i16 passed[8];
     for (int k = 0; k < DIRECTIONS; ++k) {
-        v16 needed(0.0f), farthest(-1e30f);
+        v16 farthest(-1e30f);
         for (int p = 0; p < 3; ++p) {
-            const v16 along = h[k].x * x[p] + h[k].y * y[p] + h[k].z * z[p], beyond = along - support[k];
-            const v16 under = select(beyond >= -tolerance, v16(0.0f), v16(1e30f));
-            const v16 over = select(beyond > 0.0f, above[p] / max16(beyond, v16(1e-30f)), v16(1e30f));
-            needed = max16(needed, select(above[p] <= 0.0f, under, over));
+            const v16 along = h[k].x * x[p] + h[k].y * y[p] + h[k].z * z[p];
+            beyond[k][p] = along - support[k];
             farthest = max16(farthest, along);
         }
-        lowest = min16(lowest, needed);
         if (k < 8) passed[k] = farthest < behind[k];
+    }
+    // First by products alone: most triangles lie below the horizons found so far.
+    const v16 reach = least_around(passed);
+    open &= reach < 1e30f;
+    for (int k = 0; k < DIRECTIONS; ++k) {
+        i16 below = open;
+        for (int p = 0; p < 3; ++p)
+            below &= ((above[p] <= 0.0f) & (beyond[k][p] >= -tolerance)) | ((beyond[k][p] > 0.0f) & (above[p] <= reach * beyond[k][p]));
+        open &= ~below;
+        if (!any(open)) return;
+    }
+    v16 lowest(1e30f);
+    for (int k = 0; k < DIRECTIONS; ++k) {
+        v16 needed(0.0f);
+        for (int p = 0; p < 3; ++p) {
+            const v16 under = select(beyond[k][p] >= -tolerance, v16(0.0f), v16(1e30f));
+            const v16 over = select(beyond[k][p] > 0.0f, above[p] / max16(beyond[k][p], v16(1e-30f)), v16(1e30f));
+            needed = max16(needed, select(above[p] <= 0.0f, under, over));
+        }
+        lowest = min16(lowest, needed);
     }
     least = 1e30f;
     for (int k = 0; k < 8; ++k) {

@@ -133,11 +133,15 @@ def plan_frame(
             Skip("samples of strategies that a point's material hardly needs", "they go to its other strategies", "exact in the mean")
         )
     skips.append(
-        Skip("tracing of rays that leave above all the mesh has there", "horizons of faces, found as rays pay for them", "exact")
+        Skip(
+            "tracing of rays that leave above all the mesh has there",
+            "horizons of faces, the asset's or found as rays pay for them",
+            "exact",
+        )
         if skip_error <= 0
         else Skip(
             "tracing of rays that leave above nearly all the mesh has there",
-            "horizons of faces, found as rays pay for them",
+            "horizons of faces, the asset's or found as rays pay for them",
             f"at most {100 * skip_error:g} % of the cosine-weighted sky at a point taken for open",
         )
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import safetensors.numpy
 import torch
+from jaxtyping import UInt8
 from torch import Tensor
 
 from drgs.exchange.exr import decode_environment, encode_environment
@@ -32,7 +33,7 @@ CONVENTIONS = {
     "environment": "lat-long; texel (u, v) holds radiance from d with u = 0.5 - atan2(d_y, d_x) / 2 pi, v = acos(d_z) / pi",
     "brdf": "metallic-roughness, GGX with alpha = roughness^2",
 }
-_FILES = ("gaussians.ply", "mesh.glb", "binding.safetensors", "environment.exr", "cameras.json")
+_FILES = ("gaussians.ply", "mesh.glb", "binding.safetensors", "environment.exr", "cameras.json", "horizons.safetensors")
 _REQUIRED = ("mesh.glb", "environment.exr", "cameras.json")
 THUMBNAIL = "thumb.jpg"
 
@@ -52,6 +53,8 @@ class Asset:
     meters_per_unit: float = 1.0
     provenance: dict = field(default_factory=dict)
     """Plain JSON: source, preset, seed, versions, seconds per stage, quality."""
+    horizons: UInt8[Tensor, "face 8"] | None = None
+    """How high the mesh rises around each of its faces (drgs.render.horizon.stored_horizons); None: found out while rendering."""
 
 
 def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = None) -> None:
@@ -75,6 +78,8 @@ def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = No
     files["mesh.glb"] = encode_glb(GlbMesh(attributes, _array(mesh.faces), means), asset.meters_per_unit)
     if asset.binding is not None:
         files["binding.safetensors"] = safetensors.numpy.save(_arrays(asset.binding))
+    if asset.horizons is not None:
+        files["horizons.safetensors"] = safetensors.numpy.save({"sine": _array(asset.horizons)})
     files["environment.exr"] = encode_environment(_array(asset.environment.radiance))
     files["cameras.json"] = json.dumps({"camera_model": "PINHOLE", "frames": [_camera_json(c) for c in asset.cameras]}, indent=1).encode()
     if thumbnail_jpeg is not None:
@@ -112,12 +117,14 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     mesh = TriangleMesh(faces=torch.from_numpy(glb.faces).to(device), **tensors)
     if "binding.safetensors" in files:
         binding = _read_binding(files["binding.safetensors"], path, device)
+    horizons = _read_horizons(files["horizons.safetensors"], path, device) if "horizons.safetensors" in files else None
     radiance = decode_environment(files["environment.exr"], f"{path}: environment.exr", clamp_negative=False)
     cameras = _read_cameras(files["cameras.json"], path, device)
     meters, provenance = manifest.get("meters_per_unit"), manifest.get("provenance", {})
     if not isinstance(meters, float | int) or not 0 < meters < float("inf") or not isinstance(provenance, dict):
         raise ValueError(f"{path}: asset.json has meters_per_unit {meters!r}; expected a positive number")
-    asset = Asset(gaussians, mesh, binding, Environment(torch.from_numpy(radiance).to(device)), cameras, float(meters), provenance)
+    environment = Environment(torch.from_numpy(radiance).to(device))
+    asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons)
     _check(asset, str(path))
     return asset
 
@@ -136,6 +143,8 @@ def _check(asset: Asset, name: str) -> None:
         raise ValueError(f"{name}: the mesh has no faces, or a face names a vertex that does not exist ({vertices} vertices)")
     if any(len(values) != vertices for values in (mesh.normals, mesh.albedo, mesh.roughness, mesh.metallic)):
         raise ValueError(f"{name}: the mesh's vertex attributes differ in length ({vertices} vertices)")
+    if asset.horizons is not None and asset.horizons.shape != (len(faces), 8):
+        raise ValueError(f"{name}: the horizons are of {len(asset.horizons)} faces, there are {len(faces)}")
     if binding is not None:
         if gaussians is None or len(binding.face) != len(gaussians.centers):
             found = 0 if gaussians is None else len(gaussians.centers)
@@ -153,6 +162,16 @@ def _read_binding(data: bytes, path: Path, device: torch.device | str) -> Bindin
     if face.dtype != np.int32 or face.ndim != 1 or barycentric.shape != (len(face), 3) or offset.shape != (len(face),):
         raise ValueError(f"{path}: binding.safetensors holds arrays of the wrong shape")
     return Binding(*(torch.from_numpy(values.copy()).to(device) for values in (face, barycentric, offset)))
+
+
+def _read_horizons(data: bytes, path: Path, device: torch.device | str) -> Tensor:
+    try:
+        sine = safetensors.numpy.load(data)["sine"]
+    except (safetensors.SafetensorError, KeyError) as error:
+        raise ValueError(f"{path}: horizons.safetensors is damaged ({error})") from error
+    if sine.dtype != np.uint8 or sine.ndim != 2:
+        raise ValueError(f"{path}: horizons.safetensors holds an array of the wrong shape")
+    return torch.from_numpy(sine.copy()).to(device)
 
 
 def _camera_json(camera: Camera) -> dict:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from drgs.scene.environment import Environment
@@ -32,3 +32,5 @@ class PosedScene:
     environment_rotation_degrees: float = 0.0
     """Counter-clockwise seen from above; applied by turning directions, the table stays as it is."""
     environment_intensity: float = 1.0
+    horizons: UInt8[Tensor, "face 8"] | None = None
+    """The asset's, while its mesh is at rest."""

@@ -7,12 +7,27 @@ import torch
 import trimesh
 import warp as wp
 
+from drgs.deform.pose_scene import pose_scene
+from drgs.reference.rasterize_gbuffer import look_at_camera
 from drgs.render import horizon as horizon_module
-from drgs.render.horizon import BLOCKED, RAYS_A_FACE, RAYS_A_FACE_AHEAD, TRIAL, Horizons, find_horizons, usable_horizons
+from drgs.render.accumulate import RenderSettings, start_frame
+from drgs.render.horizon import (
+    BLOCKED,
+    RAYS_A_FACE,
+    RAYS_A_FACE_AHEAD,
+    TRIAL,
+    Horizons,
+    find_horizons,
+    stored_horizons,
+    usable_horizons,
+)
 from drgs.render.trace_rays import build_tracer
+from drgs.render.tracer import mesh_extent
+from drgs.scene.asset import Asset
+from drgs.scene.edits import parse_edits
 from drgs.scene.mesh import TriangleMesh
 from drgs.warp_torch import warp_array
-from tests.render.closed_form_scenes import mesh_of, on_device, sphere_mesh, two_spheres
+from tests.render.closed_form_scenes import constant_sky, mesh_of, on_device, sphere_mesh, two_spheres
 
 
 def crumpled_sphere() -> TriangleMesh:
@@ -167,3 +182,28 @@ def test_a_share_of_sky_may_be_given_up_where_little_is_blocked() -> None:
     given_up = (allowed < 0).all(1)
     assert torch.equal(given_up, horizons.sine.square().mean(1) <= 0.05) and bool(given_up.any()) and not bool(given_up.all())
     assert torch.equal(allowed[~given_up], horizons.sine[~given_up])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_stored_horizons_are_never_lower_and_hardly_higher(name: str) -> None:
+    mesh = SCENES[name]()
+    lift = mesh_extent(mesh)[1]
+    found = find_horizons(mesh, lift)
+    read = Horizons(mesh, lift, stored_horizons(found))
+    assert read.found == read.faces and bool((read.sine >= found).all())
+    assert float((read.sine - found).max()) < 1 / 250
+    read.pay(10**9)  # nothing is left to be found
+    assert bool(((read.sine == BLOCKED) == (found == BLOCKED)).all())
+
+
+def test_a_scene_at_rest_brings_its_horizons_and_a_moved_one_finds_its_own() -> None:
+    mesh = two_spheres()
+    stored = stored_horizons(find_horizons(mesh, mesh_extent(mesh)[1]))
+    asset = Asset(None, mesh, None, constant_sky(), horizons=stored)
+    settings = RenderSettings(samples_per_pixel=4)
+    known, moved = (
+        start_frame(pose_scene(asset, edits), look_at_camera(32, 32, focal=40.0), settings).tracer.horizons
+        for edits in ([], parse_edits([{"op": "deform", "map": {"type": "twist", "rate": 0.3}}]))
+    )
+    assert known is not None and known.found == known.faces
+    assert moved is not None and moved.found == 0

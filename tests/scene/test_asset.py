@@ -27,7 +27,10 @@ def small_asset() -> Asset:
     pose[:3, :3], pose[:3, 3] = turn * torch.linalg.det(turn), normal(3).double()
     k = torch.tensor([[511.1, 0, 200.3], [0, 510.7, 199.9], [0, 0, 1]])
     cameras = (camera_from_opengl(pose, k, 400, 401, "r_000"), Camera(torch.eye(4), k, 7, 5, "nästa"))
-    return Asset(gaussians, mesh, binding, Environment(uniform(4, 8, 3) * 1e3), cameras, 0.1, {"seed": 0, "quality": {"psnr": 30.1}})
+    horizons = torch.randint(256, (4, 8), generator=random, dtype=torch.uint8)
+    return Asset(
+        gaussians, mesh, binding, Environment(uniform(4, 8, 3) * 1e3), cameras, 0.1, {"seed": 0, "quality": {"psnr": 30.1}}, horizons
+    )
 
 
 def assert_equal_bits(a, b):
@@ -54,15 +57,21 @@ def test_an_asset_survives_saving_and_loading_bit_for_bit(tmp_path, name):
     assert os.listdir(tmp_path) == [name]  # no temporary file is left
 
 
+def test_horizons_of_another_mesh_are_refused(tmp_path):
+    asset = replace(small_asset(), horizons=torch.zeros(5, 8, dtype=torch.uint8))
+    with pytest.raises(ValueError, match="the horizons are of 5 faces, there are 4"):
+        save_asset(asset, tmp_path / "a")
+
+
 def test_an_asset_without_gaussians_and_cameras_survives_saving_and_loading(tmp_path):
-    asset = replace(small_asset(), gaussians=None, binding=None, cameras=())
+    asset = replace(small_asset(), gaussians=None, binding=None, cameras=(), horizons=None)
     save_asset(asset, tmp_path / "a")
     assert_equal_bits(asset, load_asset(tmp_path / "a"))
 
 
 def test_the_folder_holds_the_files_of_the_contract_and_a_described_manifest(tmp_path):
     save_asset(small_asset(), tmp_path / "a", thumbnail_jpeg=b"jpeg")
-    files = {"gaussians.ply", "mesh.glb", "binding.safetensors", "environment.exr", "cameras.json", "thumb.jpg"}
+    files = {"gaussians.ply", "mesh.glb", "binding.safetensors", "environment.exr", "cameras.json", "horizons.safetensors", "thumb.jpg"}
     assert set(os.listdir(tmp_path / "a")) == files | {"asset.json"}
     manifest = json.loads((tmp_path / "a" / "asset.json").read_text())
     assert manifest["schema_version"] == 1 and manifest["meters_per_unit"] == 0.1 and set(manifest["files"]) == files

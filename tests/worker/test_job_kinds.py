@@ -213,3 +213,10 @@ def test_a_version_looks_at_rest_as_its_edits_made_the_asset(tmp_path: Path, cub
     assert bool((sides.sum(-1) > 0).all())
     save_asset(version, tmp_path / "asset")
     assert load_asset(tmp_path / "asset").provenance["versions"] == json.loads(json.dumps(version.provenance["versions"]))
+
+
+def test_a_version_keeps_the_horizons_of_a_mesh_that_stayed_as_it_was(tmp_path: Path, cube: Asset) -> None:
+    known = replace(cube, horizons=torch.zeros(len(cube.mesh.faces), 8, dtype=torch.uint8))
+    painted, twisted = (parse_edits([edit]) for edit in (material(roughness=0.2), {"op": "deform", "map": {"type": "twist", "rate": 0.5}}))
+    assert with_edits(known, painted, tmp_path, 2).horizons is known.horizons
+    assert with_edits(known, twisted, tmp_path, 2).horizons is None
