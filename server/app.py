@@ -17,7 +17,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from drgs import __version__
-from server import routes_assets, routes_jobs, routes_sessions, stream
+from server import routes_assets, routes_jobs, routes_sessions, routes_views, stream
 from server.context import ServerContext
 from server.docs_page import docs_page
 from server.environments import EnvironmentStore
@@ -105,7 +105,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     derive = app.openapi
     app.openapi = cache(lambda: complete_document(deepcopy(derive())))  # type: ignore[method-assign]
     add_problem_handlers(app)
-    for routes in (routes_jobs, routes_assets, routes_sessions, stream):
+    for routes in (routes_jobs, routes_assets, routes_views, routes_sessions, stream):
         app.include_router(routes.router)
     _add_small_routes(app, context)
     _add_pages(app, settings)

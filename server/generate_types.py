@@ -55,6 +55,7 @@ _ANSWERS: tuple[type[BaseModel], ...] = (
     rest_records.JobFileList,
     rest_records.AssetInfo,
     rest_records.AssetList,
+    rest_records.TrainingViewList,
     rest_records.EnvironmentInfo,
     rest_records.EnvironmentList,
     rest_records.SessionInfo,

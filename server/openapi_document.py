@@ -51,6 +51,16 @@ _ASSET = {
     "edits": [],
     "deleted_at": None,
 }
+_VIEW = {
+    "name": "r_000",
+    "width": 400,
+    "height": 400,
+    "world_from_camera": [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
+    "left": -0.36,
+    "right": 0.36,
+    "bottom": -0.36,
+    "top": 0.36,
+}
 _ENVIRONMENT = {"name": "studio.exr", "title": "Studio", "width": 1024, "height": 512}
 _SESSION = {"id": SESSION, "asset": ASSET, "asset_name": "Mug", "created_at": "2026-11-20T10:10:00Z", "viewers": 1} | _LOG
 _SNAPSHOT = {"name": "chrome", "created_at": "2026-11-20T10:12:00Z", "revision": 3, "edits": [_MATERIAL, _LIGHT]}
@@ -104,6 +114,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "SessionRequest": {"asset": {"asset": ASSET}},
     "SnapshotInfo": {"chrome": _SNAPSHOT},
     "SnapshotList": {"one": {"snapshots": [_SNAPSHOT]}},
+    "TrainingViewList": {"one": {"views": [_VIEW], "has_photographs": True}},
     "TokenRequest": {"token": {"token": "0" * 64}},
 }
 """By schema and a few words."""
@@ -116,6 +127,7 @@ FILES: dict[str, tuple[str, ...]] = {
     "/api/assets/{asset_id}/mesh.glb": ("model/gltf-binary",),
     "/api/assets/{asset_id}/environment.exr": ("image/x-exr",),
     "/api/assets/{asset_id}/export": ("application/octet-stream",),
+    "/api/assets/{asset_id}/views/{number}/photograph.webp": ("image/webp",),
     "/api/environments/{name}": ("image/x-exr",),
     "/api/environments/{name}/thumb.jpg": ("image/jpeg",),
     "/api/sessions/{session_id}/frame.{suffix}": ("image/jpeg", "image/png", "image/x-exr"),

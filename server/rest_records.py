@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from drgs.scene.edits import Edit
+from server.messages import Row
 from worker.requests import (
     BuildRequest,
     ExportRequest,
@@ -104,6 +105,31 @@ class AssetList(_Body):
     assets: list[AssetInfo]
     """Newest first."""
     total: int
+
+
+class TrainingView(_Body):
+    """One camera of the capture that an asset was built from."""
+
+    name: str
+    """Of the photograph's file, without its ending."""
+    width: int
+    """Pixels of the photograph as the build saw it."""
+    height: int
+    world_from_camera: tuple[Row, Row, Row, Row]
+    """OpenGL camera-to-world, rows, as of a camera message."""
+    left: float
+    """This and the next three: edges of the picture on the plane at distance 1 before the camera, x to the right and y up. The picture's
+    middle need not lie on the axis."""
+    right: float
+    bottom: float
+    top: float
+
+
+class TrainingViewList(_Body):
+    views: list[TrainingView]
+    """In the order of the asset's cameras; empty for an imported mesh."""
+    has_photographs: bool
+    """False for assets that were built before photographs were kept with them."""
 
 
 class EnvironmentInfo(_Body):

@@ -144,8 +144,17 @@ def _info(context: ServerContext, row: AssetRow) -> AssetInfo:
     return info.model_copy(update={"has_thumbnail": True})
 
 
+def asset_folder(context: ServerContext, asset_id: str) -> Path:
+    """Of an asset that is not deleted, fetched if it is not here.
+
+    Raises:
+        ProblemError, ArtifactError: there is none, or it cannot be had now.
+    """
+    return bring_asset(context.directory, _read_row(context, asset_id).id)
+
+
 def _asset_file(context: ServerContext, asset_id: str, name: str, media_type: str) -> FileResponse:
-    path = bring_asset(context.directory, _read_row(context, asset_id).id) / name
+    path = asset_folder(context, asset_id) / name
     if not path.is_file():
         raise ProblemError(404, f"This asset has no {name}.")
     return FileResponse(path, media_type=media_type)

@@ -57,10 +57,16 @@ async def run_file_tool(*arguments: str) -> None:
 def make_asset(source: Path, out: Path) -> None:
     """A zipped asset is read and written anew, so that nothing else of the archive arrives."""
     from drgs.build.import_mesh import import_mesh
-    from drgs.scene.asset import load_asset, save_asset
+    from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs
+    from drgs.scene.asset import load_asset, load_photographs, save_asset
 
-    asset = load_asset(source) if source.suffix == ".zip" else import_mesh(source)
-    save_asset(asset, out, thumbnail_jpeg=thumbnail(asset))
+    if source.suffix != ".zip":
+        asset, photographs = import_mesh(source), None
+    else:
+        asset, photographs = load_asset(source), load_photographs(source)
+        if photographs is not None:
+            check_photographs(photographs, len(asset.cameras), f"{source}: {PHOTOGRAPHS}")
+    save_asset(asset, out, thumbnail(asset), photographs)
 
 
 def thumbnail(asset: "Asset") -> bytes:
@@ -85,10 +91,10 @@ def thumbnail(asset: "Asset") -> bytes:
 
 
 def make_version(asset_folder: Path, out: Path, edits: Path, environments: Path, version: int) -> None:
-    from drgs.scene.asset import save_asset
+    from drgs.scene.asset import load_photographs, save_asset
 
     made = edited_asset(asset_folder, edits, environments, version)
-    save_asset(made, out, thumbnail_jpeg=thumbnail(made))
+    save_asset(made, out, thumbnail(made), load_photographs(asset_folder))
 
 
 def edited_asset(asset_folder: Path, edits: Path, environments: Path, version: int) -> "Asset":
@@ -109,20 +115,20 @@ def export(asset_folder: Path, out: Path, format: Any) -> None:
     from drgs.scene.asset import load_asset
 
     picture = asset_folder / "thumb.jpg"
-    write_export(load_asset(asset_folder), out, format, lambda: picture.read_bytes() if picture.exists() else None)
+    write_export(load_asset(asset_folder), asset_folder, out, format, lambda: picture.read_bytes() if picture.exists() else None)
 
 
 def export_edited(asset_folder: Path, out: Path, format: Any, edits: Path, environments: Path, version: int) -> None:
     made = edited_asset(asset_folder, edits, environments, version)
-    write_export(made, out, format, lambda: thumbnail(made))
+    write_export(made, asset_folder, out, format, lambda: thumbnail(made))
 
 
-def write_export(asset: "Asset", out: Path, format: Any, picture: Callable[[], bytes | None]) -> None:
-    """`picture` is asked for where the format keeps one."""
+def write_export(asset: "Asset", source: Path, out: Path, format: Any, picture: Callable[[], bytes | None]) -> None:
+    """`picture` is asked for where the format keeps one; photographs are those of the folder `source`."""
     if format == "zip":
-        from drgs.scene.asset import save_asset
+        from drgs.scene.asset import load_photographs, save_asset
 
-        save_asset(asset, out, thumbnail_jpeg=picture())
+        save_asset(asset, out, picture(), load_photographs(source))
     else:
         from drgs.build.export_asset import export_asset
 

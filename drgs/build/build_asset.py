@@ -37,12 +37,14 @@ from drgs.build.initial_points import initial_points
 from drgs.build.load_views import load_views
 from drgs.build.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
 from drgs.build.report_progress import BuildReporter, Progress, encode_preview
+from drgs.exchange.photographs import encode_photographs
 from drgs.render.horizon import find_horizons, stored_horizons
 from drgs.render.sample_rays import SampleCounts
 from drgs.render.tracer import mesh_extent
 from drgs.scene.asset import Asset, save_asset
 from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
+from drgs.scene.views import Views
 from drgs.warp_torch import device_from_name
 
 
@@ -162,6 +164,7 @@ def build_stages(
     with timed("read"):
         reporter.report("read", 0.0, "reading the capture")
         views = load_views(dataset, max_side=preset.image_side)
+        photographs = views
         points = initial_points(views, preset.points, settings.seed)
         identity = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
         place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, should_stop or (lambda: False))
@@ -229,9 +232,15 @@ def build_stages(
             },
             horizons=stored_horizons(find_horizons(baked, mesh_extent(baked)[1])),
         )
-    save_asset(asset, out, _thumbnail(materials, views.cameras))
+    save_asset(asset, out, _thumbnail(materials, views.cameras), kept_photographs(photographs))
     reporter.report("pack", 1.0, "done")
     yield "pack", asset
+
+
+def kept_photographs(views: Views) -> bytes:
+    """Small copies for comparing by eye, cut out where the capture has masks of its own: ones that the build found are a guess."""
+    pictures = torch.cat([views.images_srgb, views.coverage[..., None]], -1) if views.has_masks else views.images_srgb
+    return encode_photographs([picture.numpy() for picture in pictures])
 
 
 def _thumbnail(materials: MaterialState, cameras: tuple[Camera, ...]) -> bytes:

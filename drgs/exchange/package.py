@@ -154,7 +154,7 @@ def _write_zip(path: Path, files: dict[str, bytes]) -> None:
                 for file, data in files.items():
                     info = zipfile.ZipInfo(file, (1980, 1, 1, 0, 0, 0))
                     info.external_attr = 0o100644 << 16
-                    packed = zipfile.ZIP_STORED if file.endswith((".exr", ".jpg")) else zipfile.ZIP_DEFLATED
+                    packed = zipfile.ZIP_STORED if file.endswith((".exr", ".jpg", ".zip")) else zipfile.ZIP_DEFLATED
                     archive.writestr(info, data, packed, compresslevel=1)
             stream.flush()
             os.fsync(stream.fileno())

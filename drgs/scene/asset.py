@@ -14,6 +14,7 @@ from drgs.exchange.exr import decode_environment, encode_environment
 from drgs.exchange.gaussian_ply import decode_gaussian_ply, encode_gaussian_ply
 from drgs.exchange.glb import GlbMesh, decode_glb, encode_glb
 from drgs.exchange.package import read_package, write_package
+from drgs.exchange.photographs import PHOTOGRAPHS
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, opengl_from_camera
@@ -57,8 +58,12 @@ class Asset:
     """How high the mesh rises around each of its faces (drgs.render.horizon.stored_horizons); None: found out while rendering."""
 
 
-def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = None) -> None:
+def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = None, photographs_zip: bytes | None = None) -> None:
     """Write a folder, or a zip if the path ends in .zip, atomically; float32 arrays are kept bit for bit.
+
+    Args:
+        photographs_zip: small copies of what the training cameras saw (exchange/photographs.py). They are no part of `Asset`: only
+            people look at them.
 
     Raises:
         ValueError: a value is not finite, an index points nowhere, or the path is taken by something that is no asset.
@@ -84,6 +89,8 @@ def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = No
     files["cameras.json"] = json.dumps({"camera_model": "PINHOLE", "frames": [_camera_json(c) for c in asset.cameras]}, indent=1).encode()
     if thumbnail_jpeg is not None:
         files[THUMBNAIL] = thumbnail_jpeg
+    if photographs_zip is not None:
+        files[PHOTOGRAPHS] = photographs_zip
     surfels = 0 if asset.gaussians is None else len(asset.gaussians.centers)
     manifest = {
         "format": "drgs asset",
@@ -127,6 +134,11 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons)
     _check(asset, str(path))
     return asset
+
+
+def load_photographs(path: Path | str) -> bytes | None:
+    """What `save_asset` was given as photographs_zip; None where there are none. Raises like load_asset."""
+    return read_package(Path(path), (PHOTOGRAPHS,), (), SCHEMA_VERSION)[1].get(PHOTOGRAPHS)
 
 
 def _check(asset: Asset, name: str) -> None:

@@ -1,15 +1,19 @@
 """From a capture to an asset on a tiny preset: what is written, how it stops and resumes, and what is refused."""
 
 import dataclasses
+import io
 import shutil
+import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import simplejpeg
 import torch
+from PIL import Image
 
 from drgs.build.bind_gaussians import points_from_binding
-from drgs.build.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset
+from drgs.build.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, kept_photographs
 from drgs.build.densify import DensifySettings
 from drgs.build.extract_mesh import MeshSettings
 from drgs.build.fit_gaussians import FitSettings
@@ -17,8 +21,10 @@ from drgs.build.fit_materials import MaterialSettings
 from drgs.build.fit_mesh_surfels import MeshFitSettings
 from drgs.build.mesh_from_gaussians import drop_unseen
 from drgs.build.report_progress import encode_preview
+from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photograph
 from drgs.render.sample_rays import SampleCounts
-from drgs.scene.asset import Asset, load_asset
+from drgs.scene.asset import Asset, load_asset, load_photographs
+from drgs.scene.views import Views
 from tests.build.surfel_spheres import joined, surfel_sphere
 from tests.build.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
 from tests.render.closed_form_scenes import front_camera
@@ -78,6 +84,26 @@ def test_a_build_makes_an_asset_that_loads_with_the_same_numbers(build: Build):
         assert torch.equal(loaded[name], value), name
     assert (build.path / "thumb.jpg").read_bytes()[:2] == b"\xff\xd8"
     assert len(load_asset(build.path).cameras) == len(sphere_views())
+
+
+def test_the_photographs_of_the_capture_are_kept_with_the_asset(build: Build):
+    photographs = load_photographs(build.path)
+    assert photographs is not None
+    check_photographs(photographs, len(build.asset.cameras), "the asset")
+    for number, view in enumerate(sphere_views(square=True)):
+        kept = Image.open(io.BytesIO(read_photograph(build.path / PHOTOGRAPHS, number)))
+        reduced = np.asarray(Image.fromarray(view.rgba).resize(kept.size, Image.Resampling.BOX), float)
+        difference = np.abs(np.asarray(kept.convert("RGBA"), float) - reduced)
+        assert max(kept.size) == TINY.image_side and difference[..., 3].mean() < 4, view.name
+        assert difference[..., :3][reduced[..., 3] == 255].mean() < 8, view.name
+
+
+def test_a_capture_without_masks_keeps_whole_photographs():
+    views = Views((), torch.zeros(1, 8, 8, 3, dtype=torch.uint8), torch.zeros(1, 8, 8, dtype=torch.uint8), None, None, False, "nerfstudio")
+    for has_masks, bands in ((True, ("R", "G", "B", "A")), (False, ("R", "G", "B"))):
+        packed = kept_photographs(dataclasses.replace(views, has_masks=has_masks))
+        picture = zipfile.ZipFile(io.BytesIO(packed)).read("0000.webp")
+        assert Image.open(io.BytesIO(picture)).getbands() == bands
 
 
 def test_the_mesh_is_the_sphere_and_its_vertices_carry_materials(build: Build):

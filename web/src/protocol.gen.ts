@@ -677,6 +677,32 @@ export interface TokenRequest {
   token: string;
 }
 
+/** One camera of the capture that an asset was built from. */
+export interface TrainingView {
+  /** Of the photograph's file, without its ending. */
+  name: string;
+  /** Pixels of the photograph as the build saw it. */
+  width: number;
+  height: number;
+  /** OpenGL camera-to-world, rows, as of a camera message. */
+  world_from_camera: [[number, number, number, number], [number, number, number, number], [number, number, number, number], [number, number, number, number]];
+  /**
+   * This and the next three: edges of the picture on the plane at distance 1 before the camera, x to the right and y up. The picture's
+   * middle need not lie on the axis.
+   */
+  left: number;
+  right: number;
+  bottom: number;
+  top: number;
+}
+
+export interface TrainingViewList {
+  /** In the order of the asset's cameras; empty for an imported mesh. */
+  views: TrainingView[];
+  /** False for assets that were built before photographs were kept with them. */
+  has_photographs: boolean;
+}
+
 /** Cameras round the object, all of it in sight. */
 export interface Turntable {
   frames?: number;
