@@ -1,6 +1,6 @@
 /** The REST calls of the viewer, each once. Every failure is an ApiError whose message is a sentence for the user. */
 
-import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest } from './protocol.gen';
+import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest, TrainingViewList } from './protocol.gen';
 import type { View } from './viewpoint';
 
 export class ApiError extends Error {
@@ -82,6 +82,8 @@ export const assetEnvironment = (id: string) => `/api/assets/${part(id)}/environ
 export const assetExport = (id: string, format: ExportFormat) => `/api/assets/${part(id)}/export?format=${format}`;
 /** The same with the session's edits put into it. */
 export const sessionExport = (id: string, format: ExportFormat) => `/api/sessions/${part(id)}/export?format=${format}`;
+export const listTrainingViews = (asset: string) => call<TrainingViewList>('GET', `/api/assets/${part(asset)}/views`);
+export const photograph = (asset: string, view: number) => `/api/assets/${part(asset)}/views/${view}/photograph.webp`;
 export type ExportFormat = 'glb' | 'ply' | 'ply3' | 'usd' | 'env' | 'zip';
 
 export function uploadAsset(file: File, onProgress?: (share: number) => void): Promise<AssetInfo> {

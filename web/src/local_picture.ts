@@ -9,6 +9,7 @@
 
 import {
   BufferAttribute,
+  BufferGeometry,
   Color,
   DataTexture,
   EquirectangularReflectionMapping,
@@ -30,7 +31,6 @@ import {
   Vector2,
   Vector3,
   WebGLRenderer,
-  type BufferGeometry,
   type Texture,
   type WebGLRenderTarget,
 } from 'three';
@@ -58,6 +58,8 @@ export class LocalPicture {
     onlyHighlight: { value: 0 },
   };
   private object: Mesh | null = null;
+  /** The same mesh with shape and materials as captured; made when it is first asked for. */
+  private captured: Mesh | null = null;
   private rest: RestMesh | null = null;
 
   /** Throws where the browser has no WebGL 2. */
@@ -85,8 +87,9 @@ export class LocalPicture {
 
   dropMesh(): void {
     this.object?.geometry.dispose();
+    this.captured?.geometry.dispose();
     this.root.clear();
-    this.object = this.rest = null;
+    this.object = this.captured = this.rest = null;
   }
 
   /**
@@ -161,6 +164,19 @@ export class LocalPicture {
     object.geometry.boundingSphere = null;
   }
 
+  private capturedMesh(): Mesh | null {
+    const { object, rest } = this;
+    if (!object || !rest || this.captured) return this.captured;
+    const geometry = new BufferGeometry().setIndex(object.geometry.index);
+    const attributes = { position: rest.positions, normal: rest.normals, color: rest.materials.albedo, _roughness: rest.materials.roughness, _metallic: rest.materials.metallic };
+    for (const [name, values] of Object.entries(attributes)) geometry.setAttribute(name, new BufferAttribute(values, (3 * values.length) / rest.positions.length));
+    geometry.setAttribute('_weight', new BufferAttribute(new Float32Array(rest.positions.length / 3), 1));
+    this.captured = new Mesh(geometry, this.material);
+    this.captured.frustumCulled = false;
+    this.root.add(this.captured);
+    return this.captured;
+  }
+
   private write(name: string, values: Float32Array): void {
     const attribute = this.object?.geometry.getAttribute(name) as BufferAttribute | undefined;
     if (!attribute || attribute.array.length !== values.length) return;
@@ -223,8 +239,8 @@ export class LocalPicture {
     this.background = background;
   }
 
-  /** Draw what `camera` sees (world, z up). */
-  render(camera: PerspectiveCamera, near: number, far: number, rotationDegrees: number, intensity: number, stops: number, highlight: number, onlyHighlight: boolean): void {
+  /** Draw what `camera` sees (world, z up); left of the share `split` of the width as captured. */
+  render(camera: PerspectiveCamera, near: number, far: number, rotationDegrees: number, intensity: number, stops: number, highlight: number, onlyHighlight: boolean, split: number | null = null): void {
     this.uniforms.highlight.value = highlight;
     this.uniforms.onlyHighlight.value = onlyHighlight ? 1 : 0;
     this.scene.background = this.background === 'environment' && !onlyHighlight ? this.sky : null;
@@ -241,7 +257,24 @@ export class LocalPicture {
     this.renderer.toneMappingExposure = 2 ** stops;
     this.scene.environmentIntensity = intensity;
     this.scene.backgroundIntensity = intensity;
-    this.renderer.render(this.scene, this.eye);
+    this.drawHalves(split);
+  }
+
+  private drawHalves(split: number | null): void {
+    const { renderer, object } = this;
+    const captured = split === null ? this.captured : this.capturedMesh();
+    if (captured) captured.visible = false;
+    if (split === null || !captured || !object) return renderer.render(this.scene, this.eye);
+    const { x: width, y: height } = renderer.getSize(new Vector2());
+    const line = Math.round(split * width);
+    renderer.setScissorTest(true);
+    renderer.setScissor(line, 0, width - line, height);
+    renderer.render(this.scene, this.eye);
+    [object.visible, captured.visible] = [false, true];
+    renderer.setScissor(0, 0, line, height);
+    renderer.render(this.scene, this.eye);
+    [object.visible, captured.visible] = [true, false];
+    renderer.setScissorTest(false);
   }
 
   dispose(): void {

@@ -1,6 +1,7 @@
 /** What mouse, pen, fingers and arrow keys do to the picture, beside what camera-controls does by itself. */
 
 import CameraControls from 'camera-controls';
+import { viewNumber } from './photographs';
 import { editLight, newKey } from './session';
 import { shapeTool } from './shaping';
 import { flying, light, tool } from './state';
@@ -91,7 +92,7 @@ export function listenToPointers(stage: HTMLElement, controls: CameraControls, o
       '+': () => void controls.dolly(0.1 * controls.distance, true),
       '-': () => void controls.dolly(-0.1 * controls.distance, true),
     };
-    const move = event.target === stage && !flying.value && !event.ctrlKey && !event.metaKey ? moves[event.key] : undefined;
+    const move = event.target === stage && !flying.value && viewNumber.value === null && !event.ctrlKey && !event.metaKey ? moves[event.key] : undefined;
     if (!move) return;
     event.preventDefault();
     move();

@@ -12,7 +12,8 @@ export interface Shortcut {
 
 export type ActionName =
   | 'frame' | 'home' | 'undo' | 'redo' | 'help' | 'escape' | 'local' | 'theme' | 'library' | 'inspector'
-  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'still' | 'remove' | 'turn' | 'before' | 'fly' | 'all' | 'copy' | 'paste' | 'show';
+  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'still' | 'remove' | 'turn' | 'before' | 'fly' | 'all' | 'copy' | 'paste' | 'show'
+  | 'photographs' | 'previousView' | 'nextView' | 'split';
 
 export const shortcuts: Shortcut[] = [
   { group: 'Camera', chords: [], gesture: 'Left drag, one finger', text: 'Orbit' },
@@ -32,6 +33,7 @@ export const shortcuts: Shortcut[] = [
   { group: 'Edit', chords: ['mod+c'], text: 'Copy the material', action: 'copy' },
   { group: 'Edit', chords: ['mod+v'], text: 'Paste the material', action: 'paste' },
   { group: 'Edit', chords: ['b'], gesture: 'B, held', text: 'See the object as captured', action: 'before' },
+  { group: 'Edit', chords: ['shift+b'], text: 'Split the window: as captured, and now', action: 'split' },
   { group: 'Edit', chords: [], gesture: 'Double-click a slider', text: 'Take that value’s edits back' },
   { group: 'Shape', chords: [], gesture: 'Click, handles on', text: 'Put a handle, or choose one' },
   { group: 'Shape', chords: ['delete', 'backspace'], text: 'Remove the chosen handle', action: 'remove' },
@@ -42,6 +44,9 @@ export const shortcuts: Shortcut[] = [
   { group: 'View', chords: ['4'], text: 'Metallic', action: 'channel4' },
   { group: 'View', chords: ['5'], text: 'Normal', action: 'channel5' },
   { group: 'View', chords: ['6'], text: 'Depth', action: 'channel6' },
+  { group: 'View', chords: ['c'], text: 'Compare with a photograph, or leave it', action: 'photographs' },
+  { group: 'View', chords: ['arrowleft'], text: 'Comparing: the photograph before', action: 'previousView' },
+  { group: 'View', chords: ['arrowright'], text: 'Comparing: the next photograph', action: 'nextView' },
   { group: 'View', chords: ['p'], text: 'Instant local picture on or off', action: 'local' },
   { group: 'View', chords: ['mod+s'], text: 'Save the picture as PNG', action: 'still' },
   { group: 'Panels', chords: ['l'], text: 'Library', action: 'library' },
@@ -64,7 +69,8 @@ export function chordOf(event: KeyboardEvent): string {
 }
 
 export function chordText(chord: string): string {
-  const names: Record<string, string> = isApple ? { mod: '⌘', shift: '⇧', alt: '⌥', escape: 'Esc', delete: 'Del', backspace: '⌫' } : { mod: 'Ctrl', shift: 'Shift', alt: 'Alt', escape: 'Esc', delete: 'Del', backspace: 'Backspace' };
+  const modifiers = isApple ? { mod: '⌘', shift: '⇧', alt: '⌥', backspace: '⌫' } : { mod: 'Ctrl', shift: 'Shift', alt: 'Alt', backspace: 'Backspace' };
+  const names: Record<string, string> = { ...modifiers, escape: 'Esc', delete: 'Del', arrowleft: '←', arrowright: '→' };
   return chord.split('+').map((part) => names[part] ?? part.toUpperCase()).join(isApple ? '' : '+');
 }
 
@@ -89,6 +95,8 @@ export function listenForKeys(actions: Actions, releases: Actions, isFlying: () 
     const typing = target.matches?.('input:not([type=range]):not([type=checkbox]):not([type=radio]):not([type=color]), textarea, select');
     if (typing && chord !== 'escape') return;
     if (isFlying() && /^(shift\+|alt\+)?[wasdqe]$/.test(chord)) return;
+    // Tabs, sliders and radio buttons have their own use for these keys.
+    if (/^arrow/.test(chord) && target.matches?.('input:not([type=checkbox]), [role=tab], [role=slider]')) return;
     const action = byChord.get(chord);
     const run = action && actions[action];
     if (!run || (action === 'copy' && String(getSelection()))) return;

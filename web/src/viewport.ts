@@ -5,7 +5,7 @@
  * picture is hidden and a fresh one fades in; without it the newest traced picture always stays.
  */
 
-import { effect } from '@preact/signals';
+import { effect, untracked } from '@preact/signals';
 import CameraControls from 'camera-controls';
 import { Box3, Matrix4, MOUSE, PerspectiveCamera, Quaternion, Raycaster, Sphere, Spherical, Vector2, Vector3, Vector4 } from 'three';
 import * as api from './api';
@@ -14,6 +14,8 @@ import { frameBox } from './framing';
 import { Gizmo } from './gizmo';
 import { LocalPace } from './local_pace';
 import { LocalPicture } from './local_picture';
+import { LookThrough } from './look_through';
+import { photographInSight, split, viewNumber } from './photographs';
 import { FLAG_CONVERGED, FLAG_MOVING, MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from './protocol.gen';
 import { listen, pick, sendCamera } from './session';
 import { listenToPointers } from './pointers';
@@ -60,6 +62,7 @@ export class Viewport {
   private readonly stillMotion = matchMedia('(prefers-reduced-motion: reduce)').matches;
   private readonly flight: Flight;
   private readonly gizmo: Gizmo;
+  private readonly lookThrough: LookThrough;
 
   constructor(
     private readonly stage: HTMLElement,
@@ -81,6 +84,7 @@ export class Viewport {
     }
     this.gizmo = new Gizmo(stage);
     this.flight = new Flight(this.camera, this.controls, this.bounds);
+    this.lookThrough = new LookThrough(stage, this.camera, this.controls, this.bounds, this.stillMotion ? 0 : undefined);
     listen(this.onHello, this.onFrame);
     listenToPointers(stage, this.controls, {
       select: (event) => this.selectAt(event),
@@ -97,13 +101,21 @@ export class Viewport {
 
   /** Show the whole object in the part of the window that no panel covers, from where the camera is. */
   frame(): void {
+    this.leaveView();
     flying.value = false;
     this.showAll(this.camera.position.clone().sub(this.controls.getTarget(new Vector3())), true);
   }
 
   reset(): void {
+    this.leaveView();
     flying.value = false;
     if (this.homeDirection) this.showAll(this.homeDirection, true);
+  }
+
+  /** The camera is the controls' again, where it was before it looked through a view of the capture. */
+  private leaveView(): void {
+    viewNumber.value = null;
+    this.lookThrough.apply(performance.now());
   }
 
   /** The traced picture as PNG; null while there is none. */
@@ -177,6 +189,11 @@ export class Viewport {
     return localPicture.value && this.local !== null && this.local.hasMesh && settings.value.channel === 'final' && session.value !== null && isAnalytic(edits.value);
   }
 
+  /** Left of this share of the width the object stands as captured; a photograph that stands there needs no picture of ours. */
+  private get splitAt(): number | null {
+    return photographInSight.value ? null : split.value;
+  }
+
   private setFresh(fresh: boolean): void {
     this.fresh = fresh;
     this.stage.dataset.fresh = String(fresh);
@@ -231,7 +248,17 @@ export class Viewport {
     });
     effect(() => {
       this.stage.dataset.flying = String(flying.value);
+      if (flying.value) untracked(() => this.leaveView());
       this.flight.turn(flying.value);
+    });
+    effect(() => {
+      this.stage.dataset.split = String(this.splitAt !== null);
+      this.stage.style.setProperty('--split', `${100 * (this.splitAt ?? 0)}%`);
+      this.localDirty = true;
+    });
+    effect(() => {
+      this.stage.dataset.view = String(viewNumber.value ?? '');
+      if (viewNumber.value !== null) flying.value = false;
     });
     effect(() => {
       if (ballsWanted.value && mesh.value) this.drawBalls();
@@ -309,7 +336,7 @@ export class Viewport {
     const elapsed = now - this.lastTick;
     this.lastTick = now;
     this.flight.move(elapsed / 1000);
-    const moved = this.controls.update(elapsed / 1000);
+    const moved = this.lookThrough.apply(now) ?? this.controls.update(elapsed / 1000);
     if (moved && now - this.movedAt < MOVING_MS && this.localPace.measure(elapsed)) this.resizeLocal();
     if (!session.value) return;
     if (moved) {
@@ -329,10 +356,10 @@ export class Viewport {
     const flashing = since < FLASH_MS;
     const strength = !flashing ? 0 : this.stillMotion ? 0.5 : 0.85 * Math.sin((2 * Math.PI * since) / FLASH_MS) ** 2;
     // Over a traced picture only the selection is drawn, on nothing.
-    const overlay = flashing && !(this.localShows && !this.fresh) && !before.value;
+    const overlay = flashing && !(this.localShows && !this.fresh) && !before.value && this.splitAt === null;
     if (flashing || this.stage.dataset.overlay !== String(overlay)) this.localDirty = true;
     this.stage.dataset.overlay = String(overlay);
-    if (!this.localShows && !overlay && !before.value) return;
+    if (!this.localShows && !overlay && !before.value && this.splitAt === null) return;
     const sharp = !moved && now - this.movedAt > MOVING_MS;
     if (sharp !== this.localSharp && (this.localDirty || (sharp && !this.fresh))) {
       this.localSharp = sharp;
@@ -343,7 +370,7 @@ export class Viewport {
     const { radius, center } = this.bounds;
     const distance = this.camera.position.distanceTo(center);
     const { rotation, intensity } = light.value;
-    this.local!.render(this.camera, Math.max(0.002 * radius, distance - 1.5 * radius), distance + 1.5 * radius, rotation, intensity, settings.value.exposure_stops, strength, overlay);
+    this.local!.render(this.camera, Math.max(0.002 * radius, distance - 1.5 * radius), distance + 1.5 * radius, rotation, intensity, settings.value.exposure_stops, strength, overlay, this.splitAt);
     this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
   }
 
@@ -430,7 +457,7 @@ export class Viewport {
 
   /** Put the focal point on the surface under the pointer; the server knows surfaces that the local mesh does not. */
   private focusAt(event: MouseEvent): void {
-    if (flying.value) return;
+    if (flying.value || viewNumber.value !== null) return;
     void pick(...this.shareAt(event))?.then((picked) => {
       if (picked.hit && picked.position) void this.controls.moveTo(...picked.position, true);
     });

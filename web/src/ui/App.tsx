@@ -1,6 +1,7 @@
 /** The page: full-window stage, panels over it, files dropped anywhere. */
 
 import { useEffect, useRef, useState } from 'preact/hooks';
+import { stepView, turnPhotographs, viewNumber } from '../photographs';
 import { redo, undo, changeSettings } from '../session';
 import { selectAll } from '../selecting';
 import { choose, removeChosen, turning } from '../shaping';
@@ -8,6 +9,7 @@ import { listenForKeys, titleFor, type Actions } from '../shortcuts';
 import { assets, before, dismiss, flash, flying, helpOpen, inspectorOpen, libraryOpen, localPicture, log, notices, notify, session, theme } from '../state';
 import type { Viewport } from '../viewport';
 import { download } from '../download';
+import { Compare, turnSplit } from './Compare';
 import { Help } from './Help';
 import { Hud } from './Hud';
 import { Icon } from './icons';
@@ -43,6 +45,7 @@ export function App() {
       escape: () => {
         helpOpen.value = flying.value = false;
         choose(null);
+        viewNumber.value = null;
         (document.activeElement as HTMLElement | null)?.blur();
       },
       fly: () => session.value && (flying.value = !flying.value),
@@ -63,6 +66,10 @@ export function App() {
       channel4: channel('metallic'),
       channel5: channel('normal'),
       channel6: channel('depth'),
+      photographs: () => session.value && turnPhotographs(viewNumber.value === null),
+      previousView: () => stepView(-1),
+      nextView: () => stepView(1),
+      split: () => session.value && turnSplit(),
       still: () => void saveStill(),
     };
     const silence = listenForKeys(actions, { before: () => (before.value = false) }, () => flying.value);
@@ -82,6 +89,7 @@ export function App() {
         <canvas ref={local} class="local" aria-hidden="true" />
         <canvas ref={traced} class="traced" aria-hidden="true" />
       </div>
+      <Compare />
       {!session.value && <Welcome />}
       <TopBar onFrame={() => viewport.current?.frame()} />
       <Library />

@@ -4,6 +4,7 @@ import type { Settings } from '../protocol.gen';
 import { changeSettings } from '../session';
 import { titleFor } from '../shortcuts';
 import { flying, localPicture, resolution, settings, status } from '../state';
+import { CompareSection } from './Compare';
 import { Choice, Section, Switch } from './fields';
 
 export const CHANNELS: { value: NonNullable<Settings['channel']>; text: string }[] = [
@@ -44,6 +45,7 @@ export function ViewPanel() {
         <Switch label="Denoise" title="Filter what is left of the noise; fades as samples add up" value={denoise} onChange={(value) => changeSettings({ denoise: value })} />
         <Switch label="Instant local picture" title={titleFor('local', 'Draw the mesh in the browser while the traced picture is on its way')} value={localPicture.value} onChange={(value) => (localPicture.value = value)} />
       </Section>
+      <CompareSection />
       <Section title="Camera">
         <Switch label="Fly with W A S D Q E" title={titleFor('fly')} value={flying.value} onChange={(value) => (flying.value = value)} />
       </Section>

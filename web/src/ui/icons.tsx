@@ -17,6 +17,8 @@ const paths = {
   play: 'M6.5 4v12l9-6z',
   stop: 'M5.5 5.5h9v9h-9z',
   film: 'M3 4.5h14v11H3zM6.5 4.5v11M13.5 4.5v11M3 8h3.5M3 12h3.5M13.5 8H17M13.5 12H17',
+  left: 'M12 4.5 6.5 10l5.5 5.5',
+  right: 'M8 4.5 13.5 10 8 15.5',
   plus: 'M10 4v12M4 10h12',
   download: 'M10 3v9M6.5 8.8 10 12.3l3.5-3.5M4 16.5h12',
 };

@@ -1,0 +1,180 @@
+"""Comparing in the browser: photographs from their own cameras, whatever the window's shape, and the object as captured beside the present one.
+
+The photographs are pictures that our own renderer took of the ball, so that they must agree with what the page shows of it.
+"""
+
+import base64
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from playwright.sync_api import expect
+
+from drgs.build.import_mesh import import_mesh
+from drgs.deform.pose_scene import pose_scene
+from drgs.exchange.photographs import encode_photographs
+from drgs.render.accumulate import RenderSettings
+from drgs.render.render_frame import render_frame
+from drgs.scene.asset import Asset, save_asset
+from drgs.scene.camera import Camera, camera_from_opengl
+from tests.web.conftest import Viewer, wait_until
+
+WIDTH, HEIGHT = 120, 90
+INTRINSICS = torch.tensor([[150.0, 0, 42], [0, 150, 55], [0, 0, 1]])
+"""The axis is well off the picture's middle."""
+
+
+def camera_at(azimuth_degrees: float, roll_degrees: float, name: str) -> Camera:
+    azimuth, roll = np.radians([azimuth_degrees, roll_degrees])
+    backward = np.array([np.cos(azimuth), np.sin(azimuth), 0.4]) / np.hypot(1, 0.4)
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+    up = np.cross(backward, right)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1] = np.cos(roll) * right + np.sin(roll) * up, np.cos(roll) * up - np.sin(roll) * right
+    pose[:3, 2], pose[:3, 3] = backward, 2.2 * backward
+    return camera_from_opengl(torch.tensor(pose), INTRINSICS, WIDTH, HEIGHT, name)
+
+
+def photograph(asset: Asset, camera: Camera) -> np.ndarray:
+    """(height, width, 3) uint8 over the asset's own white sky."""
+    settings = RenderSettings(samples_per_pixel=128, background="environment")
+    rgba = render_frame(pose_scene(asset, []), camera, settings).rgba_srgb
+    return (rgba[..., :3].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+
+
+@pytest.fixture(scope="module")
+def photographs() -> list[np.ndarray]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def captured(viewer: Viewer, ball_file: Path, photographs: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Viewer:
+    """The page with the ball open as if it had been built from three photographs, one of them taken with a tilted camera."""
+    cameras = (camera_at(-60, 0, "front"), camera_at(60, 25, "tilted"), camera_at(180, 0, "back"))
+    asset = replace(import_mesh(ball_file), cameras=cameras)
+    photographs += [photograph(asset, camera) for camera in cameras]
+    path = tmp_path_factory.mktemp("captured") / "captured.zip"
+    save_asset(asset, path, None, encode_photographs(photographs))
+    answer = httpx.post(
+        f"{viewer.server.address}/api/assets",
+        files={"file": ("captured.zip", path.read_bytes())},
+        headers={"Authorization": f"Bearer {viewer.server.token}"},
+        timeout=60,
+    )
+    assert answer.status_code == 201, answer.text
+    viewer.page.goto(f"{viewer.server.address}/#asset={answer.json()['id']}")
+    viewer.page.reload()
+    viewer.page.get_by_role("button", name="Library").click()
+    viewer.settle()
+    viewer.page.keyboard.press("Shift+F")
+    viewer.settle()
+    viewer.open_tab("View")
+    return viewer
+
+
+def shown_where_the_photograph_lies(viewer: Viewer) -> np.ndarray:
+    """(HEIGHT, WIDTH, 3) of the traced picture, where the page lays the photograph over it."""
+    viewer.page.wait_for_selector(".photograph[data-shown=true]")
+    viewer.settle()
+    box = viewer.page.evaluate(
+        "(({ x, y, width, height }) => [x, y, width, height])(document.querySelector('.photograph').getBoundingClientRect())"
+    )
+    data = viewer.page.evaluate("document.querySelector('canvas.traced').toDataURL('image/png')")
+    picture = Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB")
+    scale = picture.width / viewer.page.evaluate("innerWidth")
+    x, y, width, height = (scale * value for value in box)
+    return np.asarray(picture.resize((WIDTH, HEIGHT), Image.Resampling.BILINEAR, (x, y, x + width, y + height)), float)
+
+
+def difference(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.abs(a - b).mean())
+
+
+def shift(picture: np.ndarray) -> np.ndarray:
+    return np.roll(picture, 4, 1)
+
+
+def test_photographs_lie_exactly_over_what_the_page_shows_from_their_cameras(captured: Viewer, photographs: list[np.ndarray]) -> None:
+    before = captured.settled_picture()
+    captured.page.locator(".stage").focus()
+    captured.page.keyboard.press("c")
+    expect(captured.page.locator(".view-bar")).to_contain_text("front · 1 of 3")  # nearest to the first view
+    for name, picture in zip(("front", "tilted", "back"), photographs, strict=True):
+        expect(captured.page.locator(".view-bar")).to_contain_text(name)
+        taken = picture.astype(float)
+        wait_until(lambda taken=taken: difference(shown_where_the_photograph_lies(captured), taken) < 7, f"{name} as photographed")
+        shown = shown_where_the_photograph_lies(captured)
+        assert difference(shown, taken) < 0.5 * difference(shown, shift(taken)), f"{name} is out of place"
+        captured.page.keyboard.press("ArrowRight")
+    expect(captured.page.locator(".view-bar")).to_contain_text("front")
+    captured.page.keyboard.press("ArrowLeft")
+    expect(captured.page.locator(".view-bar")).to_contain_text("back")
+    captured.page.keyboard.press("Escape")
+    expect(captured.page.locator(".view-bar")).to_have_count(0)
+    wait_until(lambda: np.abs(captured.settled_picture() - before).mean() < 2, "the camera where it was")
+
+
+def test_a_photograph_fits_between_the_panels_and_fades_by_its_slider(captured: Viewer, photographs: list[np.ndarray]) -> None:
+    captured.page.get_by_role("switch", name="Photographs, from their own cameras").check()
+    captured.page.wait_for_selector(".photograph[data-shown=true]")
+    picture, panel = (captured.page.locator(which).bounding_box() for which in (".photograph", ".inspector"))
+    assert picture["x"] + picture["width"] <= panel["x"] + 1 and picture["x"] >= 0 and picture["y"] >= 43
+    for percent in ("0", "100"):
+        captured.page.get_by_label("Photograph, exact value").fill(percent)
+        captured.page.get_by_label("Photograph, exact value").press("Enter")
+        assert captured.page.evaluate("getComputedStyle(document.querySelector('.photograph')).opacity") == str(int(percent) // 100)
+    captured.page.get_by_role("switch", name="Photographs, from their own cameras").uncheck()
+    expect(captured.page.locator(".photograph")).to_have_count(0)
+
+
+def halves(viewer: Viewer) -> tuple[np.ndarray, np.ndarray]:
+    """Mean colours of the ball just left and just right of the window's middle, as the screen shows them."""
+    screen = np.asarray(Image.open(io.BytesIO(viewer.page.screenshot())).convert("RGB"), float)
+    line = viewer.page.locator(".divider").bounding_box()
+    scale = screen.shape[1] / viewer.page.evaluate("innerWidth")
+    x, y = scale * (line["x"] + line["width"] / 2), screen.shape[0] // 2 + 22
+    left, right = slice(int(x) - 26, int(x) - 10), slice(int(x) + 10, int(x) + 26)
+    return screen[y - 30 : y - 10, left].mean((0, 1)), screen[y - 30 : y - 10, right].mean((0, 1))
+
+
+def test_the_split_shows_the_object_as_captured_beside_the_present_one(captured: Viewer) -> None:
+    captured.append_edit({"op": "material", "select": {"all": True}, "set": {"albedo": [0.0, 0.0, 0.0]}})
+    captured.settle()
+    captured.page.keyboard.press("Shift+B")
+    divider = captured.page.get_by_role("slider", name="Split between before and now")
+    # The ball is in the middle of what the inspector leaves free.
+    wait_until(lambda: captured.page.evaluate("document.querySelector('.stage').dataset.split") == "true", "a split window")
+    divider.focus()
+    for _ in range(2):
+        captured.page.keyboard.press("Shift+ArrowLeft")
+    expect(divider).to_have_attribute("aria-valuenow", "30")
+
+    def is_black_on_the_right_only() -> bool:
+        captured.settle()
+        left, right = halves(captured)
+        return left.max() > 100 and right.max() < 90
+
+    wait_until(is_black_on_the_right_only, lambda: f"colours left and right of the divider: {halves(captured)}")
+    box = divider.bounding_box()
+    captured.page.mouse.move(box["x"] + 12, 150)
+    captured.page.mouse.down()
+    captured.page.mouse.move(box["x"] + 12 + 76, 150, steps=3)
+    captured.page.mouse.up()
+    expect(divider).to_have_attribute("aria-valuenow", "40")
+    captured.page.keyboard.press("Shift+B")
+    expect(divider).to_have_count(0)
+    captured.page.keyboard.press("Control+z")
+    captured.wait_for_edits(0)
+
+
+def test_an_imported_mesh_says_that_it_has_no_photographs(captured: Viewer, ball_file: Path) -> None:
+    captured.page.get_by_role("button", name="Library").click()
+    captured.page.get_by_label("Capture or mesh").set_input_files(ball_file)
+    expect(captured.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=120_000)
+    expect(captured.page.get_by_text("this asset was made from a mesh")).to_be_visible()
+    assert captured.complaints == []
