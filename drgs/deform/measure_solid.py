@@ -1,6 +1,6 @@
-"""The inside of a closed triangle mesh, as signed distances on a lattice: what matter collides with.
+"""The inside of a closed triangle mesh, as signed distances on a lattice: what matter collides with. And what lies near some points: what holds it.
 
-In: a mesh as arrays or as a file. Out: a Solid (drgs/deform/mpm/records.py). Inside is where the winding number exceeds a half, so small
+In: a mesh as arrays or as a file, or points. Out: a Solid (drgs/deform/mpm/records.py). Inside is where the winding number exceeds a half, so small
 holes and flipped faces do no harm. Planes are kept exactly; edges and parts thinner than the spacing are rounded off.
 """
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.deform.fill_particles import depths
@@ -36,19 +37,23 @@ def measure_solid(vertices: Tensor, faces: Tensor, spacing: float) -> Solid:
         raise ValueError(f"faces name vertices 0 to {len(vertices) - 1}; found {int(faces.min())} to {int(faces.max())}")
     used = vertices[faces.long().unique()].double().cpu()
     low, high = used.amin(0), used.amax(0)
-    while float(((high - low) / spacing + 2 * MARGIN + 1).ceil().prod()) > MOST_NODES:
-        spacing *= 1.1
-    counts = ((high - low) / spacing + 2 * MARGIN + 1).ceil().long().tolist()
-    origin = low - MARGIN * spacing
-    axes = [origin[k] + spacing * torch.arange(counts[k], dtype=torch.float64) for k in range(3)]
-    nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).float().contiguous().to(vertices.device)
+    nodes, spacing, counts = _lattice(low, high, spacing)
     tree = wp.Mesh(warp_array(vertices, wp.vec3), warp_array(faces.reshape(-1)), support_winding_number=True)
-    distances = -depths(tree, nodes).reshape(counts)
+    distances = -depths(tree, nodes.float().contiguous().to(vertices.device)).reshape(counts)
     if not bool((distances <= 0).any()):
         raise ValueError(
             f"a mesh that matter collides with encloses a volume and is thicker than a cell of {spacing:.3g}; this one is neither or not"
         )
-    return Solid(tuple(origin.tolist()), spacing, distances)
+    return Solid(tuple((low - MARGIN * spacing).tolist()), spacing, distances)
+
+
+def solid_around(points: Tensor, radius: float, spacing: float) -> Solid:
+    """What lies within a radius of some points (n, 3), at least one; on a lattice of this spacing, or a larger one if need be."""
+    places = points.detach().double().cpu()
+    low, high = places.amin(0) - radius, places.amax(0) + radius
+    nodes, spacing, counts = _lattice(low, high, spacing)
+    distances, _ = cKDTree(places.numpy()).query(nodes.numpy())
+    return Solid(tuple((low - MARGIN * spacing).tolist()), spacing, torch.from_numpy(distances - radius).float().reshape(counts))
 
 
 def distances_from_solid(solid: Solid, points: Tensor) -> Tensor:
@@ -65,6 +70,16 @@ def distances_from_solid(solid: Solid, points: Tensor) -> Tensor:
         weight = torch.where(corner.bool(), share, 1 - share).prod(1)
         found = found + weight * grid[at[:, 0], at[:, 1], at[:, 2]]
     return torch.where(outside, torch.full_like(found, torch.inf), found)
+
+
+def _lattice(low: Tensor, high: Tensor, spacing: float) -> tuple[Tensor, float, list[int]]:
+    """Nodes (n, 3) float64 around a box, their spacing, and how many there are along each axis."""
+    while float(((high - low) / spacing + 2 * MARGIN + 1).ceil().prod()) > MOST_NODES:
+        spacing *= 1.1
+    counts = ((high - low) / spacing + 2 * MARGIN + 1).ceil().long().tolist()
+    origin = low - MARGIN * spacing
+    axes = [origin[k] + spacing * torch.arange(counts[k], dtype=torch.float64) for k in range(3)]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), spacing, counts
 
 
 def read_collider(path: Path) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ from drgs.deform.clip import ClipFrame, blend_frames, save_clip
 from drgs.deform.drive_mesh import vertex_gradients
 from drgs.deform.fill_particles import SPACINGS_A_CELL, FillSettings, Particles, fill_particles
 from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate
-from drgs.deform.measure_solid import distances_from_solid
+from drgs.deform.measure_solid import distances_from_solid, solid_around
 from drgs.deform.mpm import (
     LAWS,
     Box,
@@ -54,6 +54,8 @@ STILL_FRAMES = 3
 """Frames at rest after which nothing is computed until something acts again."""
 MOST_PARTS_NAMED = 3
 """Of those that may tear, in a warning."""
+PINNED_CELLS = 1.5
+"""How far from pinned vertices the grid stands still: as far as the matter there feels the grid [cells]."""
 ROOM_SIZES = 3.0
 """How far the room reaches beyond the object on every side, in sizes of the object."""
 
@@ -283,6 +285,12 @@ def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center:
         point[axis], normal[axis] = height, 1.0
         conditions.append(Condition(Plane(tuple(point), tuple(normal)), scene.floor.effect, scene.floor.friction))
         room_low[axis] = min(float(room_low[axis]), height - 4 * dx)
+    if scene.pins:
+        if max(scene.pins) >= len(asset.mesh.vertices):
+            raise ValueError(f"pins name vertex {max(scene.pins)}; the mesh has {len(asset.mesh.vertices)}, counted from 0")
+        held = asset.mesh.vertices[torch.tensor(sorted(set(scene.pins)), device=interior.device)].double().cpu() - center
+        # Last, so that nothing moves what is held.
+        conditions.append(Condition(solid_around(held, PINNED_CELLS * dx, dx), "sticky"))
     grid = GridSettings(tuple(room_low.tolist()), tuple(room_high.tolist()), dx)
     return make_model(filled.positions, filled.volumes, tuple(materials), material_of, grid, tuple(gravity), tuple(conditions))
 

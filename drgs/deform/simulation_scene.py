@@ -140,6 +140,8 @@ class SimulationScene(_Plain):
     up: Literal["x", "y", "z"] = "z"
     floor: Floor | None = Floor()
     acts: list[Act] = Field(default_factory=list, max_length=64)
+    pins: list[Annotated[int, Field(ge=0)]] = Field(default_factory=list, max_length=200_000)
+    """Vertices of the mesh that stay where they are, and the matter near them."""
     velocity: Triple = (0.0, 0.0, 0.0)
     """Of the whole object at the start [world units/s]."""
     spin: Triple = (0.0, 0.0, 0.0)

@@ -141,6 +141,19 @@ def test_regions_hold_another_matter_and_acts_hold_parts_in_place():
         Simulation(ball_asset(), scene(regions=[region | {"shape": {"sphere": {"center": [9, 9, 9], "radius": 1}}}]))
 
 
+def test_pinned_vertices_stay_and_the_rest_hangs_from_them():
+    asset = ball_asset()
+    rest = asset.mesh.vertices
+    top = torch.nonzero(rest[:, 2] > 5.3).flatten().tolist()
+    frame = Simulation(asset, scene(floor=None, pins=top, particles=1500)).at(0.5)
+    moved = (frame.vertices - rest).norm(dim=-1)
+    assert float(moved[top].max()) < 0.02
+    foot = rest[:, 2] < 4.7
+    assert 0.005 < float((rest - frame.vertices)[foot, 2].mean()) < 0.3, "without pins it would have fallen by 1.2"
+    with pytest.raises(ValueError, match="pins name vertex 9999; the mesh has 162"):
+        Simulation(asset, scene(pins=[3, 9999]))
+
+
 def test_presets_look_alike_at_every_scale():
     for preset in ("jelly", "rubber", "clay", "sand", "snow", "honey"):
         matter = parse_simulation_scene({"matter": {"preset": preset}}).matter
@@ -162,6 +175,7 @@ def test_presets_look_alike_at_every_scale():
         ({"duration": 1e9}, "duration"),
         ({"acts": [{"shape": {}}]}, "exactly one of plane, sphere, box, mesh"),
         ({"colour": "red"}, "colour"),
+        ({"pins": [-1]}, "pins"),
         ({"acts": [{"shape": {"mesh": {"file": "a.obj", "vertices": [[0, 0, 0]] * 4}}}]}, "either a file"),
     ],
 )

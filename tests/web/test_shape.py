@@ -18,7 +18,7 @@ def shape(ball: Viewer) -> Iterator[None]:
     ball.wait_for_edits(0)
     ball.open_tab("Shape")
     yield
-    for name in ("Handles on the picture", "Corners on the picture"):
+    for name in ("Handles on the picture", "Corners on the picture", "Paint what stays"):
         if (switch := ball.page.get_by_label(name)).is_visible():
             switch.uncheck()
 
@@ -152,6 +152,42 @@ def test_a_corner_of_the_lattice_is_dragged_and_the_local_picture_follows(ball: 
     assert np.abs(np.abs(corners[:7]) - 0.5).max() < 1e-3 and np.abs(corners[7] - 0.5).max() > 0.05
     assert chosen_ball(ball) == pytest.approx((x + 30, y - 20), abs=4)
     page.keyboard.press("Control+z")
+    ball.wait_for_edits(0)
+
+
+def test_what_is_painted_stays_while_the_rest_falls(ball: Viewer) -> None:
+    page = ball.page
+    left, top, right, bottom = outline(ball)
+    before = screen(ball)
+    page.get_by_label("Paint what stays").check()
+    expect(page.get_by_text("Nothing is held.")).to_be_visible()
+    x, y = (left + right) / 2, top + 0.15 * (bottom - top)
+    page.mouse.move(x - 30, y)
+    page.mouse.down()
+    page.mouse.move(x, y, steps=3)
+    page.mouse.move(x + 30, y, steps=3)
+    page.mouse.up()
+    expect(page.get_by_text("% of the surface is held.")).to_be_visible()
+    spot = (round(y / 2), round(x / 2))
+    wait_until(lambda: np.abs(screen(ball)[spot] - before[spot]).max() > 60, "a mark where it was painted")
+    page.get_by_role("button", name="Hold the top").click()
+    page.get_by_label("Paint what stays").uncheck()
+    for label, value in (("Length", "0.25"), ("Density", "2"), ("Poisson", "0.4")):
+        field = page.get_by_label(f"{label}, exact value")
+        field.fill(value)
+        field.press("Enter")
+    page.get_by_role("button", name="Let it go").click()
+    (edit,) = wait_until(lambda: [edit for edit in ball.edits() if edit["time"] > 0], "a simulation that plays", 60)
+    page.get_by_role("button", name="Pause").click()
+    assert len(edit["scene"]["pins"]) > 10
+    assert edit["scene"]["matter"] == {"preset": "jelly", "density": 2000, "poisson_ratio": 0.4}
+    time = page.get_by_label("Time, exact value")
+    time.fill("0.25")
+    time.press("Enter")
+    wait_until(lambda: ball.edits()[-1]["time"] == 0.25, "the last moment", 60)
+    assert abs(outline(ball)[1] - top) < 6, "the top hangs where it was; without pins it would have fallen by a third of the ball"
+    page.get_by_role("button", name="Remove", exact=True).click()
+    page.get_by_role("button", name="Hold nothing").click()
     ball.wait_for_edits(0)
 
 

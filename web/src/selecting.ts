@@ -67,9 +67,14 @@ function select(next: Selection): void {
 export function paint(point: Triple, erase: boolean): void {
   const positions = mesh.value?.positions;
   if (!positions) return;
-  const weights = selection.value.vertex_weights?.slice() ?? new Array<number>(positions.length / 3).fill(0);
+  select({ vertex_weights: dabbed(selection.value.vertex_weights ?? new Array<number>(positions.length / 3).fill(0), positions, point, erase, softness.value) });
+}
+
+/** Weights of vertices with one dab more, or taken away. */
+export function dabbed(painted: number[], positions: Float32Array, point: Triple, erase: boolean, soft: number): number[] {
+  const weights = painted.slice();
   const radius = 0.5 * size.value * objectRadius.value;
-  const core = radius * (1 - softness.value);
+  const core = radius * (1 - soft);
   for (let i = 0; i < weights.length; i++) {
     const distance = Math.hypot(positions[3 * i]! - point[0], positions[3 * i + 1]! - point[1], positions[3 * i + 2]! - point[2]);
     if (distance >= radius) continue;
@@ -77,5 +82,5 @@ export function paint(point: Triple, erase: boolean): void {
     const dab = Math.round(100 * t * t * (3 - 2 * t)) / 100; // two digits keep the edit short
     weights[i] = erase ? Math.min(weights[i]!, 1 - dab) : Math.max(weights[i]!, dab);
   }
-  select({ vertex_weights: weights });
+  return weights;
 }

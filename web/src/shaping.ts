@@ -6,6 +6,7 @@ import { handlesOf, keyOf, MOST_HANDLES, movedTo, overruled, placeOf, restOf, wi
 import { adjusted, cornersOf, edgesOf, restLattice, withCorner, type Lattice } from './lattice';
 import { withReplaced } from './edit_log';
 import type { Edit, LatticeMap } from './protocol.gen';
+import { forgetPins } from './pins';
 import { objectRadius } from './selecting';
 import { changeFlowing, commitDraft, draftEdit, isTwin, newKey, replaceEdits } from './session';
 import { boundsOf, movePoint, unmovePoint } from './shape';
@@ -73,6 +74,7 @@ export function chooseShapeTool(next: ShapeTool): void {
 effect(() => {
   session.value?.asset;
   chooseShapeTool('none');
+  forgetPins();
 });
 
 // ---- what is done with it -----------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ import { LookThrough } from './look_through';
 import { photographInSight, split, viewNumber } from './photographs';
 import { FLAG_CONVERGED, FLAG_MOVING, MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from './protocol.gen';
 import { listen, pick, sendCamera } from './session';
+import { paintPins, pinWeights } from './pins';
 import { listenToPointers } from './pointers';
 import { paint, selectAt } from './selecting';
 import { choose, putHandle, shapeTool } from './shaping';
@@ -31,6 +32,7 @@ const BALL_PIXELS = 72;
 const SKY_PIXELS = 160;
 /** How long a selection shows, in two pulses. */
 const FLASH_MS = 1400;
+const PINS_STRENGTH = 0.7;
 const MOVING_MS = 120;
 const PIXEL_BUDGET = { low: 200_000, medium: 500_000, full: MAX_PIXELS };
 /** A fresh picture with fewer samples a pixel than this is too noisy to replace the local one: denoised, and as it is. */
@@ -194,6 +196,11 @@ export class Viewport {
     return photographInSight.value ? null : split.value;
   }
 
+  /** What is held is marked for as long as its brush is chosen. */
+  private get marksPins(): boolean {
+    return shapeTool.value === 'pins' && isAnalytic(edits.value);
+  }
+
   private setFresh(fresh: boolean): void {
     this.fresh = fresh;
     this.stage.dataset.fresh = String(fresh);
@@ -239,7 +246,9 @@ export class Viewport {
       this.localDirty = true;
     });
     effect(() => {
-      if (selectionWeights.value) this.local?.setHighlighted(selectionWeights.value);
+      const marked = this.marksPins ? pinWeights.value : selectionWeights.value;
+      if (marked) this.local?.setHighlighted(marked);
+      this.localDirty = true;
       if (flash.value > 0) this.flashedAt = NaN; // from the next picture on, however late that is
     });
     effect(() => {
@@ -354,9 +363,10 @@ export class Viewport {
     if (Number.isNaN(this.flashedAt)) this.flashedAt = now;
     const since = now - this.flashedAt;
     const flashing = since < FLASH_MS;
-    const strength = !flashing ? 0 : this.stillMotion ? 0.5 : 0.85 * Math.sin((2 * Math.PI * since) / FLASH_MS) ** 2;
+    const marks = this.marksPins;
+    const strength = marks ? PINS_STRENGTH : !flashing ? 0 : this.stillMotion ? 0.5 : 0.85 * Math.sin((2 * Math.PI * since) / FLASH_MS) ** 2;
     // Over a traced picture only the selection is drawn, on nothing.
-    const overlay = flashing && !(this.localShows && !this.fresh) && !before.value && this.splitAt === null;
+    const overlay = (flashing || marks) && !(this.localShows && !this.fresh) && !before.value && this.splitAt === null;
     if (flashing || this.stage.dataset.overlay !== String(overlay)) this.localDirty = true;
     this.stage.dataset.overlay = String(overlay);
     if (!this.localShows && !overlay && !before.value && this.splitAt === null) return;
@@ -451,7 +461,7 @@ export class Viewport {
 
   private paintAt(event: PointerEvent): boolean {
     const hit = this.pickLocally(event);
-    if (hit) paint(hit.rest, event.shiftKey);
+    if (hit) (shapeTool.value === 'pins' ? paintPins : paint)(hit.rest, event.shiftKey);
     return hit !== null;
   }
 

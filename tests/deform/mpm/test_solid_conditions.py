@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from drgs.deform.measure_solid import distances_from_solid, measure_solid, read_collider
+from drgs.deform.measure_solid import distances_from_solid, measure_solid, read_collider, solid_around
 from drgs.deform.mpm import Box, Condition, GridSettings, Material, MpmSettings, Plane, Sphere, advance, make_model, rest_state
 
 DX = 1 / 16
@@ -129,3 +129,11 @@ def test_boxes_beside_solids_in_one_list_both_act():
     )  # fmt: skip
     after, _ = advance(both, state, 0.1)
     assert torch.isfinite(after.positions).all() and float((after.positions - model.rest).abs().max()) < 0.02
+
+
+def test_a_solid_around_points_is_a_ball_around_each():
+    points = torch.tensor([[0.0, 0, 0], [2.0, 0, 1.0]])
+    solid = solid_around(points, 0.3, 0.05)
+    beside = points + torch.tensor([0.0, 0.2, 0])
+    assert torch.allclose(distances_from_solid(solid, beside), torch.full((2,), -0.1), atol=0.01)
+    assert float(distances_from_solid(solid, points + torch.tensor([0, 0, 0.33])).min()) > 0

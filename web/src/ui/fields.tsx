@@ -47,6 +47,8 @@ export interface SliderProps {
   logarithmic?: boolean;
   /** Not set by the user yet: shown dimmed. */
   unset?: boolean;
+  /** Tool-tip, where the label is not enough. */
+  title?: string;
   onChange(value: number): void;
   /** The slider was let go, or a number typed. */
   onCommit?: () => void;
@@ -56,7 +58,7 @@ export interface SliderProps {
 
 const clamp = (value: number, low: number, high: number) => Math.min(high, Math.max(low, value));
 
-export function Slider({ label, value, min, max, step, unit, logarithmic, unset, onChange, onCommit, onReset }: SliderProps) {
+export function Slider({ label, value, min, max, step, unit, logarithmic, unset, title, onChange, onCommit, onReset }: SliderProps) {
   const [dragged, setDragged] = useState<number | null>(null);
   const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
   const shown = dragged ?? value;
@@ -68,7 +70,7 @@ export function Slider({ label, value, min, max, step, unit, logarithmic, unset,
     onCommit?.();
   };
   return (
-    <div class={`field${unset ? ' unset' : ''}`} title={unset ? `${label}: as captured` : undefined}>
+    <div class={`field${unset ? ' unset' : ''}`} title={title ?? (unset ? `${label}: as captured` : undefined)}>
       <label for={id}>{label}</label>
       <input
         id={id}
