@@ -81,7 +81,7 @@ def refusal(case: str, attempt: Callable[[], object]) -> Row:
 
 def estimate(points: ShadingPoints, sky: Environment, counts: SampleCounts, bounces: int = 0, seed: int = 3) -> PointLight:
     starts = RayStarts(points.position_world + 100 * points.normal_world, points.normal_world)
-    light = environment_light(sky, build_environment_table(sky))
+    light = environment_light(build_environment_table(sky))
     return shade(points, starts, light, build_tracer(sphere_mesh(1, radius=1e-3)), counts, bounces, seed)
 
 

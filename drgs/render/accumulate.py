@@ -151,7 +151,7 @@ def start_frame(
         tracer.horizons = Horizons(tracer.mesh, tracer.lift, scene.horizons)
     lap("build_tracer")
     table = build_environment_table(scene.environment) if previous is None or "environment_table" in make else previous.table
-    light = environment_light(scene.environment, table, scene.environment_rotation_degrees, scene.environment_intensity)
+    light = environment_light(table, scene.environment_rotation_degrees, scene.environment_intensity)
     lap("environment_table")
 
     fixed = first = None

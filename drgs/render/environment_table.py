@@ -22,18 +22,52 @@ from drgs.warp_torch import warp_array
 
 MAX_RADIANCE = 1e12
 """Of a texel; a half-float picture holds 65504, squared luminance overflows at 1e19."""
+LANES = 16
+"""Of the vectors that CPU kernels search with."""
 
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentTable:
     """Written by build_environment_table, read by the samplers; carries no gradient."""
 
-    nodes: Float[Tensor, "height_plus_2 width"]
-    """Density before normalisation at texel centres; first and last row: the poles, 0."""
-    column_sums: Float[Tensor, "height_plus_2 width_plus_1"]
-    """Running integral of each row over u, from the centre of column 0 onwards."""
-    row_sums: Float[Tensor, "height_plus_2"]
-    """Running integral over v of the rows' totals; the last entry is the integral of everything, 0 for a black sky."""
+    texels: Float[Tensor, "height_plus_2 width 4"]
+    """Radiance and density before normalisation at texel centres, which a lookup interpolates alike; first and last row: the poles, with the
+    radiance of the rows beside them and density 0."""
+    padded_column_sums: Float[Tensor, "height_plus_2 pitch"]
+    """column_sums, then infinity up to a multiple of LANES and LANES more: searches look at that many at once."""
+    padded_row_sums: Float[Tensor, "pitch"]
+    """row_sums, likewise."""
+    coarse_column_sums: Float[Tensor, "height_plus_2 16"]
+    """Of each row's column_sums every search_stride(width)-th."""
+
+    @property
+    def nodes(self) -> Float[Tensor, "height_plus_2 width"]:
+        """Density before normalisation at texel centres."""
+        return self.texels[..., 3]
+
+    @property
+    def column_sums(self) -> Float[Tensor, "height_plus_2 width_plus_1"]:
+        """Running integral of each row over u, from the centre of column 0 onwards."""
+        return self.padded_column_sums[:, : self.texels.shape[1] + 1]
+
+    @property
+    def row_sums(self) -> Float[Tensor, "height_plus_2"]:
+        """Running integral over v of the rows' totals; the last entry is the integral of everything, 0 for a black sky."""
+        return self.padded_row_sums[: len(self.texels)]
+
+
+def search_stride(count: int) -> int:
+    """Distance of the places among `count` that a search looks at first: 16 of them reach the end, and halving it ends at LANES."""
+    stride = LANES
+    while stride * LANES < count:
+        stride *= 2
+    return stride
+
+
+def _padded(sums: Tensor, dtype: torch.dtype) -> Tensor:
+    """Rows of sums with infinity behind them."""
+    beyond = -sums.shape[-1] % LANES + LANES
+    return torch.nn.functional.pad(sums.to(dtype), (0, beyond), value=math.inf)
 
 
 def build_environment_table(environment: Environment) -> EnvironmentTable:
@@ -62,7 +96,11 @@ def build_environment_table(environment: Environment) -> EnvironmentTable:
     row_height = torch.full((height + 1,), 1 / height, device=radiance.device, dtype=torch.float64)
     row_height[0] = row_height[-1] = 0.5 / height
     row_sums = torch.cat([totals.new_zeros(1), (0.5 * row_height * (totals[1:] + totals[:-1])).cumsum(0)])
-    return EnvironmentTable(nodes.contiguous(), column_sums.to(radiance.dtype), row_sums.to(radiance.dtype))
+    rows = torch.arange(-1, height + 1, device=radiance.device).clamp(0, height - 1)
+    texels = torch.cat([radiance[rows], nodes[..., None]], -1)
+    padded = _padded(column_sums, radiance.dtype)
+    places = (torch.arange(LANES, device=radiance.device) * search_stride(width + 1)).clamp(max=padded.shape[1] - 1)
+    return EnvironmentTable(texels, padded, _padded(row_sums, radiance.dtype), padded[:, places].contiguous())
 
 
 def _row_of_v(v: Tensor, height: int) -> tuple[Tensor, Tensor]:
@@ -123,10 +161,13 @@ def sample_environment(table: EnvironmentTable, u: Tensor) -> Tensor:
 class EnvironmentLight:
     """An environment as kernels see it: lookup, density and sampling in world space."""
 
-    radiance: wp.array[wp.vec3]
-    nodes: wp.array2d[float]
+    texels: wp.array2d[wp.vec4]
     column_sums: wp.array2d[float]
+    """Padded; of the same pitch as in the table."""
     row_sums: wp.array[float]
+    coarse_column_sums: wp.array2d[float]
+    column_stride: int
+    row_stride: int
     height: int
     width: int
     cos_rotation: float
@@ -146,34 +187,8 @@ def table_place(light: EnvironmentLight, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def lookup_radiance(light: EnvironmentLight, place: wp.vec3) -> wp.vec3:
-    x = place[0] * float(light.width) - 0.5
-    y = wp.clamp(place[1] * float(light.height) - 0.5, 0.0, float(light.height - 1))
-    x0 = wp.floor(x)
-    row = wp.min(int(y), wp.max(light.height - 2, 0))
-    row1 = wp.min(row + 1, light.height - 1)
-    fx = x - x0
-    fy = y - float(row)
-    column0 = int(x0)
-    if column0 < 0:
-        column0 += light.width
-    if column0 >= light.width:
-        column0 -= light.width
-    column1 = column0 + 1
-    if column1 >= light.width:
-        column1 = 0
-    a = row * light.width
-    b = row1 * light.width
-    top = light.radiance[a + column0] * (1.0 - fx) + light.radiance[a + column1] * fx
-    bottom = light.radiance[b + column0] * (1.0 - fx) + light.radiance[b + column1] * fx
-    return light.intensity * (top * (1.0 - fy) + bottom * fy)
-
-
-@wp.func
-def lookup_pdf(light: EnvironmentLight, place: wp.vec3) -> float:
-    total = light.row_sums[light.height + 1]
-    if total <= 0.0:
-        return 0.0
+def texel_at(light: EnvironmentLight, place: wp.vec3) -> wp.vec4:
+    """Radiance without the intensity, and density before normalisation, between four texel centres."""
     y = place[1] * float(light.height) + 0.5
     row = wp.clamp(int(y), 0, light.height)
     t = y - float(row)
@@ -193,9 +208,23 @@ def lookup_pdf(light: EnvironmentLight, place: wp.vec3) -> float:
     column1 = column0 + 1
     if column1 >= light.width:
         column1 = 0
-    upper = light.nodes[row, column0] * (1.0 - s) + light.nodes[row, column1] * s
-    lower = light.nodes[row + 1, column0] * (1.0 - s) + light.nodes[row + 1, column1] * s
-    return (upper * (1.0 - t) + lower * t) / (19.7392088 * wp.max(place[2], 1.0e-6) * total)
+    upper = light.texels[row, column0] * (1.0 - s) + light.texels[row, column1] * s
+    lower = light.texels[row + 1, column0] * (1.0 - s) + light.texels[row + 1, column1] * s
+    return upper * (1.0 - t) + lower * t
+
+
+@wp.func
+def lookup_radiance(light: EnvironmentLight, place: wp.vec3) -> wp.vec3:
+    texel = texel_at(light, place)
+    return light.intensity * wp.vec3(texel[0], texel[1], texel[2])
+
+
+@wp.func
+def lookup_pdf(light: EnvironmentLight, place: wp.vec3) -> float:
+    total = light.row_sums[light.height + 1]
+    if total <= 0.0:
+        return 0.0
+    return texel_at(light, place)[3] / (19.7392088 * wp.max(place[2], 1.0e-6) * total)
 
 
 @wp.func
@@ -240,8 +269,8 @@ def environment_direction(light: EnvironmentLight, u: wp.vec2) -> wp.vec3:
     following = low + 1
     if following == light.width:
         following = 0
-    a = light.nodes[row, low] * (1.0 - t) + light.nodes[row + 1, low] * t
-    b = light.nodes[row, following] * (1.0 - t) + light.nodes[row + 1, following] * t
+    a = light.texels[row, low][3] * (1.0 - t) + light.texels[row + 1, low][3] * t
+    b = light.texels[row, following][3] * (1.0 - t) + light.texels[row + 1, following][3] * t
     s = linear_place(wp.clamp((target - before) / wp.max(after - before, 1.0e-37), 0.0, 1.0), a, b)
     azimuth = (0.5 - (float(low) + 0.5 + s) / float(light.width)) * 6.28318530718
     polar = 3.14159265359 * y / float(light.height)
@@ -250,22 +279,19 @@ def environment_direction(light: EnvironmentLight, u: wp.vec2) -> wp.vec3:
     return wp.vec3(light.cos_rotation * x - light.sin_rotation * z, light.sin_rotation * x + light.cos_rotation * z, wp.cos(polar))
 
 
-def environment_light(
-    environment: Environment | None, table: EnvironmentTable, rotation_degrees: float = 0.0, intensity: float = 1.0
-) -> Any:
+def environment_light(table: EnvironmentTable, rotation_degrees: float = 0.0, intensity: float = 1.0) -> Any:
     """The struct that kernels read; it keeps the tensors' memory alive.
 
     Args:
-        environment: None where directions are sampled and weighed but nothing looks radiance up.
         rotation_degrees: counter-clockwise seen from above.
     """
     light = EnvironmentLight()
-    radiance = table.nodes.new_zeros(1, 3) if environment is None else environment.radiance.reshape(-1, 3)
-    light.radiance = warp_array(radiance.float(), wp.vec3)
-    light.nodes = warp_array(table.nodes.float())
-    light.column_sums = warp_array(table.column_sums.float())
-    light.row_sums = warp_array(table.row_sums.float())
-    light.height, light.width = table.nodes.shape[0] - 2, table.nodes.shape[1]
+    light.texels = warp_array(table.texels.float(), wp.vec4)
+    light.column_sums = warp_array(table.padded_column_sums.float())
+    light.row_sums = warp_array(table.padded_row_sums.float())
+    light.coarse_column_sums = warp_array(table.coarse_column_sums.float())
+    light.height, light.width = table.texels.shape[0] - 2, table.texels.shape[1]
+    light.column_stride, light.row_stride = search_stride(light.width + 1), search_stride(light.height + 2)
     light.cos_rotation = math.cos(math.radians(rotation_degrees))
     light.sin_rotation = math.sin(math.radians(rotation_degrees))
     light.intensity = intensity

@@ -155,65 +155,71 @@ const auto lobe_at = [&](const Lobes& l, V3 d, v16 n_dot_l, v16& pdf, v16& dv, v
     const v16 c2 = c * c;
     c5 = c2 * c2 * c;
 };
-// Directions drawn from the environment's table. All lanes search side by side, without branches: their
-// loads overlap.
-const auto draw_environment = [&](const auto& light, v16 u0, v16 u1) -> V3 {
-    const int height = light.height, width = light.width;
+// The last of `count` running sums at most `target`, of which at(i) brings 16 from place i on: first 16 of them `stride` apart, which `coarse` holds.
+const auto last_sum_below = [&](v16 coarse, int stride, int count, float target, const auto& at) -> int {
+    int low = stride * (-__builtin_reduce_add(coarse <= target) - 1);
+    low = max_int(low, 0);
+    for (int span = stride / 2; span >= 16; span /= 2)
+        if (low + span < count && at(low + span)[0] <= target) low += span;
+    low += -__builtin_reduce_add(at(low) <= target) - 1;
+    return min_int(max_int(low, 0), count - 2);
+};
+// Directions drawn from the environment's table, in lanes that ask for one.
+const auto draw_environment = [&](const auto& light, v16 u0, v16 u1, i16 asked) -> V3 {
+    const int height = light.height, width = light.width, pitch = light.column_sums.shape[1];
     const float* const rows = light.row_sums.data;
-    alignas(64) float azimuth_lane[16], polar_lane[16], target[16], second_number[16], between[16];
-    alignas(64) int row[16] = {0}, column[16] = {0};
-    store16(target, u0 * rows[height + 1]);
-    store16(second_number, u1);
-    const auto linear_place = [](float u, float a, float b) -> float {
-        u = u < 0.0f ? 0.0f : (u > 1.0f ? 1.0f : u);
-        const float square = a * a + u * (b * b - a * a), root = a + __builtin_sqrtf(square > 0.0f ? square : 0.0f);
-        return u * (a + b) / (root > 1e-37f ? root : 1e-37f);
+    const v4* const texels = (const v4*)light.texels.data;
+    // By lane: sums of a cell's rows or columns up to it and in it, and the densities at its two ends.
+    alignas(64) float before[16] = {0}, mass[16] = {0}, start[16] = {0}, end[16] = {0}, target[16], between[16];
+    alignas(64) int row[16] = {0}, column[16] = {0}, asked_lane[16];
+    alignas(64) float every[16];
+    for (int k = 0; k < 16; ++k) every[k] = rows[min_int(k * light.row_stride, light.row_sums.shape[0] - 1)];
+    const v16 coarse_rows = load16(every);
+    *(i16*)asked_lane = asked;
+    const v16 row_target = u0 * rows[height + 1];
+    store16(target, row_target);
+    for (int lane = 0; lane < 16; ++lane) {
+        if (asked_lane[lane] == 0) continue;
+        const int r = last_sum_below(coarse_rows, light.row_stride, height + 2, target[lane], [&](int i) { return load16(rows + i); });
+        row[lane] = r;
+        before[lane] = rows[r];
+        mass[lane] = rows[r + 1] - rows[r];
+        start[lane] = light.column_sums.data[(long)r * pitch + width];
+        end[lane] = light.column_sums.data[(long)(r + 1) * pitch + width];
+    }
+    const auto linear_place = [&](v16 u, v16 a, v16 b) -> v16 {
+        return u * (a + b) / max16(a + sqrt16(max16(a * a + u * (b * b - a * a), v16(0.0f))), v16(1e-37f));
     };
-    int step = 1;
-    while (2 * step <= height) step *= 2;
-    for (; step > 0; step >>= 1) {
-        for (int lane = 0; lane < 16; ++lane) {
-            const int probe = row[lane] + step, there = min_int(probe, height);
-            row[lane] += ((probe <= height) & (rows[there] <= target[lane])) ? step : 0;
-        }
-    }
+    const auto place_in_cell = [&](v16 sum) -> v16 {
+        const v16 share = (sum - load16(before)) / max16(load16(mass), v16(1e-37f));
+        return linear_place(min16(max16(share, v16(0.0f)), v16(1.0f)), load16(start), load16(end));
+    };
+    const v16 t = place_in_cell(row_target), r = __builtin_convertvector(*(const i16*)row, v16);
+    const v16 y = select(r == 0.0f, 0.5f * t, select(r == (float)height, r - 0.5f + 0.5f * t, r - 0.5f + t));
+    const v16 column_target = u1 * (load16(start) * (1.0f - t) + load16(end) * t);
+    store16(between, t);
+    store16(target, column_target);
     for (int lane = 0; lane < 16; ++lane) {
-        const int r = row[lane];
-        const float* const upper = light.column_sums.data + (long)r * (width + 1);
-        const float* const lower = upper + (width + 1);
-        const float mass = rows[r + 1] - rows[r];
-        const float t = linear_place((target[lane] - rows[r]) / (mass > 1e-37f ? mass : 1e-37f), upper[width], lower[width]);
-        const float y = r == 0 ? 0.5f * t : (r == height ? (float)r - 0.5f + 0.5f * t : (float)r - 0.5f + t);
-        between[lane] = t;
-        polar_lane[lane] = 0.5f * y / (float)height;
-        target[lane] = second_number[lane] * (upper[width] * (1.0f - t) + lower[width] * t);
+        if (asked_lane[lane] == 0) continue;
+        const float part = between[lane], rest = 1.0f - part;
+        const float* const upper = light.column_sums.data + (long)row[lane] * pitch;
+        const float* const lower = upper + pitch;
+        const float* const coarse = light.coarse_column_sums.data + 16 * (long)row[lane];
+        const auto mixed = [&](const float* a, const float* b) -> v16 { return load16(a) * rest + load16(b) * part; };
+        const int low = last_sum_below(mixed(coarse, coarse + 16), light.column_stride, width + 1, target[lane],
+                                       [&](int i) { return mixed(upper + i, lower + i); });
+        const int next = low + 1 == width ? 0 : low + 1;
+        const v4* const top = texels + (long)row[lane] * width;
+        column[lane] = low;
+        before[lane] = upper[low] * rest + lower[low] * part;
+        mass[lane] = upper[low + 1] * rest + lower[low + 1] * part - before[lane];
+        start[lane] = top[low][3] * rest + top[width + low][3] * part;
+        end[lane] = top[next][3] * rest + top[width + next][3] * part;
     }
-    step = 1;
-    while (2 * step < width) step *= 2;
-    for (; step > 0; step >>= 1) {
-        for (int lane = 0; lane < 16; ++lane) {
-            const float* const upper = light.column_sums.data + (long)row[lane] * (width + 1);
-            const float t = between[lane];
-            const int probe = column[lane] + step, there = min_int(probe, width - 1);
-            const float sum = upper[there] * (1.0f - t) + upper[width + 1 + there] * t;
-            column[lane] += ((probe < width) & (sum <= target[lane])) ? step : 0;
-        }
-    }
-    for (int lane = 0; lane < 16; ++lane) {
-        const int low = column[lane], next = low + 1 == width ? 0 : low + 1;
-        const float t = between[lane];
-        const float* const upper = light.column_sums.data + (long)row[lane] * (width + 1);
-        const float* const lower = upper + (width + 1);
-        const float at = upper[low] * (1.0f - t) + lower[low] * t;
-        const float mass = upper[low + 1] * (1.0f - t) + lower[low + 1] * t - at;
-        const float* const top = light.nodes.data + (long)row[lane] * width;
-        const float a = top[low] * (1.0f - t) + top[width + low] * t, b = top[next] * (1.0f - t) + top[width + next] * t;
-        azimuth_lane[lane] =
-            0.5f - ((float)low + 0.5f + linear_place((target[lane] - at) / (mass > 1e-37f ? mass : 1e-37f), a, b)) / (float)width;
-    }
+    const v16 azimuth = 0.5f - (__builtin_convertvector(*(const i16*)column, v16) + 0.5f + place_in_cell(column_target)) / (float)width;
     v16 sin_azimuth, cos_azimuth, sin_polar, cos_polar;
-    sincos_turns(load16(azimuth_lane), sin_azimuth, cos_azimuth);
-    sincos_turns(load16(polar_lane), sin_polar, cos_polar);
+    sincos_turns(azimuth, sin_azimuth, cos_azimuth);
+    sincos_turns(0.5f * y / (float)height, sin_polar, cos_polar);
     const v16 ex = cos_azimuth * sin_polar, ey = sin_azimuth * sin_polar;
     return {light.cos_rotation * ex - light.sin_rotation * ey, light.sin_rotation * ex + light.cos_rotation * ey, cos_polar};
 };
@@ -224,47 +230,35 @@ const auto look_up = [&](const auto& light, V3 d, i16 asked, v16* seen) -> v16 {
     const v16 turned_x = light.cos_rotation * d.x + light.sin_rotation * d.y, turned_y = light.cos_rotation * d.y - light.sin_rotation * d.x;
     const v16 sin_polar = sqrt16(d.x * d.x + d.y * d.y);
     const v16 u = 0.5f - atan2_turns(turned_y, turned_x), v = 2.0f * atan2_turns(sin_polar, d.z);
-    const v16 x = u * (float)width - 0.5f, x0 = floor16(x), fx = x - x0;
-    const v16 y = min16(max16(v * (float)height - 0.5f, v16(0.0f)), v16((float)(height - 1)));
-    const v16 y0 = min16(floor16(y), v16((float)max_int(height - 2, 0))), fy = y - y0;
-    const v16 node_y = v * (float)height + 0.5f, node_row = min16(max16(floor16(node_y), v16(0.0f)), v16((float)height));
-    v16 node_t = node_y - node_row;
-    node_t = select(node_row == 0.0f, 2.0f * (node_y - 0.5f), node_t);
-    node_t = select(node_row == (float)height, 2.0f * (node_y - node_row), node_t);
-    node_t = min16(max16(node_t, v16(0.0f)), v16(1.0f));
-    alignas(64) int column_lane[16], row_lane[16], node_lane[16], asked_lane[16];
+    const v16 x = u * (float)width - 0.5f, x0 = floor16(x);
+    const v16 y = v * (float)height + 0.5f, row = min16(max16(floor16(y), v16(0.0f)), v16((float)height));
+    v16 t = y - row;
+    t = select(row == 0.0f, 2.0f * (y - 0.5f), t);
+    t = select(row == (float)height, 2.0f * (y - row), t);
+    alignas(64) int column_lane[16], row_lane[16], asked_lane[16];
+    alignas(64) float x_lane[16], y_lane[16];
     *(i16*)column_lane = __builtin_convertvector(x0, i16);
-    *(i16*)row_lane = __builtin_convertvector(y0, i16);
-    *(i16*)node_lane = __builtin_convertvector(node_row, i16);
+    *(i16*)row_lane = __builtin_convertvector(row, i16);
     *(i16*)asked_lane = asked;
-    const float* const texels = (const float*)light.radiance.data;
-    alignas(64) float corner[16][16];
+    store16(x_lane, x - x0);
+    store16(y_lane, min16(max16(t, v16(0.0f)), v16(1.0f)));
+    const v4* const texels = (const v4*)light.texels.data;
+    alignas(64) v4 found[16];
     for (int lane = 0; lane < 16; ++lane) {
-        if (asked_lane[lane] == 0) {
-            for (int k = 0; k < 16; ++k) corner[k][lane] = 0.0f;
-            continue;
-        }
+        found[lane] = v4(0.0f);
+        if (asked_lane[lane] == 0) continue;
         int c0 = column_lane[lane];
         c0 = c0 < 0 ? c0 + width : (c0 >= width ? c0 - width : c0);
-        const int c1 = c0 + 1 == width ? 0 : c0 + 1, r0 = row_lane[lane], r1 = min_int(r0 + 1, height - 1);
-        for (int k = 0; k < 3; ++k) {
-            corner[k][lane] = texels[3 * (r0 * width + c0) + k];
-            corner[3 + k][lane] = texels[3 * (r0 * width + c1) + k];
-            corner[6 + k][lane] = texels[3 * (r1 * width + c0) + k];
-            corner[9 + k][lane] = texels[3 * (r1 * width + c1) + k];
-        }
-        const float* const top = light.nodes.data + (long)node_lane[lane] * width;
-        corner[12][lane] = top[c0];
-        corner[13][lane] = top[c1];
-        corner[14][lane] = top[width + c0];
-        corner[15][lane] = top[width + c1];
+        const int c1 = c0 + 1 == width ? 0 : c0 + 1;
+        const v4* const top = texels + (long)row_lane[lane] * width;
+        const float fx = x_lane[lane], fy = y_lane[lane];
+        const v4 upper = top[c0] * (1.0f - fx) + top[c1] * fx, lower = top[width + c0] * (1.0f - fx) + top[width + c1] * fx;
+        found[lane] = upper * (1.0f - fy) + lower * fy;
     }
-    for (int k = 0; k < 3; ++k) {
-        const v16 top = load16(corner[k]) * (1.0f - fx) + load16(corner[3 + k]) * fx;
-        const v16 bottom = load16(corner[6 + k]) * (1.0f - fx) + load16(corner[9 + k]) * fx;
-        seen[k] = light.intensity * (top * (1.0f - fy) + bottom * fy);
-    }
-    const v16 upper = load16(corner[12]) * (1.0f - fx) + load16(corner[13]) * fx;
-    const v16 lower = load16(corner[14]) * (1.0f - fx) + load16(corner[15]) * fx;
-    return (upper * (1.0f - node_t) + lower * node_t) / (19.7392088f * max16(sin_polar, v16(1e-6f)) * (total > 0.0f ? total : 1.0f));
+    const auto component = [&](int k) -> v16 {
+        const float* const f = (const float*)found + k;
+        return v16{f[0], f[4], f[8], f[12], f[16], f[20], f[24], f[28], f[32], f[36], f[40], f[44], f[48], f[52], f[56], f[60]};
+    };
+    for (int k = 0; k < 3; ++k) seen[k] = light.intensity * component(k);
+    return component(3) / (19.7392088f * max16(sin_polar, v16(1e-6f)) * (total > 0.0f ? total : 1.0f));
 };

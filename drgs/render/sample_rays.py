@@ -265,7 +265,7 @@ def sample_rays(points: ShadingPoints, environment_table: EnvironmentTable, coun
     """
     device = points.normal_world.device
     point_count = len(points.pixel)
-    light = environment_light(None, environment_table)
+    light = environment_light(environment_table)
     direction = torch.empty(point_count, counts.total, 3, device=device)
     weight = torch.empty(point_count, counts.total, device=device)
     inputs = [point_arrays(points), light, sample_set(counts, seed)]

@@ -160,7 +160,7 @@ const auto put = [&](long, i16 live, V3 d, const v16* light_there, const v16* ca
 // 4. Towards the environment.
 v16 u0, u1, reflected[3], incoming[3];
 numbers(16u, u0, u1);
-V3 d = draw_environment(light, u0, u1);
+V3 d = draw_environment(light, u0, u1, outside);
 v16 n_dot_l = dot3(n, d);
 i16 live = outside & (n_dot_l > 0.0f) & (dot3(outward, d) > 0.0f);
 v16 table_pdf = look_up(light, d, live, incoming);

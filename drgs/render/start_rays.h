@@ -77,7 +77,7 @@ sobol_pair(index16, hash_combine(hash_combine(u16(samples.seed), pixel16), strat
 const i16 is_environment = strategy == 2u;
 V3 d = lobe_direction(lobes, u0, u1, strategy == 0u);
 if (any(is_environment)) {
-    const V3 drawn = draw_environment(light, u0, u1);
+    const V3 drawn = draw_environment(light, u0, u1, is_environment);
     d = {select(is_environment, drawn.x, d.x), select(is_environment, drawn.y, d.y), select(is_environment, drawn.z, d.z)};
 }
 d = unit3(d);

@@ -52,7 +52,7 @@ def test_under_a_sun_half_of_the_samples_go_to_the_environment() -> None:
 def test_more_samples_of_the_environment_lower_the_error_under_a_sun() -> None:
     points = points_seen_at([40.0], roughness=0.4, metallic=0.0, copies=400)
     sky = sunny_sky(sun=1e4)
-    light = environment_light(sky, build_environment_table(sky))
+    light = environment_light(build_environment_table(sky))
     starts = RayStarts(points.position_world + 100 * points.normal_world, points.normal_world)
     tracer = build_tracer(sphere_mesh(1, radius=1e-3))
     spread = [
@@ -78,7 +78,7 @@ def test_a_black_sky_sends_no_rays_and_gives_black() -> None:
 def test_sharing_samples_out_by_material_keeps_the_mean(metallic: float, roughness: float) -> None:
     points = points_seen_at([40.0], roughness=roughness, metallic=metallic, copies=400)
     sky = sunny_sky(sun=5.0)
-    light = environment_light(sky, build_environment_table(sky))
+    light = environment_light(build_environment_table(sky))
     starts = RayStarts(points.position_world + 100 * points.normal_world, points.normal_world)
     tracer = build_tracer(sphere_mesh(1, radius=1e-3))
     results = [
@@ -95,7 +95,7 @@ def test_a_mirror_keeps_a_sample_of_the_environment() -> None:
     points = points_seen_at([40.0], roughness=0.1, metallic=1.0, copies=400)
     sky = torch.zeros(32, 64, 3)
     sky[3, 40] = 1e3  # far from the mirror direction
-    light = environment_light(Environment(sky), build_environment_table(Environment(sky)))
+    light = environment_light(build_environment_table(Environment(sky)))
     starts = RayStarts(points.position_world + 100 * points.normal_world, points.normal_world)
     tracer = build_tracer(sphere_mesh(1, radius=1e-3))
     means = [
@@ -108,7 +108,7 @@ def test_a_mirror_keeps_a_sample_of_the_environment() -> None:
 def test_sharing_samples_out_by_material_lowers_the_error_on_metal() -> None:
     points = points_seen_at([40.0], roughness=0.2, metallic=1.0, copies=400)
     sky = sunny_sky(sun=5.0)
-    light = environment_light(sky, build_environment_table(sky))
+    light = environment_light(build_environment_table(sky))
     starts = RayStarts(points.position_world + 100 * points.normal_world, points.normal_world)
     tracer = build_tracer(sphere_mesh(1, radius=1e-3))
     spread = [

@@ -36,7 +36,7 @@ def shade_points(
     lift: float = 100.0,
     memory: RayMemory | None = None,
 ) -> PointLight:
-    light = environment_light(environment, build_environment_table(environment))
+    light = environment_light(build_environment_table(environment))
     starts = RayStarts(points.position_world + lift * points.normal_world, points.normal_world)
     tracer = build_tracer(FAR_AWAY if mesh is None else mesh)
     return shade(points, starts, light, tracer, counts, bounces, seed, samples_round, memory=memory)
@@ -116,7 +116,7 @@ def test_kernel_shades_as_the_reference_does(device: str) -> None:
     sky_there = Environment(sky.radiance.to(device))
     result = shade(
         ShadingPoints(**there), RayStarts(there["position_world"], there["normal_world"]),
-        environment_light(sky_there, build_environment_table(sky_there)), build_tracer(on_device(mesh, device)), counts, 0, 4,
+        environment_light(build_environment_table(sky_there)), build_tracer(on_device(mesh, device)), counts, 0, 4,
     )  # fmt: skip
     for ours, twin in ((result.diffuse, diffuse), (result.specular, specular)):
         difference = (ours.cpu().double() - twin).abs() / (twin.abs() + 1e-2)
@@ -131,7 +131,7 @@ def test_a_half_space_below_the_surface_is_dark() -> None:
     across = torch.nn.functional.normalize(torch.linalg.cross(n, torch.tensor([1.0, 0.0, 0.0]).expand_as(n)), dim=-1)
     triangle = math.cos(math.pi / 3) * n + math.sin(math.pi / 3) * across
     sky = constant_sky()
-    light = environment_light(sky, build_environment_table(sky))
+    light = environment_light(build_environment_table(sky))
     result = shade(
         points, RayStarts(points.position_world + 100 * n, triangle), light, build_tracer(FAR_AWAY), SampleCounts(64, 8, 8), 0, 0
     )
@@ -230,7 +230,7 @@ def test_sixteen_rays_at_once_are_the_rays_one_by_one(by_material: bool, sky: En
     surface = torch.nn.functional.normalize(points.normal_world + 0.3 * torch.randn(points.normal_world.shape), dim=-1)
     counts, first = SampleCounts(7, 3, 5), 45
     rays = (len(points.pixel) - first // counts.total) * counts.total - 6
-    light = environment_light(sky, build_environment_table(sky), rotation_degrees=70.0, intensity=2.0)
+    light = environment_light(build_environment_table(sky), rotation_degrees=70.0, intensity=2.0)
     inputs = [
         first, point_arrays(points), warp_array(points.position_world, wp.vec3), warp_array(surface, wp.vec3),
         warp_array(torch.arange(len(surface)).int()), warp_array(2 * torch.rand(8 * len(surface))), light, sample_set(counts, 11, 3, by_material), 0,
@@ -272,7 +272,7 @@ def test_sixteen_paths_at_once_are_the_paths_one_by_one(depth: int, sky: Environ
     throughput = torch.rand(paths, 3, generator=numbers)
     counts, points = SampleCounts(7, 3, 5), points_seen_at([0.0, 45.0], roughness=0.3, metallic=0.4, copies=40)
     path_ray = torch.sort(torch.randint((len(points.pixel) - 3) * counts.total, (paths,), generator=numbers)).values
-    light = environment_light(sky, build_environment_table(sky), rotation_degrees=70.0, intensity=2.0)
+    light = environment_light(build_environment_table(sky), rotation_degrees=70.0, intensity=2.0)
     inputs = [
         warp_array(path_ray), warp_array(face), warp_array(barycentric, wp.vec2), warp_array(arriving, wp.vec3),
         warp_array(throughput, wp.vec3), 3, depth, paths, point_arrays(points), light,

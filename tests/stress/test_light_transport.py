@@ -44,8 +44,8 @@ def test_the_comparison_with_float64_finds_an_error_of_a_thousandth(monkeypatch:
 
     def wrong(environment: Environment):
         table = honest(environment)
-        if table.nodes.dtype == torch.float32:
-            table.nodes.mul_(1.002)
+        if table.texels.dtype == torch.float32:
+            table.texels[..., 3] *= 1.002
         return table
 
     right = sweeps.against_twin("", points, sky)
