@@ -10,6 +10,7 @@ elevation e is sin^2 e.
 """
 
 import math
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -236,10 +237,9 @@ def _curve_order(points: Tensor) -> Tensor:
     """Places of points (n, 3) along a Z-order curve of 1024 steps a side."""
     low, high = points.amin(0), points.amax(0)
     cell = ((points - low) / (high - low).clamp(min=1e-30) * 1023).long()
-    code = torch.zeros(len(points), dtype=torch.int64, device=points.device)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):  # two empty bits behind each
+        cell = (cell | (cell << shift)) & mask
+    code = cell[:, 0] | (cell[:, 1] << 1) | (cell[:, 2] << 2)
     return torch.argsort(code)
 
 
@@ -261,7 +261,7 @@ def _box_lanes(low: Tensor, high: Tensor) -> Tensor:
 class Horizons:
     """The horizons of a mesh's faces, found a share at a time as rays show that they will be needed. Final.
 
-    Rays pay for them: after each pass as many faces are looked at as make up a fixed share of the pass's own cost. The first TRIAL of
+    Rays pay for them: after each pass but the first as many faces are looked at as make up a fixed share of the pass's own cost. The first TRIAL of
     all faces come in a scattered order, and when they say that hardly a ray would be let off, the search ends; then those that rays
     start from, then the rest.
     """
@@ -280,23 +280,57 @@ class Horizons:
             self.found = len(stored)
             self._open_sky = float((1 - self.sine.square()).clamp(min=0).sum())
             return
-        corners = mesh.vertices.detach().float()[mesh.faces.long()]
-        count = len(corners)
-        self.sine = torch.full((count, SECTORS), BLOCKED, device=corners.device)
+        device = mesh.vertices.device
+        self.sine = torch.full((len(mesh.faces), SECTORS), BLOCKED, device=device)
         self.found = 0
         """Faces looked at so far."""
+        self._mesh = mesh
         self._lift = lift
         self._rays = 0
+        self._again = False
         self._open_sky = 0.0
-        self._known = torch.zeros(count, dtype=torch.bool, device=corners.device)
-        self._order = _curve_order(corners.mean(1)) if count else torch.empty(0, dtype=torch.int64, device=corners.device)
-        self._corners = corners[self._order].contiguous()
-        stride = next(s for s in range(max(1, int(0.618 * count)), count + 2) if math.gcd(s, max(count, 1)) == 1)
-        self._scattered = torch.arange(count, device=corners.device) * stride % max(count, 1)
-        self._place = torch.empty_like(self._order)
-        self._place[self._order] = torch.arange(count, device=corners.device)
-        self._boxes: tuple[Tensor, ...] = ()
-        self._lanes: tuple[Tensor, ...] = ()
+        self._known = torch.zeros(len(mesh.faces), dtype=torch.bool, device=device)
+
+    @cached_property
+    def _corners_by_face(self) -> Tensor:
+        return self._mesh.vertices.detach().float()[self._mesh.faces.long()]
+
+    @cached_property
+    def _order(self) -> Tensor:
+        """(face,) along a curve; places are those in it."""
+        return _curve_order(self._corners_by_face.mean(1))
+
+    @cached_property
+    def _corners(self) -> Tensor:
+        """(face, 3, 3) along the curve."""
+        return self._corners_by_face[self._order].contiguous()
+
+    @cached_property
+    def _scattered(self) -> Tensor:
+        """All places, neighbours far apart."""
+        count = self.faces
+        stride = next(s for s in range(max(1, int(0.618 * count)), count + 2) if math.gcd(s, count) == 1)
+        return torch.arange(count, device=self.sine.device) * stride % count
+
+    @cached_property
+    def _place(self) -> Tensor:
+        """(face,) its place along the curve."""
+        place = torch.empty_like(self._order)
+        place[self._order] = torch.arange(self.faces, device=place.device)
+        return place
+
+    @cached_property
+    def _boxes(self) -> tuple[Tensor, ...]:
+        group = int(GROUP)
+        return (*_boxes(self._corners, group), *_boxes(self._corners, group * int(SUPER)))
+
+    @cached_property
+    def _lanes(self) -> tuple[Tensor, ...]:
+        """What raise_horizons_simd reads: triangles and boxes by sixteens."""
+        group = int(GROUP)
+        padded = torch.cat([self._corners, self._corners[-1:].expand(-self.faces % group, 3, 3)])
+        triangles = padded.view(-1, group, 9).transpose(1, 2).contiguous()  # the last triangle repeated changes nothing
+        return triangles, _box_lanes(*self._boxes[:2]), _box_lanes(*self._boxes[2:])
 
     @property
     def faces(self) -> int:
@@ -311,6 +345,9 @@ class Horizons:
         if self.found == self.faces or self._hopeless():
             return
         self._rays += rays
+        if not self._again:  # a mesh that moves with every frame would pay for nothing
+            self._again = True
+            return
         trial = math.ceil(TRIAL * self.faces) - self.found
         if trial > 0:
             which, price = self._ahead(trial), RAYS_A_FACE
@@ -344,17 +381,11 @@ class Horizons:
         if len(which) == 0 or self._hopeless():
             return
         which = which.int()
-        group, count = int(GROUP), self.faces
-        if not self._boxes:
-            self._boxes = (*_boxes(self._corners, group), *_boxes(self._corners, group * int(SUPER)))
-            padded = torch.cat([self._corners, self._corners[-1:].expand(-count % group, 3, 3)])
-            triangles = padded.view(-1, group, 9).transpose(1, 2).contiguous()  # the last triangle repeated changes nothing
-            self._lanes = (triangles, _box_lanes(*self._boxes[:2]), _box_lanes(*self._boxes[2:]))
-        tangent = torch.empty(count, SECTORS, device=self.sine.device)
+        tangent = torch.empty(self.faces, SECTORS, device=self.sine.device)
         boxes = [warp_array(box, wp.vec3) for box in self._boxes]
         corners, device = [warp_array(which), warp_array(self._corners.view(-1, 3), wp.vec3)], warp_device(tangent)
         if tangent.is_cuda:
-            launch(raise_horizons, len(which), [*corners, count, *boxes, self._lift], [warp_array(tangent.view(-1))], device)
+            launch(raise_horizons, len(which), [*corners, self.faces, *boxes, self._lift], [warp_array(tangent.view(-1))], device)
         else:
             lanes = [warp_array(values.view(-1)) for values in self._lanes]
             launch(raise_horizons_simd, len(which), [*corners, *lanes, self._lift], [warp_array(tangent.view(-1))], device)

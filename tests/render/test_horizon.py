@@ -155,10 +155,19 @@ def test_horizons_are_found_as_rays_pay_for_them() -> None:
     assert horizons.found == horizons.faces and bool((horizons.sine < BLOCKED).all())
 
 
+def test_a_mesh_that_moves_with_every_frame_pays_for_no_search() -> None:
+    horizons = Horizons(sphere_mesh(3), 1e-5)
+    horizons.pay(RAYS_A_FACE * horizons.faces)
+    assert horizons.found == 0
+    horizons.pay(1)
+    assert horizons.found > 0
+
+
 def test_faces_that_rays_start_from_come_first() -> None:
     horizons = Horizons(sphere_mesh(4), 1e-5)
     horizons.find(math.ceil(TRIAL * horizons.faces))
     starts = torch.tensor([7, -1, 300, 7, *range(1000, 2000)], dtype=torch.int32)
+    horizons.pay(1)
     horizons.pay(RAYS_A_FACE * 2000, starts)
     assert bool((horizons.sine[starts[starts >= 0].long()] < BLOCKED).all())
     assert horizons.found < horizons.faces / 2
