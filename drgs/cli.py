@@ -67,6 +67,13 @@ class Denoiser(StrEnum):
     oidn = "oidn"
 
 
+class ToneCurveName(StrEnum):
+    standard = "standard"
+    filmic = "filmic"
+    agx = "agx"
+    neutral = "neutral"
+
+
 class ExportFormat(StrEnum):
     ply = "ply"
     ply3 = "ply3"
@@ -129,6 +136,9 @@ def render(
     bounces: Annotated[int, typer.Option(min=0, help="Indirect bounces.")] = 1,
     primary: Annotated[Primary | None, typer.Option(help="What the camera sees; by default the Gaussians where there are some.")] = None,
     denoise: Annotated[Denoiser, typer.Option()] = Denoiser.none,
+    tone_curve: Annotated[ToneCurveName, typer.Option(help="How bright light is brought to the screen; EXR files stay linear.")] = (
+        ToneCurveName.standard
+    ),
     aov: Annotated[bool, typer.Option("--aov", help="Write <name>.exr with the maps behind the picture, too.")] = False,
     seed: Annotated[int, typer.Option()] = 0,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Picture size instead of the file's.")] = None,
@@ -156,6 +166,7 @@ def render(
         bounces=bounces,
         primary=primary.value if primary else ("gaussians" if scene.surfels is not None else "mesh"),
         denoise=denoise.value,
+        tone_curve=tone_curve.value,
         target_error=error,
         skip=skip,
         seed=seed,

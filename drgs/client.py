@@ -345,7 +345,7 @@ class RemoteSession:
         Args:
             format: exr holds linear radiance.
             world_from_camera: 4x4 OpenGL camera-to-world; the start view when absent.
-            settings: exposure_stops, background, channel, bounces, denoise.
+            settings: exposure_stops, tone_curve, background, channel, bounces, denoise.
         """
         query: dict[str, Any] = {"width": width, "height": height, "spp": spp, **settings}
         if world_from_camera is not None:

@@ -279,6 +279,7 @@ def _render_settings(settings: Settings):
         bounces=_rays_key(settings)[0],
         denoise="svgf" if settings.denoise and settings.channel == "final" else "none",
         exposure=settings.exposure_stops,
+        tone_curve=settings.tone_curve,
         background=background,
     )
 

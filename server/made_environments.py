@@ -11,7 +11,7 @@ import numpy as np
 from drgs.scene.sun_and_sky import HIGHEST, LOWEST, USUAL_ELEVATION, paint_sun_and_sky
 from drgs.scene.three_point_lights import paint_three_point_lights
 
-LISTED = {"sun-and-sky.exr": "Sun and sky", "three-point-lights.exr": "Three-point lights"}
+LISTED = {"sun-and-sky.exr": "Sun and sky", "three-point-lights.exr": "Three-point"}
 """File names and titles of those that the list of environments holds."""
 SIZE = (512, 256)
 """Width and height of all of them."""

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from drgs.scene.edits import Edit
+from drgs.scene.tone_curve import ToneCurve
 from worker.requests import MAX_PICTURE_SAMPLES
 
 PROTOCOL_VERSION = 1
@@ -151,8 +152,10 @@ class Settings(_Message):
     """How this viewer sees the session; each viewer has its own."""
 
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    background: Literal["environment", "transparent"] | Vector = "environment"
-    """A triple is a colour, sRGB 0..1. Transparent arrives as PNG with alpha once converged and over grey while JPEG."""
+    tone_curve: ToneCurve = "standard"
+    """From exposed light to the screen: standard clips, filmic and agx roll highlights off, neutral keeps base colours."""
+    background: Literal["environment", "blurred", "transparent"] | Vector = "environment"
+    """blurred: the environment out of focus, its light as sharp as ever. A triple is a colour, sRGB 0..1. Transparent arrives as PNG with alpha once converged and over grey while JPEG."""
     spp_target: Annotated[int, Field(ge=1, le=MAX_SPP_TARGET)] = 256
     """Rays a pixel at which the picture counts as converged."""
     bounces: Annotated[int, Field(ge=0, le=8)] = 1

@@ -9,6 +9,7 @@ from fastapi.responses import FileResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drgs.scene.edits import Edit
+from drgs.scene.tone_curve import ToneCurve
 from server.answers import session_info, snapshot_info
 from server.context import ServerContext, context_of
 from server.edit_log import EventKind
@@ -136,7 +137,8 @@ class FrameQuery(BaseModel):
     spp: Annotated[int, Field(ge=1, le=65535)] = 128
     bounces: Annotated[int, Field(ge=0, le=8)] = 1
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    background: Literal["environment", "transparent"] = "environment"
+    tone_curve: ToneCurve = "standard"
+    background: Literal["environment", "blurred", "transparent"] = "environment"
     channel: Literal["final", "albedo", "roughness", "metallic", "normal", "depth"] = "final"
     denoise: bool = False
     world_from_camera: Annotated[str, Field(max_length=1000)] | None = None
@@ -176,6 +178,7 @@ async def read_frame(
     camera = camera.model_copy(update={"width": query.width, "height": query.height})  # may be larger than what is streamed
     settings = Settings(
         exposure_stops=query.exposure_stops,
+        tone_curve=query.tone_curve,
         background=query.background,
         spp_target=query.spp,
         bounces=query.bounces,

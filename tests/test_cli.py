@@ -1,5 +1,6 @@
 """The command line keeps its manners: fast help, one sentence for wrong input, clean stdout."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -84,6 +85,29 @@ def test_wrong_edits_are_one_sentence_that_names_the_field(tmp_path: Path):
     result = drgs("render", tmp_path, tmp_path / "out", "--cameras", tmp_path / "transforms.json", "--edits", edits)
     assert_one_sentence(result)
     assert "0..1" in result.stderr
+
+
+def test_render_brings_light_to_the_picture_by_the_curve_that_is_asked_for(tmp_path: Path):
+    from typer.testing import CliRunner
+
+    from drgs.build.import_mesh import import_mesh
+    from drgs.cli import app
+    from drgs.scene.asset import save_asset
+    from tests.web.browser import write_ball
+
+    write_ball(tmp_path / "ball.ply")
+    save_asset(import_mesh(tmp_path / "ball.ply"), tmp_path / "asset")
+    camera = {"file_path": "r_0", "transform_matrix": [[1, 0, 0, 0], [0, 0, -1, -2], [0, 1, 0, 0], [0, 0, 0, 1]]}
+    cameras = tmp_path / "transforms.json"
+    cameras.write_text(json.dumps({"camera_angle_x": 0.6, "frames": [camera]}))
+    pictures = {}
+    for curve in ("standard", "filmic"):
+        arguments = ["render", tmp_path / "asset", tmp_path / curve, "--cameras", cameras, "--size", "16x16", "--spp", "4", "--aov"]
+        result = CliRunner().invoke(app, [*map(str, arguments), "--tone-curve", curve, "--device", "cpu"])
+        assert result.exit_code == 0, result.output
+        pictures[curve] = {path.suffix: path.read_bytes() for path in (tmp_path / curve).iterdir()}
+    assert pictures["standard"][".png"] != pictures["filmic"][".png"]
+    assert pictures["standard"][".exr"] == pictures["filmic"][".exr"], "the light itself is the same"
 
 
 def test_simulate_says_that_it_is_not_there_yet(tmp_path: Path):

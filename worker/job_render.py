@@ -140,7 +140,8 @@ class _Renderer:
             bounces=asked.bounces,
             exposure=asked.exposure_stops,
             denoise="svgf" if asked.denoise else "none",
-            background="environment" if asked.background == "environment" else "transparent",
+            tone_curve=asked.tone_curve,
+            background=asked.background,
         )
         state = start_frame(scene, camera.to(scene.mesh.vertices.device), settings, tracer)
         left, passes = passes_needed(state), 1

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drgs.scene.edits import Edit
+from drgs.scene.tone_curve import ToneCurve
 
 JobKind = Literal["build", "redecouple", "simulate", "render", "export"]
 PresetName = Literal["draft", "fast", "full"]
@@ -156,7 +157,8 @@ class RenderRequest(_Job):
     bounces: Annotated[int, Field(ge=0, le=8)] = 1
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
     denoise: bool = True
-    background: Literal["environment", "transparent"] = "environment"
+    tone_curve: ToneCurve = "standard"
+    background: Literal["environment", "blurred", "transparent"] = "environment"
     video_fps: Annotated[int, Field(ge=1, le=120)] | None = None
     """Also join the pictures of each variant and environment, in the order of the cameras, to an MP4 (H.264)."""
 

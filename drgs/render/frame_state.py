@@ -18,6 +18,7 @@ from drgs.render.trace_primary import PrimaryPoints
 from drgs.render.tracer import AbstractTracer
 from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedScene
+from drgs.scene.tone_curve import ToneCurve
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,9 @@ class RenderSettings:
     seed: int = 0
     exposure: float = 0.0
     """[stops]."""
-    background: Literal["transparent", "environment"] | tuple[float, float, float] = "transparent"
-    """A colour is linear radiance."""
+    tone_curve: ToneCurve = "standard"
+    background: Literal["transparent", "environment", "blurred"] | tuple[float, float, float] = "transparent"
+    """blurred: the environment out of focus; the light stays sharp. A colour is a screen's linear one, which exposure and curve leave alone."""
 
 
 @dataclass(frozen=True, eq=False)

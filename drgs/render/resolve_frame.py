@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from drgs.render.blur_environment import blurred_light
 from drgs.render.converge import mean_variance, tile_errors
 from drgs.render.denoise import denoise
 from drgs.render.denoise_oidn import denoise_oidn
@@ -41,9 +42,9 @@ def resolve_frame(state: FrameState) -> Frame:
     background = _background(state)
     linear = window.pad(shown.diffuse + shown.specular)
     if background is None:
-        rgba = window.pad(tonemap(window.crop(linear), part.coverage, settings.exposure))
+        rgba = window.pad(tonemap(window.crop(linear), part.coverage, settings.exposure, curve=settings.tone_curve))
     else:
-        rgba = tonemap(linear, window.pad(part.coverage), settings.exposure, background)
+        rgba = tonemap(linear, window.pad(part.coverage), settings.exposure, background, settings.tone_curve)
     gbuffer = _padded(part, window) if state.gbuffer is None else state.gbuffer
     shown = replace(shown, **{name: window.pad(value) for name, value in vars(shown).items() if isinstance(value, Tensor)})
     seconds["resolve"] = time.perf_counter() - clock - seconds["denoise"]
@@ -220,11 +221,15 @@ def _background(state: FrameState) -> Tensor | None:
     background = state.settings.background
     if background == "transparent":
         return None
-    if background != "environment":
+    if not isinstance(background, str):
         return torch.tensor(background, device=state.diffuse.device)
+    scene = state.scene
+    light = state.light
+    if background == "blurred":
+        light = blurred_light(scene.environment, scene.environment_rotation_degrees, scene.environment_intensity)
     camera = state.camera
     radiance = state.diffuse.new_empty(camera.height, camera.width, 3)
-    inputs = [camera.width, wp.mat33(*world_from_pixel(camera).flatten().tolist()), state.light]
+    inputs = [camera.width, wp.mat33(*world_from_pixel(camera).flatten().tolist()), light]
     launch(environment_behind, camera.height * camera.width, inputs, [warp_array(radiance.view(-1, 3), wp.vec3)], warp_device(radiance))
     return radiance
 

@@ -9,6 +9,7 @@ from test_rest import is_problem
 from drgs.build.import_mesh import import_mesh
 from drgs.exchange.exr import decode_exr
 from drgs.maths.color import srgb_from_linear
+from drgs.reference.tonemap import apply_tone_curve
 from drgs.scene.asset import save_asset
 from server.drgs_renderer import DrgsRenderer
 from server.messages import CameraMessage, Settings
@@ -57,7 +58,7 @@ def rendered(pose: AbstractPose, **settings) -> tuple[np.ndarray, LinearPixels]:
     return picture.resolve() / 255, picture.linear()
 
 
-@pytest.mark.parametrize("background", ["environment", "transparent"])
+@pytest.mark.parametrize("background", ["environment", "blurred", "transparent"])
 def test_what_a_screen_shows_of_the_linear_picture_is_the_picture(pose: AbstractPose, background: str) -> None:
     shown, linear = rendered(pose, background=background)
     alpha = linear[..., 3:]
@@ -66,6 +67,14 @@ def test_what_a_screen_shows_of_the_linear_picture_is_the_picture(pose: Abstract
     again = srgb_from_linear(torch.from_numpy(straight)).clamp(0, 1).numpy()
     np.testing.assert_allclose(again, shown[..., :3], atol=0.51 / 255)
     np.testing.assert_allclose(alpha[..., 0], shown[..., 3], atol=0.51 / 255)
+
+
+def test_a_tone_curve_is_the_screens_and_no_matter_of_the_light(pose: AbstractPose) -> None:
+    (standard, light), (filmic, same_light) = rendered(pose), rendered(pose, tone_curve="filmic")
+    np.testing.assert_array_equal(light, same_light)
+    exact = srgb_from_linear(apply_tone_curve(torch.from_numpy(light[..., :3]), "filmic").clamp(0, 1)).numpy()
+    np.testing.assert_allclose(filmic[..., :3], exact, atol=0.6 / 255)
+    assert np.abs(filmic - standard)[..., :3].mean() > 0.01
 
 
 def test_a_channel_holds_the_values_themselves(pose: AbstractPose) -> None:

@@ -49,7 +49,7 @@ def test_a_dropped_environment_joins_the_gallery_and_lights_the_object(ball: Vie
         }""",
         list(path.read_bytes()),
     )
-    expect(ball.page.get_by_role("radio", name="Red")).to_be_checked(timeout=30_000)
+    expect(ball.page.get_by_role("radio", name="Red", exact=True)).to_be_checked(timeout=30_000)
     (edit,) = ball.wait_for_edits(1)
     assert edit["file"] == "red.exr"
     wait_for_change(ball, before, "a picture in red light")

@@ -47,15 +47,40 @@ def test_the_token_leaves_the_address_bar_and_a_chosen_mesh_opens(viewer: Viewer
 
 def test_the_local_picture_agrees_with_the_traced_one(viewer: Viewer) -> None:
     traced = viewer.settled_color()
-    # A WebGL canvas may be read only within the frame in which it was drawn: a screenshot reads what is shown.
-    viewer.page.evaluate("document.querySelector('canvas.traced').style.visibility = 'hidden'")
     box = viewer.page.evaluate(
         "(() => { const s = document.querySelector('.stage'); const a = 0.2 * s.clientHeight;"
         " return { x: (s.clientWidth - a) / 2, y: (s.clientHeight - a) / 2, width: a, height: a }; })()"
     )
-    local = mean_color(viewer, box)
-    viewer.page.evaluate("document.querySelector('canvas.traced').style.visibility = ''")
+    local = tuple(local_picture(viewer, box).mean((0, 1)))
     assert difference(local, traced) < 12, f"local {local}, traced {traced}"
+
+
+def test_the_local_picture_agrees_under_another_tone_curve_and_before_a_blurred_sky(viewer: Viewer) -> None:
+    standard = viewer.settled_color()
+    viewer.open_tab("Light")
+    viewer.page.get_by_role("radio", name="Sun and sky").check()
+    viewer.wait_for_edits(1)
+    viewer.page.get_by_role("radio", name="Blurred").check()
+    viewer.page.get_by_label("Exposure, exact value").fill("0.5")
+    viewer.page.get_by_label("Exposure, exact value").press("Enter")
+    stage = viewer.page.evaluate(
+        "(() => { const s = document.querySelector('.stage'); return { x: 0, y: 0, width: s.clientWidth, height: s.clientHeight }; })()"
+    )
+    seen = [standard]
+    for curve in ("Filmic", "AgX", "Neutral"):
+        viewer.page.get_by_role("radio", name=curve).check()
+        seen.append(viewer.settled_color())
+        assert min(difference(seen[-1], other) for other in seen[:-1]) > TOO_SMALL_TO_SEE, "each curve looks different"
+        traced = screenshot(viewer, stage)
+        apart = np.abs(local_picture(viewer, stage) - traced).mean((0, 1))
+        assert apart.max() < 5, f"{curve}: object and background differ by {apart} of 255"
+    viewer.page.get_by_role("radio", name="Standard").check()
+    viewer.page.get_by_role("button", name="Reset exposure").click()
+    viewer.page.get_by_role("radio", name="Light", exact=True).check()
+    viewer.page.get_by_role("button", name="Undo", exact=True).click()
+    viewer.wait_for_edits(0)
+    wait_until(lambda: difference(viewer.settled_color(), standard) < TOO_SMALL_TO_SEE, "the first picture again")
+    viewer.open_tab("Material")
 
 
 def test_orbiting_changes_the_picture_and_reset_brings_it_back(viewer: Viewer) -> None:
@@ -174,7 +199,17 @@ def test_the_page_comes_back_after_a_server_restart_with_its_edits(viewer: Viewe
     viewer.wait_for_edits(len(before) - 1)
 
 
-def mean_color(viewer: Viewer, clip: dict) -> tuple[float, ...]:
-    """Of a part of what the page shows, sRGB 0..255."""
-    picture = Image.open(io.BytesIO(viewer.page.screenshot(clip=clip))).convert("RGB")
-    return tuple(np.asarray(picture, float).mean((0, 1)))
+def local_picture(viewer: Viewer, clip: dict) -> np.ndarray:
+    """(height, width, 3) sRGB 0..255 of a part of what the page shows without the traced picture.
+
+    A WebGL canvas may be read only within the frame in which it was drawn: a screenshot reads what is shown.
+    """
+    viewer.page.evaluate("document.querySelector('canvas.traced').style.visibility = 'hidden'")
+    picture = screenshot(viewer, clip)
+    viewer.page.evaluate("document.querySelector('canvas.traced').style.visibility = ''")
+    return picture
+
+
+def screenshot(viewer: Viewer, clip: dict) -> np.ndarray:
+    """What has begun to fade in counts as faded in."""
+    return np.asarray(Image.open(io.BytesIO(viewer.page.screenshot(clip=clip, animations="disabled"))).convert("RGB"), float)

@@ -100,6 +100,15 @@ def test_a_render_makes_every_picture_once_and_a_video_of_each_row(job: Callable
     assert {path: path.read_bytes() for path in context.files.glob("*.png")} == before
 
 
+def test_a_render_is_exposed_toned_and_backed_as_asked(job: Callable[..., JobContext]) -> None:
+    toned = {"exposure_stops": 1.0, "tone_curve": "neutral", "background": "blurred"}
+    for name, settings in (("plain", {}), ("toned", toned)):
+        context = job(SMALL | settings | {"variants": [{"name": name, "edits": []}]})
+        run(RenderRun(context))
+    plain, bright = (np.asarray(Image.open(path)) for path in sorted(context.files.glob("*.png")))
+    assert bright[..., :3].mean() > plain[..., :3].mean() + 5 and bright[..., 3].min() == 255
+
+
 def test_a_render_stops_between_slices_and_leaves_no_half_picture(job: Callable[..., JobContext]) -> None:
     asked = 0
 

@@ -135,9 +135,10 @@ export function frameQuery(view: View, { width, height }: { width: number; heigh
     spp: String(settings.spp_target),
     bounces: String(settings.bounces),
     exposure_stops: String(settings.exposure_stops),
+    tone_curve: settings.tone_curve ?? 'standard',
     channel: settings.channel ?? 'final',
     denoise: String(settings.denoise),
-    background: transparent ? 'transparent' : 'environment',
+    background: transparent ? 'transparent' : settings.background === 'blurred' ? 'blurred' : 'environment',
     fov_y_degrees: String(view.fov_y_degrees),
     world_from_camera: view.world_from_camera.flat().join(','),
   });

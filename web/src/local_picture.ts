@@ -2,12 +2,14 @@
  * The instant picture: the asset's mesh, lit by the environment through three.js, drawn while the traced frame is on its way.
  *
  * It shows no shadows and no inter-reflection; everything else agrees with the server's picture: camera, vertex materials,
- * exposure, sRGB curve with clipping. three.js looks environments up with y up, we have z up, and the light can turn: instead of
+ * exposure, tone curve, sRGB. three.js looks environments up with y up, we have z up, and the light can turn: instead of
  * turning the environment, `lightFromWorld` turns object and camera together into the environment's own frame, which leaves one
  * matrix to be right instead of one convention per kind of environment map.
  */
 
 import {
+  ACESFilmicToneMapping,
+  AgXToneMapping,
   BufferAttribute,
   BufferGeometry,
   Color,
@@ -20,9 +22,11 @@ import {
   Matrix4,
   Mesh,
   MeshStandardMaterial,
+  NeutralToneMapping,
   PerspectiveCamera,
   PMREMGenerator,
   Raycaster,
+  RepeatWrapping,
   RGBAFormat,
   Scene,
   SphereGeometry,
@@ -37,8 +41,15 @@ import {
 import { EXRLoader } from 'three/examples/jsm/loaders/EXRLoader.js';
 import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
 import { HDRLoader } from 'three/examples/jsm/loaders/HDRLoader.js';
+import { blurEnvironment, BLURRED_HEIGHT } from './blur';
 import { srgbFromLinear, type Triple } from './color';
 import { nearestVertex, type MaterialMean, type Materials, type RestMesh } from './materials';
+import type { Settings } from './protocol.gen';
+
+type Background = Required<Settings>['background'];
+type ToneCurve = Required<Settings>['tone_curve'];
+/** The server's curves: drgs/render/tonemap.py has these very formulas. `standard` is exposure, then clipping. */
+const TONE_MAPPING = { standard: LinearToneMapping, filmic: ACESFilmicToneMapping, agx: AgXToneMapping, neutral: NeutralToneMapping } as const;
 
 const lightFromYUp = new Matrix4().makeRotationX(-Math.PI / 2); // (x, y, z) -> (x, z, -y)
 
@@ -51,7 +62,9 @@ export class LocalPicture {
   private readonly pmrem: PMREMGenerator;
   private radiance: WebGLRenderTarget | null = null;
   private sky: Texture | null = null;
-  private background: 'environment' | 'transparent' | Triple = 'environment';
+  /** The sky out of focus, once it was asked for. */
+  private softSky: Texture | null = null;
+  private background: Background = 'environment';
   private readonly uniforms = {
     /** Strength 0..1 of the selection's colour, and 1 where nothing else is to be drawn. */
     highlight: { value: 0 },
@@ -66,7 +79,6 @@ export class LocalPicture {
   constructor(readonly canvas: HTMLCanvasElement) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true, powerPreference: 'low-power' });
     this.renderer.outputColorSpace = SRGBColorSpace;
-    this.renderer.toneMapping = LinearToneMapping; // exposure, then clipping: what the server does
     this.pmrem = new PMREMGenerator(this.renderer);
     this.root.matrixAutoUpdate = false;
     this.eye.matrixAutoUpdate = false;
@@ -212,6 +224,7 @@ export class LocalPicture {
     eye.lookAt(0, 0, 0);
     scene.add(ball);
     this.resize(side, side, 1);
+    this.renderer.toneMapping = LinearToneMapping;
     this.renderer.toneMappingExposure = 1;
     const flat = document.createElement('canvas');
     flat.width = flat.height = side;
@@ -234,16 +247,16 @@ export class LocalPicture {
     this.showEnvironment(await loader.setDataType(FloatType).loadAsync(url));
   }
 
-  setBackground(background: 'environment' | 'transparent' | Triple): void {
+  setBackground(background: Background): void {
     // A colour is shown by the page behind the canvas: tone mapping would alter it here.
     this.background = background;
   }
 
   /** Draw what `camera` sees (world, z up); left of the share `split` of the width as captured. */
-  render(camera: PerspectiveCamera, near: number, far: number, rotationDegrees: number, intensity: number, stops: number, highlight: number, onlyHighlight: boolean, split: number | null = null): void {
+  render(camera: PerspectiveCamera, near: number, far: number, rotationDegrees: number, intensity: number, stops: number, curve: ToneCurve, highlight: number, onlyHighlight: boolean, split: number | null = null): void {
     this.uniforms.highlight.value = highlight;
     this.uniforms.onlyHighlight.value = onlyHighlight ? 1 : 0;
-    this.scene.background = this.background === 'environment' && !onlyHighlight ? this.sky : null;
+    this.scene.background = onlyHighlight ? null : this.background === 'environment' ? this.sky : this.background === 'blurred' ? this.blurredSky() : null;
     const lightFromWorld = new Matrix4().makeRotationZ((-rotationDegrees * Math.PI) / 180).premultiply(lightFromYUp);
     this.root.matrix.copy(lightFromWorld);
     this.root.matrixWorldNeedsUpdate = true;
@@ -254,6 +267,7 @@ export class LocalPicture {
     this.eye.updateProjectionMatrix();
     this.eye.matrix.multiplyMatrices(lightFromWorld, camera.matrixWorld);
     this.eye.matrixWorldNeedsUpdate = true;
+    this.renderer.toneMapping = TONE_MAPPING[curve];
     this.renderer.toneMappingExposure = 2 ** stops;
     this.scene.environmentIntensity = intensity;
     this.scene.backgroundIntensity = intensity;
@@ -280,6 +294,7 @@ export class LocalPicture {
   dispose(): void {
     this.radiance?.dispose();
     this.sky?.dispose();
+    this.softSky?.dispose();
     this.pmrem.dispose();
     this.renderer.dispose();
   }
@@ -291,9 +306,23 @@ export class LocalPicture {
     const radiance = this.pmrem.fromEquirectangular(sky);
     this.radiance?.dispose();
     this.sky?.dispose();
+    this.softSky?.dispose();
     this.radiance = radiance;
     this.sky = sky;
+    this.softSky = null;
     this.scene.environment = radiance.texture;
+  }
+
+  private blurredSky(): Texture | null {
+    const { data, width, height } = (this.sky?.image ?? {}) as { data?: unknown; width: number; height: number };
+    if (this.softSky || !(data instanceof Float32Array)) return this.softSky ?? this.sky;
+    const soft = new DataTexture(blurEnvironment(data, width, height), 2 * BLURRED_HEIGHT, BLURRED_HEIGHT, RGBAFormat, FloatType);
+    soft.mapping = EquirectangularReflectionMapping;
+    soft.wrapS = RepeatWrapping;
+    soft.minFilter = soft.magFilter = LinearFilter;
+    soft.needsUpdate = true;
+    this.softSky = soft;
+    return soft;
   }
 
   /** Teach the standard material to take roughness and metallic from vertices, as the asset's mesh holds them. */

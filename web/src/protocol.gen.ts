@@ -474,7 +474,8 @@ export interface RenderRequest {
   bounces?: number;
   exposure_stops?: number;
   denoise?: boolean;
-  background?: "environment" | "transparent";
+  tone_curve?: "standard" | "filmic" | "agx" | "neutral";
+  background?: "environment" | "blurred" | "transparent";
   /** Also join the pictures of each variant and environment, in the order of the cameras, to an MP4 (H.264). */
   video_fps?: number | null;
 }
@@ -555,8 +556,10 @@ export interface SessionRequest {
 /** How this viewer sees the session; each viewer has its own. */
 export interface Settings {
   exposure_stops?: number;
-  /** A triple is a colour, sRGB 0..1. Transparent arrives as PNG with alpha once converged and over grey while JPEG. */
-  background?: "environment" | "transparent" | [number, number, number];
+  /** From exposed light to the screen: standard clips, filmic and agx roll highlights off, neutral keeps base colours. */
+  tone_curve?: "standard" | "filmic" | "agx" | "neutral";
+  /** blurred: the environment out of focus, its light as sharp as ever. A triple is a colour, sRGB 0..1. Transparent arrives as PNG with alpha once converged and over grey while JPEG. */
+  background?: "environment" | "blurred" | "transparent" | [number, number, number];
   /** Rays a pixel at which the picture counts as converged. */
   spp_target?: number;
   /** Indirect bounces; 0 is direct light with shadows only. */

@@ -28,7 +28,7 @@ const withoutNulls = <T>(value: T): T =>
   (Array.isArray(value) ? value.map(withoutNulls) : value && typeof value === 'object' ? Object.fromEntries(Object.entries(value).filter(([, entry]) => entry !== null).map(([key, entry]) => [key, withoutNulls(entry)])) : value) as T;
 
 export function asPython({ origin, asset, edits, view, settings }: Scene): string {
-  const frame = view && [`width=${view.width}`, `height=${view.height}`, `spp=${settings.spp_target}`, `fov_y_degrees=${view.fov_y_degrees}`, `exposure_stops=${settings.exposure_stops}`];
+  const frame = view && [`width=${view.width}`, `height=${view.height}`, `spp=${settings.spp_target}`, `fov_y_degrees=${view.fov_y_degrees}`, `exposure_stops=${settings.exposure_stops}`, `tone_curve=${python(settings.tone_curve)}`, ...(settings.background === 'blurred' ? ['background="blurred"'] : [])];
   return [
     'import os',
     'from pathlib import Path',

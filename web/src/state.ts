@@ -60,7 +60,7 @@ export const selectionWeights = weights;
 export const mean = computed<MaterialMean>(() => (materials.value && weights.value && meanMaterial(materials.value, weights.value)) || NEUTRAL);
 const NEUTRAL: MaterialMean = { albedo: [0.5, 0.5, 0.5], roughness: 0.5, metallic: 0 };
 
-export const settings = signal<Required<Settings>>({ exposure_stops: 0, background: 'environment', spp_target: 256, bounces: 1, channel: 'final', denoise: true });
+export const settings = signal<Required<Settings>>({ exposure_stops: 0, tone_curve: 'standard', background: 'environment', spp_target: 256, bounces: 1, channel: 'final', denoise: true });
 
 export interface Notice {
   id: number;

@@ -216,7 +216,7 @@ export class Viewport {
   private followState(): void {
     let last: unknown[] = [];
     effect(() => {
-      const now = [edits.value, settings.value.exposure_stops, settings.value.background, settings.value.channel, settings.value.denoise];
+      const now = [edits.value, settings.value.exposure_stops, settings.value.tone_curve, settings.value.background, settings.value.channel, settings.value.denoise];
       if (now.some((value, i) => value !== last[i])) {
         // Settings renumber the camera; the next animation frame asks by which number.
         if (now.slice(1).some((value, i) => value !== last[i + 1])) this.cameraNumber = -1;
@@ -380,7 +380,7 @@ export class Viewport {
     const { radius, center } = this.bounds;
     const distance = this.camera.position.distanceTo(center);
     const { rotation, intensity } = light.value;
-    this.local!.render(this.camera, Math.max(0.002 * radius, distance - 1.5 * radius), distance + 1.5 * radius, rotation, intensity, settings.value.exposure_stops, strength, overlay, this.splitAt);
+    this.local!.render(this.camera, Math.max(0.002 * radius, distance - 1.5 * radius), distance + 1.5 * radius, rotation, intensity, settings.value.exposure_stops, settings.value.tone_curve, strength, overlay, this.splitAt);
     this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
   }
 

@@ -33,7 +33,8 @@ async function renderFilm(what: string, way: Pick<RenderRequest, 'turntable' | '
     spp: Number(quality.value),
     bounces: settings.value.bounces,
     exposure_stops: settings.value.exposure_stops,
-    background: settings.value.background === 'environment' ? 'environment' : 'transparent',
+    tone_curve: settings.value.tone_curve,
+    background: Array.isArray(settings.value.background) ? 'transparent' : settings.value.background,
   });
 }
 

@@ -4,6 +4,7 @@ import { useRef } from 'preact/hooks';
 import * as api from '../api';
 import { type Triple } from '../color';
 import { takeFile } from '../jobs';
+import { elevationOf, LOWEST_SUN, HIGHEST_SUN, SUN_AND_SKY, sunAndSky, USUAL_SUN } from '../sun_and_sky';
 import { changeSettings, editLight, useCapturedLight } from '../session';
 import { capturedLight, environments, light, settings } from '../state';
 import { Choice, Section, Slider } from './fields';
@@ -13,6 +14,7 @@ export function LightPanel() {
   return (
     <>
       <Environment />
+      <Picture />
       <Background />
     </>
   );
@@ -21,10 +23,11 @@ export function LightPanel() {
 function Environment() {
   const file = useRef<HTMLInputElement>(null);
   const { rotation, intensity, file: current } = light.value;
-  const stops = settings.value.exposure_stops;
+  const elevation = elevationOf(current);
+  const wantedElevation = useRef(USUAL_SUN);
   const tile = (name: string | null, title: string, picture: string | null, choose: () => void) => (
     <label class="tile" title={title}>
-      <input type="radio" name="environment" checked={current === name} onChange={choose} />
+      <input type="radio" name="environment" checked={current === name || (name === SUN_AND_SKY && elevation !== null)} onChange={choose} />
       {picture ? <img src={picture} alt="" loading="lazy" /> : <span class="no-light" aria-hidden="true" />}
       <span>{title}</span>
     </label>
@@ -33,7 +36,7 @@ function Environment() {
     <Section title="Light">
       <div class="gallery" role="radiogroup" aria-label="Environment">
         {tile(null, 'Captured', capturedLight.value, useCapturedLight)}
-        {environments.value.map((environment) => tile(environment.name, environment.title, api.environmentThumb(environment.name), () => editLight({ file: environment.name })))}
+        {environments.value.map((environment) => tile(environment.name, environment.title, api.environmentThumb(environment.name === SUN_AND_SKY && elevation !== null ? current! : environment.name), () => editLight({ file: environment.name })))}
         <button class="tile add" title="Add an EXR or HDR; or drop one on the page" onClick={() => file.current?.click()}>
           <Icon name="plus" />
           <span>Add…</span>
@@ -52,10 +55,43 @@ function Environment() {
           }}
         />
       </div>
+      {elevation !== null && (
+        <Slider
+          label="Sun height"
+          unit="°"
+          value={elevation}
+          min={LOWEST_SUN}
+          max={HIGHEST_SUN}
+          step={1}
+          onChange={(value) => (wantedElevation.current = Math.round(value))}
+          onCommit={() => editLight({ file: sunAndSky(wantedElevation.current) })}
+          onReset={elevation !== USUAL_SUN ? () => editLight({ file: SUN_AND_SKY }) : undefined}
+        />
+      )}
       <Slider label="Rotation" unit="°" value={rotation} min={0} max={360} step={1} onChange={(value) => editLight({ rotation: value })} onReset={rotation ? () => editLight({ rotation: 0 }) : undefined} />
       <Slider label="Intensity" unit="×" value={intensity} min={0} max={4} step={0.01} onChange={(value) => editLight({ intensity: value })} onReset={intensity !== 1 ? () => editLight({ intensity: 1 }) : undefined} />
+      <p class="hint">Alt+drag on the picture turns the light{elevation !== null && ', and the sun with it'}.</p>
+    </Section>
+  );
+}
+
+function Picture() {
+  const { exposure_stops: stops, tone_curve: curve } = settings.value;
+  return (
+    <Section title="Exposure and tone">
       <Slider label="Exposure" unit="EV" value={stops} min={-4} max={4} step={0.05} onChange={(value) => changeSettings({ exposure_stops: value })} onReset={stops ? () => changeSettings({ exposure_stops: 0 }) : undefined} />
-      <p class="hint">Alt+drag on the picture turns the light. Exposure is the camera’s: it is yours alone and no edit.</p>
+      <Choice
+        label="Tone curve"
+        value={curve}
+        options={[
+          { value: 'standard', text: 'Standard', title: 'None: colours as they are, and what is brighter than white clips' },
+          { value: 'neutral', text: 'Neutral', title: 'Khronos PBR Neutral: base colours as they are, highlights compressed' },
+          { value: 'filmic', text: 'Filmic', title: 'ACES: contrasty, highlights roll off softly' },
+          { value: 'agx', text: 'AgX', title: 'Low contrast, bright colours fade to white' },
+        ]}
+        onChange={(value) => changeSettings({ tone_curve: value })}
+      />
+      <p class="hint">These are the camera’s: yours alone, and no edits. EXR files stay linear.</p>
     </Section>
   );
 }
@@ -77,6 +113,7 @@ function Background() {
           value={kind}
           options={[
             { value: 'environment', text: 'Light', title: 'Show the environment' },
+            { value: 'blurred', text: 'Blurred', title: 'Show the environment out of focus; its light stays sharp' },
             { value: 'colour', text: 'Colour' },
             { value: 'transparent', text: 'None', title: 'Transparent in a saved PNG' },
           ]}
