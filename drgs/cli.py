@@ -268,7 +268,7 @@ def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
     if as_json:
         print(json.dumps(report))
     elif report["ok"]:
-        _print_document({name: value for name, value in report.items() if name not in ("findings", "advice")}, as_json)
+        _print_document({name: value for name, value in report.items() if name not in ("findings", "advice", "summary")}, as_json)
         for line in [f"{finding['level']}: {finding['sentence']}" for finding in report["findings"]] + report["advice"]:
             print(line)
     else:

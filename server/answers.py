@@ -9,6 +9,7 @@ from sqlalchemy import Row, func
 from drgs.scene.edits import parse_edits
 from server.rest_records import AssetInfo, JobInfo, SessionInfo, SnapshotInfo
 from server.sessions import LiveSession
+from worker.capture_report import CaptureReport
 from worker.database import AssetRow, JobRow, SnapshotRow
 from worker.queue import JobStatus
 
@@ -59,6 +60,7 @@ def job_info(row: JobRow | Row, status: JobStatus) -> JobInfo:
         source_asset=row.source_asset,
         clip=f"clips/{row.id}" if row.kind == "simulate" and status.state == "done" else None,
         error=error if status.state == "failed" else None,
+        capture=CaptureReport.model_validate(row.capture_report) if row.capture_report is not None else None,
         preview_version=row.preview_version,
     )
 

@@ -34,6 +34,16 @@ _JOB = {
     "source_asset": None,
     "clip": None,
     "error": None,
+    "capture": {
+        "summary": "64 pictures of 800x800 with masks; the object fills 21 % of them.",
+        "findings": [
+            {
+                "level": "warning",
+                "sentence": "No view from azimuths within 40 degrees of 120.",
+                "advice": "Add pictures from there: that side's shape and material will be guessed.",
+            }
+        ],
+    },
     "preview_version": 12,
 }
 _ASSET = {

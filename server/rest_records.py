@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from drgs.scene.edits import Edit
 from server.messages import Row
+from worker.capture_report import CaptureReport
 from worker.requests import (
     BuildRequest,
     ExportRequest,
@@ -57,6 +58,8 @@ class JobInfo(_Body):
     """What a `pose` edit names to show a simulation; set when done."""
     error: str | None
     """A sentence, when failed."""
+    capture: CaptureReport | None
+    """What `drgs doctor` finds in the capture of a build; there soon after it began."""
     preview_version: int
     """Rises with each new preview picture; 0 while there is none. Use it to get round the browser's cache."""
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 
+from worker.capture_report import CaptureReport, examine_capture
+
 DEFAULT_BUILDER = "worker.builders:build_with_drgs"
 BUILDER_VARIABLE = "DRGS_BUILDER"
 """Environment variable `module:function`."""
@@ -43,7 +45,7 @@ class BuildRequest:
 
 @dataclass(frozen=True)
 class BuildProgress:
-    """How far a build is; the fields of drgs.build.build_asset.Progress."""
+    """How far a build is; the fields of drgs.build.build_asset.Progress, and what was found before it began."""
 
     stage: str
     iteration: int
@@ -54,6 +56,8 @@ class BuildProgress:
     message: str = ""
     eta_seconds: float | None = None
     preview_jpeg: bytes | None = None
+    capture: CaptureReport | None = None
+    """What the doctor found; told once, before the capture is read for the build."""
 
 
 Builder = Callable[[BuildRequest, Callable[[BuildProgress], None], Callable[[], bool]], Iterator[str]]
@@ -74,14 +78,18 @@ def find_builder() -> Builder:
 
 
 def build_with_drgs(request: BuildRequest, progress: Callable[[BuildProgress], None], should_stop: Callable[[], bool]) -> Iterator[str]:
-    """drgs.build.build_asset.build_stages, resumed from its checkpoints where there are some."""
+    """drgs.build.doctor's report, then drgs.build.build_asset.build_stages, resumed from its checkpoints where there are some."""
     from drgs.build import build_asset as build
 
     settings = build.BuildSettings(request.preset, request.binding, request.device, request.seed, resume=True, materials=request.materials)
 
     def report(made: build.Progress) -> None:
-        progress(BuildProgress(**{entry.name: getattr(made, entry.name) for entry in fields(BuildProgress)}))
+        progress(BuildProgress(**{entry.name: getattr(made, entry.name) for entry in fields(made)}))
 
+    if request.materials is None:  # else another build did, whose geometry this one is on
+        progress(BuildProgress("read", 0, 0, 0.0, message="checking the capture"))
+        capture = examine_capture(request.dataset, Path(f"{request.out}.build") / "capture.json")
+        progress(BuildProgress("read", 0, 0, 0.0, capture=capture))
     try:
         for stage, _ in build.build_stages(request.dataset, request.out, settings, progress=report, should_stop=should_stop):
             yield stage

@@ -88,6 +88,8 @@ class JobRow(Base):
     preview_version: Mapped[int] = mapped_column(default=0)
     asset_id: Mapped[str | None]
     error: Mapped[str | None]
+    capture_report: Mapped[dict | None] = mapped_column(JSON)
+    """worker.capture_report.CaptureReport of a build, once its capture was looked at."""
 
     @property
     def source_asset(self) -> str | None:

@@ -219,6 +219,8 @@ def _progress_writer(job_id: str) -> Callable[[BuildProgress], None]:
             draft.write_bytes(progress.preview_jpeg)
             draft.rename(preview)
             values["preview_version"] = JobRow.preview_version + 1
+        elif progress.capture is not None:
+            values["capture_report"] = progress.capture.model_dump()
         elif progress.stage == stage and time.monotonic() - written_at < PROGRESS_SECONDS:
             return
         written_at, stage = time.monotonic(), progress.stage

@@ -3,7 +3,7 @@
 In: a folder. Out: plain JSON data. A folder that cannot be read is a finding, not an exception.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +34,10 @@ POOR_AGREEMENT = 0.85
 """Intersection over union of a mask with what all masks together say."""
 TILTED_UP = 30.0
 """[degrees]"""
+WHAT_IS_READ = (
+    "Mend that first. A capture is a folder with transforms_train.json (NeRF-synthetic), transforms.json (nerfstudio), "
+    "sparse/ and images/ (COLMAP) or NeRO's cameras, and with all pictures that these name."
+)
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,8 @@ def doctor(folder: Path) -> dict[str, Any]:
         views = read_pictures(capture, EXAMINED_SIDE)
         points = initial_points(views, EXAMINED_POINTS, seed=0)
     except ValueError as error:
-        return {"ok": False, "folder": str(folder), "findings": [{"level": "error", "sentence": str(error)}], "advice": []}
+        finding = {"level": "error", "sentence": str(error), "advice": WHAT_IS_READ}
+        return {"ok": False, "folder": str(folder), "summary": "", "findings": [finding], "advice": [WHAT_IS_READ]}
 
     report: dict[str, Any] = {"ok": True, "folder": str(folder), "source": capture.source, "views": len(capture.photographs)}
     findings: list[Finding] = []
@@ -67,9 +72,17 @@ def doctor(folder: Path) -> dict[str, Any]:
         report[section], found = examine()
         findings += found
     report["size"] = report.pop("pictures")["size"]
-    report["findings"] = [{"level": finding.level, "sentence": finding.sentence} for finding in findings]
+    report["summary"] = _summary(report)
+    report["findings"] = [asdict(finding) for finding in findings]
     report["advice"] = [finding.advice for finding in findings if finding.advice]
     return report
+
+
+def _summary(report: dict[str, Any]) -> str:
+    width, height = report["size"]
+    masks = report["masks"]
+    about = f"with masks; the object fills {100 * masks['mean_coverage']:.0f} % of them" if masks["present"] else "without masks"
+    return f"{report['views']} pictures of {width}x{height} {about}."
 
 
 _Section = tuple[dict[str, Any], list[Finding]]

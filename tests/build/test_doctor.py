@@ -20,6 +20,7 @@ def test_a_good_capture_is_reported_without_warnings(tmp_path: Path) -> None:
     assert json.loads(json.dumps(report)) == report
     assert report["ok"]
     assert _sentences(report) == "" and report["advice"] == []
+    assert report["summary"].startswith(f"{tiny.VIEWS} pictures of {tiny.WIDTH}x{tiny.HEIGHT} with masks; the object fills ")
     assert (report["source"], report["views"], report["size"]) == ("nerf-synthetic", tiny.VIEWS, [tiny.WIDTH, tiny.HEIGHT])
     assert report["intrinsics"]["field_of_view_degrees"] == pytest.approx(np.degrees(2 * np.arctan(0.5 * tiny.WIDTH / tiny.FX)), abs=0.01)
     assert report["scale"]["camera_distance"] == pytest.approx([3 - 0.27, 3 + 0.27], abs=0.1)
@@ -32,6 +33,7 @@ def test_a_folder_that_cannot_be_read_is_a_finding(tmp_path: Path) -> None:
     report = doctor(tmp_path / "nowhere")
     assert not report["ok"]
     assert "no such folder" in _sentences(report, "error")
+    assert "transforms.json" in report["findings"][0]["advice"] == report["advice"][0]
     folder = tiny.write_nerf_synthetic(tmp_path / "capture")
     (folder / "train" / "r_003.png").unlink()
     assert "r_003.png (or .jpg, .webp): no such image" in _sentences(doctor(folder), "error")

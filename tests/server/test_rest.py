@@ -60,6 +60,16 @@ def test_an_uploaded_capture_becomes_a_queued_job(service: Service) -> None:
     assert service.client.post(f"/api/jobs/{job['id']}/retry").json()["state"] == "queued"
 
 
+def test_a_job_tells_what_was_found_in_its_capture(service: Service) -> None:
+    job = submit(service, zipped({"transforms.json": b"{}"})).json()
+    assert job["capture"] is None
+    found = {"summary": "4 pictures.", "findings": [{"level": "warning", "sentence": "4 views are few.", "advice": "Take more."}]}
+    with Session(service.context.engine) as session, session.begin():
+        session.get_one(JobRow, job["id"]).capture_report = found
+    assert service.client.get(f"/api/jobs/{job['id']}").json()["capture"] == found
+    assert service.client.get("/api/jobs").json()["jobs"][0]["capture"] == found
+
+
 def test_the_same_idempotency_key_gives_the_same_job(service: Service) -> None:
     body = zipped({"transforms.json": b"{}"})
     first, second = (

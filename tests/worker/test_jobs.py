@@ -101,11 +101,13 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 
 def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:
-    job = bench.submit()
+    found = {"summary": "4 pictures.", "findings": [{"level": "warning", "sentence": "4 views are few.", "advice": "Take more."}]}
+    job = bench.submit(found=found)
     assert bench.state(job) == "queued"
     bench.start_worker()
     bench.wait_for(job, "done")
     row = bench.row(job)
+    assert row.capture_report == found, "kept, though told right after other progress"
     assert (row.asset_id, row.fraction, row.attempts, row.error) == (job, 1.0, 1, None)
     assert row.preview_version == 3 and bench.directory.preview(job).read_bytes() == b"\xff\xd8tiny"
     assert (bench.directory.asset(job) / "asset.json").exists()

@@ -1,7 +1,7 @@
 """A builder that takes as long as its capture says, keeps a checkpoint, and writes down every iteration that it runs.
 
 The capture holds plan.json: {"iterations" (of the fit), "seconds" (each), "fail" (sentence), "die_at" (iteration at which the process
-kills itself), "stage_seconds" (of every other stage)}. Each stage that really runs is written to stages.txt.
+kills itself), "stage_seconds" (of every other stage), "found" (report on the capture)}. Each stage that really runs is written to stages.txt.
 """
 
 import json
@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from worker.builders import STAGES, BuildProgress, BuildRequest, BuildStopped
+from worker.capture_report import CaptureReport
 
 
 def build(request: BuildRequest, progress: Callable[[BuildProgress], None], should_stop: Callable[[], bool]) -> Iterator[str]:
@@ -39,6 +40,8 @@ def other_stage(folder: Path, stage: str, plan: dict, work: Path, progress, shou
         return
     note(folder, stage, "begins")
     progress(BuildProgress(stage, 0, 0, 0.0))
+    if stage == "read" and "found" in plan:
+        progress(BuildProgress(stage, 0, 0, 0.0, capture=CaptureReport.model_validate(plan["found"])))
     until = time.monotonic() + plan.get("stage_seconds", 0)
     while time.monotonic() < until:
         if should_stop():

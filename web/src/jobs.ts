@@ -1,7 +1,7 @@
 /** Builds, assets and environments: what the server holds, kept up to date by asking. */
 
 import * as api from './api';
-import type { AssetInfo, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
+import type { AssetInfo, BuildRequest, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
 import { editLight, openAsset } from './session';
 import { assets, attempt, environments, jobs, notify, psnrCurves, session, workersAlive } from './state';
 
@@ -87,12 +87,13 @@ async function follow(started: Promise<JobInfo>): Promise<JobInfo | null> {
   return job;
 }
 
-export const buildSample = (preset: Preset) => follow(api.startJob({ dataset: 'sample', preset }));
+export const buildSample = (choice: BuildChoice) => follow(api.startJob({ dataset: 'sample', ...choice }));
 /** Jobs that make no asset: the list shows them. */
 export const startJob = (request: RenderRequest | SimulateRequest) => follow(api.startJob(request));
 export const resume = (job: JobInfo) => follow(api.resumeJob(job.id));
 export const retry = (job: JobInfo) => follow(api.retryJob(job.id));
-export type Preset = 'draft' | 'fast' | 'full';
+/** How a capture becomes an asset. */
+export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding'>>;
 
 export async function cancel(job: JobInfo): Promise<void> {
   await attempt(api.cancelJob(job.id));
@@ -105,7 +106,7 @@ export async function remove(job: JobInfo): Promise<void> {
 }
 
 /** Take a dropped or chosen file by what its name says it is; returns what was made of it. */
-export async function takeFile(file: File, preset: Preset, onProgress: (share: number) => void): Promise<'environment' | 'asset' | 'build' | null> {
+export async function takeFile(file: File, choice: BuildChoice, onProgress: (share: number) => void): Promise<'environment' | 'asset' | 'build' | null> {
   const name = file.name.toLowerCase();
   if (/\.(exr|hdr)$/.test(name)) {
     const added = await attempt(api.uploadEnvironment(file, onProgress));
@@ -122,7 +123,7 @@ export async function takeFile(file: File, preset: Preset, onProgress: (share: n
     return 'asset';
   }
   if (name.endsWith('.zip')) {
-    await follow(api.uploadCapture(file, preset, onProgress));
+    await follow(api.uploadCapture(file, choice, onProgress));
     return 'build';
   }
   notify(`“${file.name}” is none of the kinds that can be dropped here: a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr).`);

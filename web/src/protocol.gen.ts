@@ -146,6 +146,22 @@ export interface CameraPath {
   keyframes: CameraKeyframe[];
 }
 
+/** One thing that helps or hurts a build. */
+export interface CaptureFinding {
+  /** error: there is nothing to build from. */
+  level: "error" | "warning" | "info";
+  sentence: string;
+  /** What to do about it; may be empty. */
+  advice: string;
+}
+
+/** Of `drgs doctor`. */
+export interface CaptureReport {
+  /** How many pictures of what size and with what around them; empty where the capture cannot be read. */
+  summary: string;
+  findings: CaptureFinding[];
+}
+
 /** First message of a client; nothing else is answered before it. */
 export interface ClientHello {
   type: "hello";
@@ -332,6 +348,8 @@ export interface JobInfo {
   clip: string | null;
   /** A sentence, when failed. */
   error: string | null;
+  /** What `drgs doctor` finds in the capture of a build; there soon after it began. */
+  capture: CaptureReport | null;
   /** Rises with each new preview picture; 0 while there is none. Use it to get round the browser's cache. */
   preview_version: number;
 }

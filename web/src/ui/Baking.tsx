@@ -3,7 +3,8 @@
 import { computed } from '@preact/signals';
 import { cancel, isActive } from '../jobs';
 import { jobs, session } from '../state';
-import { Bar, duration } from './Library';
+import { Bar } from './fields';
+import { duration } from './Jobs';
 
 const baking = computed(() => jobs.value.filter((job) => job.kind === 'simulate' && job.source_asset === session.value?.asset && isActive(job)));
 

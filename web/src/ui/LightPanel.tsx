@@ -51,7 +51,7 @@ function Environment() {
           onChange={(event) => {
             const chosen = event.currentTarget.files?.[0];
             event.currentTarget.value = '';
-            if (chosen) void takeFile(chosen, 'fast', () => {});
+            if (chosen) void takeFile(chosen, { preset: 'fast', binding: 'particles' }, () => {});
           }}
         />
       </div>

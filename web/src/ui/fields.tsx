@@ -266,3 +266,13 @@ export function Switch({ label, value, onChange, title }: { label: string; value
     </label>
   );
 }
+
+/** How far something is, 0..1. */
+export function Bar({ label, share }: { label: string; share: number }) {
+  const percent = Math.round(100 * share);
+  return (
+    <div class="bar" role="progressbar" aria-label={label} aria-valuenow={percent} aria-valuemin={0} aria-valuemax={100}>
+      <div style={{ width: `${percent}%` }} />
+    </div>
+  );
+}
