@@ -44,14 +44,12 @@ def _shrink(radiance: Tensor) -> Tensor:
     return small.permute(1, 2, 0)
 
 
-_blurred: WeakKeyDictionary[Environment, tuple[Environment, EnvironmentTable]] = WeakKeyDictionary()
+_blurred: WeakKeyDictionary[Environment, EnvironmentTable] = WeakKeyDictionary()
 """Of environments that live."""
 
 
 def blurred_light(environment: Environment, rotation_degrees: float, intensity: float) -> Any:
     """EnvironmentLight struct of the blurred environment, for looking up; blurred once for each environment."""
     if environment not in _blurred:
-        soft = blur_environment(environment)
-        _blurred[environment] = soft, build_environment_table(soft)
-    soft, table = _blurred[environment]
-    return environment_light(soft, table, rotation_degrees, intensity)
+        _blurred[environment] = build_environment_table(blur_environment(environment))
+    return environment_light(_blurred[environment], rotation_degrees, intensity)
