@@ -1,6 +1,7 @@
 """Simulations: an asset's matter moves, and the clip is kept where `pose` edits find it. Every finished frame is on disk: a worker that dies
 costs one frame."""
 
+import time
 from pathlib import Path
 
 from worker.artifacts import keep, patiently
@@ -33,8 +34,14 @@ class SimulateRun(AbstractJobRun):
         job = self._job
         asset = load_asset(job.bring_asset(self._asked.asset), device_from_name(job.device))
 
+        told: list[tuple[float, int]] = []
+
         def report(done: int, total: int) -> None:
-            job.progress(BuildProgress("simulate", done, total, done / total, message=f"frame {done} of {total}"))
+            told.append((time.monotonic(), done))
+            (begun, first), (now, _) = told[0], told[-1]
+            # The first one was there already: the object at rest, or what an earlier run left.
+            left = (now - begun) / (done - first) * (total - done) if done > first else None
+            job.progress(BuildProgress("simulate", done, total, done / total, message=f"frame {done} of {total}", eta_seconds=left))
             if job.should_stop():
                 raise BuildStopped
 

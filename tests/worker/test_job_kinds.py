@@ -159,6 +159,8 @@ def test_a_simulation_that_was_stopped_goes_on_with_the_next_frame(job: Callable
     again: list[BuildProgress] = []
     run(SimulateRun(job(request, again.append)))
     assert [made.iteration for made in again] == [2, 3]
+    assert told[0].eta_seconds is None and told[1].eta_seconds > 0, "one frame of three is left"
+    assert [made.eta_seconds for made in again] == [None, 0]
     assert open_clip(context.directory.clip(JOB)).frame_count == 3 and not (context.folder / "frames").exists()
 
 

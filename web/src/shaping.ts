@@ -40,6 +40,9 @@ export const lattice = computed<LatticeMap | null>(() => {
 /** What comes after it moves its corners too. */
 const behindLattice = computed(() => (latticeEdit.value < 0 ? [] : edits.value.slice(latticeEdit.value + 1)));
 
+/** Something else says where everything is, so corners would have to be seen where they do nothing. */
+export const latticeOverruled = computed(() => edits.value.some(holdsShape));
+
 export const grabbables = computed<Grabbable[]>(() => {
   const positions = mesh.value?.positions;
   if (!positions) return [];
@@ -48,7 +51,7 @@ export const grabbables = computed<Grabbable[]>(() => {
       if (overruled(edits.value)) return [];
       return handles.value.map((part) => ({ key: keyOf(part), place: placeOf(part, edits.value, positions), turn: part.turn, moved: part.target !== null }));
     case 'lattice':
-      if (edits.value.some(holdsShape)) return [];
+      if (latticeOverruled.value) return [];
       return cornersOf(lattice.value ?? restLattice(bounds.value)).map(({ number, place, rest }) => ({
         key: `corner ${number}`,
         place: movePoint(place, behindLattice.value),

@@ -3,7 +3,7 @@
 import { readLattice, type Lattice } from '../lattice';
 import type { Edit } from '../protocol.gen';
 import type { AnalyticMap } from '../shape';
-import { adjustLattice, bounds, chooseShapeTool, lattice, shapeTool } from '../shaping';
+import { adjustLattice, bounds, chooseShapeTool, lattice, latticeOverruled, shapeTool } from '../shaping';
 import { commitDraft, draftEdit, isTwin, replaceEdits } from '../session';
 import { edits } from '../state';
 import { Section, Slider, Switch } from './fields';
@@ -74,7 +74,7 @@ function Corners() {
       {slider('Lean Y', 'leanY', -1, 1, '')}
       <p class="hint">Widths of top and foot, and how far the top leans, in heights of the object.</p>
       <Switch label="Corners on the picture" value={shown} onChange={(on) => chooseShapeTool(on ? 'lattice' : 'none')} />
-      {shown && <Grabbed name="Corner" hint="Drag a corner, or choose one and enter where it goes. The object follows at once; the traced picture when you let go." />}
+      {shown && <Grabbed name="Corner" hint={latticeOverruled.value ? 'What moves now says where everything is: remove it under Simulation first.' : 'Drag a corner, or choose one and enter where it goes. The object follows at once; the traced picture when you let go.'} />}
       {map && (
         <div class="buttons">
           <button onClick={without('lattice')}>Remove the lattice</button>
