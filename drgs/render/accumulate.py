@@ -193,7 +193,9 @@ def start_frame(
         factor = scene.environment_intensity / previous.scene.environment_intensity if "scale" in make else 1.0
         parts = {"tracer": tracer, "table": table, "light": light, "plan": plan, "made": made, "seconds": seconds}
         return _continued(replace(previous, scene=scene, settings=settings, **parts), factor)
-    memory = RayMemory(writes=changed != {"camera"}) if previous is None or "first_rays" in make else RayMemory(previous.memory.rays)
+    memory = (
+        RayMemory(writes=not changed & {"camera", "shape"}) if previous is None or "first_rays" in make else RayMemory(previous.memory.rays)
+    )
     pixels, device = camera.width * camera.height, seen.device
     # Memory is taken by the first pass, which copies them.
     numbers = [torch.zeros(1, *tail, device=device).expand(pixels, *tail) for tail in ((3,), (3,), (), (), (), (3,), ())]

@@ -2,8 +2,8 @@
 
 Between two frames of an unmoved camera and shape most first rays stay as they are: a new environment changes only those sampled from it, a
 new albedo hardly any. The comparison is exact, so nothing need be known about what an edit did to the samples.
-Only a frame's first pass is remembered: it is the one that somebody waits for. While the camera moves nothing is, for the next frame's rays
-start elsewhere: the first edit after a move traces all its rays.
+Only a frame's first pass is remembered: it is the one that somebody waits for. While the camera or the shape moves nothing is, for the next frame's
+rays start elsewhere: the first edit after a move traces all its rays.
 """
 
 from dataclasses import dataclass

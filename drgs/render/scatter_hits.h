@@ -129,6 +129,7 @@ const auto put = [&](long, i16 live, V3 d, const v16* light_there, const v16* ca
         if (live_lane[lane] != 0) {
             const float from[3] = {out[0][lane], out[1][lane], out[2][lane]}, along[3] = {out[3][lane], out[4][lane], out[5][lane]};
             bool met = false;
+            path_count.data[2] += traced_lane[lane] != 0;
             if (traced_lane[lane] != 0 && (ends != 0 || carried_on == nullptr)) {
                 met = is_blocked(occluded, from, along);
             } else if (traced_lane[lane] != 0) {

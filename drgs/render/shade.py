@@ -219,7 +219,7 @@ def shade(
         warp_array(result.variance, wp.vec3),
         warp_array(result.visibility),
     ]
-    at_once = isinstance(tracer, EmbreeTracer) and known is None and kept is None
+    at_once = isinstance(tracer, EmbreeTracer)
     for kernel in (
         start_rays_simd if device.type == "cpu" else start_rays,
         note_directions,
@@ -231,8 +231,9 @@ def shade(
         load_kernel(kernel, warp_dev)
 
     def batch(first: int, last: int) -> None:
-        if isinstance(tracer, EmbreeTracer) and at_once:
-            shade_slice(tracer, first, last, [arrays, *start_arrays, light], mesh, samples, counts.total, bounces, sums)
+        if isinstance(tracer, EmbreeTracer):
+            given = [arrays, *start_arrays, light]
+            shade_slice(tracer, first, last, given, mesh, samples, counts.total, bounces, known, kept, sums)
             return
         rays = (last - first) * counts.total
         specular, radiance = (torch.empty(rays, 3, device=device) for _ in range(2))

@@ -11,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from drgs.render.environment_table import EnvironmentLight
+from drgs.render.ray_memory import TracedRays
 from drgs.render.sample_rays import PointArrays, SampleSet
 from drgs.render.sum_samples import sum_point
 from drgs.render.trace_indirect import MeshArrays, ray_source
@@ -34,14 +35,24 @@ class PathArrays:
     throughput: wp.array[wp.vec3]
 
 
+@wp.struct
+class RayAnswers:
+    """ray_memory.TracedRays; empty where there are none."""
+
+    direction: wp.array[wp.vec3]
+    hit: wp.array[wp.bool]
+    face: wp.array[int]
+    barycentric: wp.array[wp.vec2]
+
+
 @wp.func_native(EMBREE_RAY + ray_source("start_rays.h", 0, 2))
 def ask_sixteen_rays(
     intersect: wp.uint64, occluded: wp.uint64, tree: wp.uint64, base: int, ray_count: int, first: int,
     points: PointArrays, starts: wp.array(dtype=wp.vec3), surface_normals: wp.array(dtype=wp.vec3),
     start_face: wp.array(dtype=int), horizon: wp.array(dtype=float),
-    light: EnvironmentLight, samples: SampleSet, keep_dark: int,
+    light: EnvironmentLight, samples: SampleSet, keep_dark: int, known: RayAnswers,
     cosine_weight: wp.array(dtype=float), specular: wp.array(dtype=wp.vec3), radiance: wp.array(dtype=wp.vec3), blocked: wp.array(dtype=wp.bool),
-    indirect: wp.array(dtype=wp.vec3), path_count: wp.array(dtype=int), packed: PathArrays,
+    indirect: wp.array(dtype=wp.vec3), path_count: wp.array(dtype=int), packed: PathArrays, kept: RayAnswers,
 ): ...  # fmt: skip
 
 
@@ -72,6 +83,7 @@ def shade_chunks(
     mesh: MeshArrays,
     samples: SampleSet,
     bounces: int,
+    known: RayAnswers,
     # room for a chunk's rays
     cosine_weight: wp.array[float],
     specular: wp.array[wp.vec3],
@@ -82,6 +94,7 @@ def shade_chunks(
     even: PathArrays,
     odd: PathArrays,
     # outputs
+    kept: RayAnswers,
     diffuse_out: wp.array[wp.vec3],
     specular_out: wp.array[wp.vec3],
     variance_out: wp.array[wp.vec3],
@@ -96,7 +109,7 @@ def shade_chunks(
     for group in range((rays + 15) // 16):
         ask_sixteen_rays(
             intersect, occluded, tree, 16 * group, rays, begin * count, points, starts, surface_normals, start_face, horizon, light, samples,
-            bounces, cosine_weight, specular, radiance, blocked, indirect, path_count, even,
+            bounces, known, cosine_weight, specular, radiance, blocked, indirect, path_count, even, kept,
         )  # fmt: skip
     for depth in range(bounces):
         side = depth % 2
@@ -122,12 +135,14 @@ def shade_chunks(
 
 
 def shade_slice(
-    tracer: EmbreeTracer, first: int, last: int, given: list[Any], mesh: Any, samples: Any, rays_a_point: int, bounces: int, sums: list[Any]
-) -> None:
-    """Points from `first` to `last`. Runs on the calling thread.
+    tracer: EmbreeTracer, first: int, last: int, given: list[Any], mesh: Any, samples: Any, rays_a_point: int, bounces: int,
+    known: TracedRays | None, kept: TracedRays | None, sums: list[Any],
+) -> int:  # fmt: skip
+    """Points from `first` to `last`, and how many rays Embree was asked about. Runs on the calling thread.
 
     Args:
         given: PointArrays, starts, surface normals, faces, horizons of all faces and EnvironmentLight. mesh, samples: MeshArrays, SampleSet.
+        known: of all points' rays, answers that may be used. kept: where to write theirs down.
         sums: where diffuse and specular light, variance and visibility of all points go.
     """
     chunk = max(1, RAYS_A_CHUNK // rays_a_point)
@@ -135,19 +150,26 @@ def shade_slice(
     room = [warp_array(torch.empty(rays)), *(warp_array(torch.empty(rays, 3), wp.vec3) for _ in range(2))]
     room += [warp_array(torch.empty(rays, dtype=torch.bool)), warp_array(torch.empty(rays, 3), wp.vec3)]
     paths = rays if bounces > 0 else 0
+    counts = torch.zeros(3, dtype=torch.int32)
     wp.launch(
         shade_chunks,
         dim=-(-(last - first) // chunk),
-        inputs=[*tracer.questions, first, last, chunk, *given, mesh, samples, bounces],
-        outputs=[
-            *room,
-            warp_array(torch.zeros(2, dtype=torch.int32)),
-            _path_arrays(paths),
-            _path_arrays(paths if bounces > 1 else 0),
-            *sums,
-        ],
+        inputs=[*tracer.questions, first, last, chunk, *given, mesh, samples, bounces, _answers(known)],
+        outputs=[*room, warp_array(counts), _path_arrays(paths), _path_arrays(paths if bounces > 1 else 0), _answers(kept), *sums],
         device="cpu",
     )
+    return int(counts[2])
+
+
+def _answers(rays: TracedRays | None) -> Any:
+    arrays = RayAnswers()
+    none = torch.empty(0)
+    arrays.direction = warp_array(none.view(0, 3) if rays is None else rays.direction_world, wp.vec3)
+    arrays.hit = warp_array(none.bool() if rays is None else rays.hit)
+    has_surfaces = rays is not None and rays.face is not None and rays.barycentric is not None
+    arrays.face = warp_array(rays.face if has_surfaces else none.int())
+    arrays.barycentric = warp_array(rays.barycentric if has_surfaces else none.view(0, 2), wp.vec2)
+    return arrays
 
 
 def _path_arrays(count: int) -> Any:

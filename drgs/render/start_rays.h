@@ -5,7 +5,8 @@
 // in   base (first ray of the group in the batch), ray_count (of the batch), first (the batch's first ray among all),
 //      points, starts, surface_normals, start_face, horizon (8 of each face), light, samples, keep_dark
 // out  cosine_weight, specular, radiance of rays base .. base + 15, and either their origin and direction,
-//      or what they met: `blocked`, and with keep_dark the rays that met a surface, packed behind path_count[0] in `packed`
+//      or what they met: `blocked`, and with keep_dark the rays that met a surface, packed behind path_count[0] in `packed`;
+//      path_count[2] counts the questions, and `kept` gets all answers where it has room
 
 // 1. The points of the group's rays: each is read once for all its lanes, and the next one overwrites the lanes from its first on.
 const int count = samples.cosine + samples.ggx + samples.environment;
@@ -120,31 +121,60 @@ for (int lane = 0; lane < lanes; ++lane) {
     }
 }
 // ----
-// 6. What they meet. A launch runs on one thread from its first index to its last, so rays that met something pack themselves in order.
+// 6. What they meet, as far as no earlier answer says it. A launch runs on one thread from its first index to its last, so rays that met
+// something pack themselves in order.
+const bool has_known = known.hit.shape[0] > 0, keeps = kept.hit.shape[0] > 0, keeps_surfaces = kept.face.shape[0] > 0;
 for (int lane = 0; lane < lanes; ++lane) {
     const int ray = base + lane;
-    bool met = false;
-    if (live_lane[lane] != 0 && traced_lane[lane] != 0) {
-        const float along[3] = {result[0][lane], result[1][lane], result[2][lane]};
-        const float* const start = from + 3 * (long)point_lane[lane];
-        if (keep_dark == 0) {
-            met = is_blocked(occluded, start, along);
-        } else {
-            RayHit found;
-            met = first_hit(intersect, found, start, along);
-            if (met) {
-                const int path = path_count.data[0]++;
-                packed.ray.data[path] = ray;
-                packed.face.data[path] = (int)found.triangle;
-                ((float*)packed.barycentric.data)[2 * path] = found.u;
-                ((float*)packed.barycentric.data)[2 * path + 1] = found.v;
-                for (int k = 0; k < 3; ++k) {
-                    ((float*)packed.arriving.data)[3 * path + k] = along[k];
-                    ((float*)packed.throughput.data)[3 * path + k] = 1.0f;
-                    ((float*)indirect.data)[3 * ray + k] = 0.0f;
-                }
-            }
+    const long number = (long)first + ray;
+    const bool traced = live_lane[lane] != 0 && traced_lane[lane] != 0;
+    const float along[3] = {result[0][lane], result[1][lane], result[2][lane]};
+    const float* const start = from + 3 * (long)point_lane[lane];
+    bool met = false, is_known = false;
+    int triangle = -1;
+    float weights[2] = {0.0f, 0.0f};
+    if (traced && has_known) {
+        const float* const before = (const float*)known.direction.data + 3 * number;
+        is_known = before[0] == along[0] && before[1] == along[1] && before[2] == along[2];
+    }
+    if (is_known) {
+        met = known.hit.data[number];
+        if (met && keep_dark != 0) {
+            triangle = known.face.data[number];
+            weights[0] = ((const float*)known.barycentric.data)[2 * number];
+            weights[1] = ((const float*)known.barycentric.data)[2 * number + 1];
+        }
+    } else if (traced && keep_dark == 0) {
+        path_count.data[2]++;
+        met = is_blocked(occluded, start, along);
+    } else if (traced) {
+        path_count.data[2]++;
+        RayHit found;
+        met = first_hit(intersect, found, start, along);
+        if (met) {
+            triangle = (int)found.triangle;
+            weights[0] = found.u;
+            weights[1] = found.v;
         }
     }
     blocked.data[ray] = met;
+    if (met && keep_dark != 0) {
+        const int path = path_count.data[0]++;
+        packed.ray.data[path] = ray;
+        packed.face.data[path] = triangle;
+        for (int k = 0; k < 2; ++k) ((float*)packed.barycentric.data)[2 * path + k] = weights[k];
+        for (int k = 0; k < 3; ++k) {
+            ((float*)packed.arriving.data)[3 * path + k] = along[k];
+            ((float*)packed.throughput.data)[3 * path + k] = 1.0f;
+            ((float*)indirect.data)[3 * ray + k] = 0.0f;
+        }
+    }
+    if (keeps) {
+        for (int k = 0; k < 3; ++k) ((float*)kept.direction.data)[3 * number + k] = traced ? along[k] : __builtin_nanf("");
+        kept.hit.data[number] = met;
+        if (keeps_surfaces) {
+            kept.face.data[number] = triangle;
+            for (int k = 0; k < 2; ++k) ((float*)kept.barycentric.data)[2 * number + k] = weights[k];
+        }
+    }
 }

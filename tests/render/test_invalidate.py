@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from drgs.render import accumulate
+from drgs.render import shade as shade_module
 from drgs.render.accumulate import FrameState, RenderSettings, refine_frame, resolve_frame, start_frame
 from drgs.render.invalidate import MADE_FROM, PARTS
+from drgs.render.shade_embree import shade_slice
 from drgs.render.tracer_embree import EmbreeTracer
 from drgs.scene.environment import Environment
 from drgs.scene.materials import Materials
@@ -99,6 +101,13 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter:
         count(accumulate, step)
     count(EmbreeTracer, "occluded")
     count(EmbreeTracer, "closest_hits")
+
+    def slice_and_count(*arguments) -> int:
+        asked = shade_slice(*arguments)
+        counted["asked in slices"] += asked
+        return asked
+
+    monkeypatch.setattr(shade_module, "shade_slice", slice_and_count)
     return counted
 
 
@@ -155,7 +164,7 @@ def rays_of_first_pass(edit: Callable, calls: Counter, bounces: int) -> tuple[in
         state = start_frame(edit(scene), CAMERA, settings, previous=previous)
         calls.clear()
         refine_frame(state)
-        numbers.append(calls["occluded"] + calls["closest_hits"])
+        numbers.append(calls["occluded"] + calls["closest_hits"] + calls["asked in slices"])
     return numbers[0], numbers[1]
 
 

@@ -197,20 +197,40 @@ def test_light_does_not_depend_on_batching_or_threads(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("bounces", [0, 1, 2])
-def test_rays_asked_about_as_they_start_bring_the_light_of_rays_written_down(bounces: int) -> None:
-    """Without a memory nothing but hits is ever written; answers are the same but for rounding, here and there a ray's at an edge."""
+def test_rays_asked_about_as_they_start_bring_the_light_of_rays_written_down(bounces: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answers are the same but for rounding, here and there a ray's at an edge."""
     mesh, counts = two_spheres(), SampleCounts(7, 3, 5)
     points = ShadingPoints(
         mesh.vertices, mesh.normals, mesh.normals, mesh.albedo, mesh.roughness, mesh.metallic, torch.arange(len(mesh.vertices)).int()
     )
     at_once = shade_points(points, sunny_sky(), counts, mesh, bounces, lift=1e-3)
-    memory = RayMemory()
-    written = shade_points(points, sunny_sky(), counts, mesh, bounces, lift=1e-3, memory=memory)
-    assert memory.rays is not None and float((at_once.visibility < 1).float().mean()) > 0.01
+    monkeypatch.setattr("drgs.render.shade.EmbreeTracer", type("NoTracer", (), {}))
+    written = shade_points(points, sunny_sky(), counts, mesh, bounces, lift=1e-3)
+    assert float((at_once.visibility < 1).float().mean()) > 0.01
     for name in ("diffuse", "specular", "variance", "visibility"):
         a, b = getattr(at_once, name), getattr(written, name)
         error = (a - b).abs() / (b.abs() + 1e-3 * b.abs().mean() + 1e-6)
         assert float((error < 1e-4).float().mean()) > 0.998, name
+
+
+@pytest.mark.parametrize("bounces", [0, 1])
+@pytest.mark.parametrize("steps", ["in one kernel", "one after the other"])
+def test_remembered_answers_are_the_answers(bounces: int, steps: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, counts = two_spheres(), SampleCounts(7, 3, 5)
+    points = ShadingPoints(
+        mesh.vertices, mesh.normals, mesh.normals, mesh.albedo, mesh.roughness, mesh.metallic, torch.arange(len(mesh.vertices)).int()
+    )
+    if steps == "one after the other":
+        monkeypatch.setattr("drgs.render.shade.EmbreeTracer", type("NoTracer", (), {}))
+    memory = RayMemory()
+    first, again = (shade_points(points, sunny_sky(), counts, mesh, bounces, lift=1e-3, memory=memory) for _ in range(2))
+    for name in ("diffuse", "specular", "variance", "visibility"):
+        assert torch.equal(getattr(first, name), getattr(again, name)), name
+    # The other way round: answers that are wrong are believed.
+    assert memory.rays is not None
+    memory.rays.hit.fill_(False)
+    believed = shade_points(points, sunny_sky(), counts, mesh, bounces, lift=1e-3, memory=memory)
+    assert float(believed.visibility.min()) == 1 > float(first.visibility.min())
 
 
 def test_no_points_give_no_light() -> None:
