@@ -2,6 +2,7 @@
 
 import { presets } from './presets';
 import type { Edit, EnvironmentEdit, MaterialEdit, MaterialValues, Selection } from './protocol.gen';
+import { environmentTitle } from './sun_and_sky';
 
 export interface Light {
   /** Null: the asset's own environment. */
@@ -105,7 +106,7 @@ export function describeEdit(edit: Edit): string {
       return `${partName(edit.select)}${what}`.replace(/^./, (first) => first.toUpperCase());
     }
     case 'environment': {
-      const parts = [edit.file ? edit.file.replace(/\.(exr|hdr)$/i, '') : 'Light'];
+      const parts = [edit.file ? environmentTitle(edit.file) : 'Light'];
       if (edit.rotation) parts.push(`${Math.round(edit.rotation)}°`);
       if ((edit.intensity ?? 1) !== 1) parts.push(`× ${rounded(edit.intensity!)}`);
       return parts.join(', ');

@@ -14,3 +14,11 @@ export function elevationOf(file: string | null): number | null {
   const elevation = Number(/^sun-and-sky-([1-9][0-9]?)\.exr$/.exec(file ?? '')?.[1]);
   return elevation >= LOWEST_SUN && elevation <= HIGHEST_SUN ? elevation : null;
 }
+
+/** What a list calls the environment of a file; the server's titles, and of the sun also its height. */
+export function environmentTitle(file: string): string {
+  const elevation = elevationOf(file);
+  if (elevation !== null) return elevation === USUAL_SUN ? 'Sun and sky' : `Sun ${elevation}° high`;
+  const words = file.replace(/\.(exr|hdr)$/i, '').replace(/[-_]/g, ' ');
+  return words.charAt(0).toUpperCase() + words.slice(1);
+}
