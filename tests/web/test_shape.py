@@ -103,6 +103,13 @@ def test_a_click_on_what_was_moved_puts_a_handle_on_the_same_place_at_rest(ball:
     page.mouse.click(20, 400)  # beside the object
     expect(page.get_by_label("Place z")).not_to_be_visible()
     assert handles(ball)["pin"] == []
+    # Materials are chosen on it just so.
+    ball.open_tab("Material")
+    page.get_by_role("radio", name="Sphere").check()
+    page.mouse.click((left + right) / 2, (top + bottom) / 2)
+    expect(page.get_by_text("% of the object is selected.")).to_be_visible()
+    page.get_by_role("radio", name="All", exact=True).check()
+    ball.open_tab("Shape")
 
 
 def test_handles_work_by_the_keyboard(ball: Viewer) -> None:

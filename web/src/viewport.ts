@@ -17,11 +17,11 @@ import { LocalPicture } from './local_picture';
 import { LookThrough } from './look_through';
 import { photographInSight, split, viewNumber } from './photographs';
 import { FLAG_CONVERGED, FLAG_MOVING, MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from './protocol.gen';
-import { listen, pick, sendCamera } from './session';
-import { paintPins, pinWeights } from './pins';
+import { listen, sendCamera } from './session';
+import { pinWeights } from './pins';
 import { listenToPointers } from './pointers';
-import { paint, selectAt } from './selecting';
-import { choose, putHandle, shapeTool } from './shaping';
+import { shapeTool } from './shaping';
+import { Touching } from './touching';
 import { aimNow, viewNow, wantedAim, type Row, type View } from './viewpoint';
 import { deformPoints, isAnalytic } from './shape';
 import { balls, ballsWanted, before, capturedLight, draft, edits, flash, flying, light, localPicture, log, materials, mesh, notify, pending, resolution, selectionWeights, session, settings, tool } from './state';
@@ -88,14 +88,7 @@ export class Viewport {
     this.flight = new Flight(this.camera, this.controls, this.bounds);
     this.lookThrough = new LookThrough(stage, this.camera, this.controls, this.bounds, this.stillMotion ? 0 : undefined);
     listen(this.onHello, this.onFrame);
-    listenToPointers(stage, this.controls, {
-      select: (event) => this.selectAt(event),
-      paint: (event) => this.paintAt(event),
-      grab: (event) => this.gizmo.grab(event),
-      drag: (event) => this.gizmo.drag(event),
-      release: (event) => this.gizmo.release(event),
-      focus: (event) => this.focusAt(event),
-    });
+    listenToPointers(stage, this.controls, new Touching(stage, this.camera, this.controls, this.gizmo, this.local));
     new ResizeObserver(this.onResize).observe(stage);
     this.followState();
     requestAnimationFrame(this.tick);
@@ -366,7 +359,7 @@ export class Viewport {
     const marks = this.marksPins;
     const strength = marks ? PINS_STRENGTH : !flashing ? 0 : this.stillMotion ? 0.5 : 0.85 * Math.sin((2 * Math.PI * since) / FLASH_MS) ** 2;
     // Over a traced picture only the selection is drawn, on nothing.
-    const overlay = (flashing || marks) && !(this.localShows && !this.fresh) && !before.value && this.splitAt === null;
+    const overlay = ((flashing && isAnalytic(edits.value)) || marks) && !(this.localShows && !this.fresh) && !before.value && this.splitAt === null;
     if (flashing || this.stage.dataset.overlay !== String(overlay)) this.localDirty = true;
     this.stage.dataset.overlay = String(overlay);
     if (!this.localShows && !overlay && !before.value && this.splitAt === null) return;
@@ -424,54 +417,6 @@ export class Viewport {
     this.camera.updateProjectionMatrix();
     this.resizeLocal();
   };
-
-  // ---- pointers ----------------------------------------------------------------------------------------------------------
-
-  /** Share of the picture's width and height at a pointer. */
-  private shareAt(event: MouseEvent): [number, number] {
-    const box = this.stage.getBoundingClientRect();
-    return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
-  }
-
-  private pickLocally(event: MouseEvent) {
-    if (!isAnalytic(edits.value)) {
-      notify('Parts can be chosen on the shape at rest only: undo the simulation first.', 'info');
-      return null;
-    }
-    const [x, y] = this.shareAt(event);
-    return this.local?.pick(this.camera, 2 * x - 1, 1 - 2 * y) ?? null;
-  }
-
-  private selectAt(event: MouseEvent): void {
-    if (shapeTool.value === 'handles') return this.putHandleAt(event);
-    const hit = this.pickLocally(event);
-    if (hit) selectAt({ point: hit.rest, vertex: hit.vertex });
-  }
-
-  /** The server knows where dragged surfaces are at rest. */
-  private putHandleAt(event: MouseEvent): void {
-    const [x, y] = this.shareAt(event);
-    const hit = isAnalytic(edits.value) ? this.local?.pick(this.camera, 2 * x - 1, 1 - 2 * y) : null;
-    if (hit) return putHandle(hit.rest);
-    void pick(x, y)?.then((picked) => {
-      if (picked.hit && picked.rest) putHandle(picked.rest);
-      else choose(null);
-    });
-  }
-
-  private paintAt(event: PointerEvent): boolean {
-    const hit = this.pickLocally(event);
-    if (hit) (shapeTool.value === 'pins' ? paintPins : paint)(hit.rest, event.shiftKey);
-    return hit !== null;
-  }
-
-  /** Put the focal point on the surface under the pointer; the server knows surfaces that the local mesh does not. */
-  private focusAt(event: MouseEvent): void {
-    if (flying.value || viewNumber.value !== null) return;
-    void pick(...this.shareAt(event))?.then((picked) => {
-      if (picked.hit && picked.position) void this.controls.moveTo(...picked.position, true);
-    });
-  }
 }
 
 const pixelRatio = () => Math.min(window.devicePixelRatio || 1, 2);
