@@ -1,0 +1,22 @@
+"""The real builder with a tenth of a draft's iterations: a whole build, its training included, in the time that a test has.
+
+A worker that DRGS_BUILDER tells to use it goes through every stage as any other does; only the pictures it ends with are rougher.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from unittest.mock import patch
+
+from worker.builders import BuildProgress, BuildRequest, build_with_drgs
+
+FIT_ITERATIONS, MATERIAL_ITERATIONS = 40, 15
+
+
+def build(request: BuildRequest, progress: Callable[[BuildProgress], None], should_stop: Callable[[], bool]) -> Iterator[str]:
+    from drgs.build.build_asset import PRESETS
+
+    draft = PRESETS["draft"]
+    fit = replace(draft.fit, iterations=FIT_ITERATIONS)
+    materials = replace(draft.materials, iterations=MATERIAL_ITERATIONS)
+    with patch.dict(PRESETS, draft=replace(draft, fit=fit, materials=materials)):
+        yield from build_with_drgs(request, progress, should_stop)

@@ -1,0 +1,310 @@
+"""The whole way of a newcomer: drop a capture, watch it built, change a part, the light and the shape, take all back, carry files away.
+
+A real worker process builds the sample's photographs, fewer and smaller ones, in `short_builder`'s few iterations. The tests run in this
+order on one page; each looks at the pixels of the canvas and at what the server says.
+"""
+
+import base64
+import io
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from playwright.sync_api import Browser, Download, Locator, expect
+from scipy import ndimage
+
+from tests.web.browser import ROOT, STOP_SECONDS, RunningServer
+from tests.web.conftest import Viewer, wait_until
+
+CAPTURE = ROOT / "examples" / "sample_capture"
+VIEW_STEP, SIDE = 2, 96
+"""Every second view, at this many pixels a side: with half as many, the object's outline is lost."""
+BUILD_SECONDS = 400
+"""Some twenty on two idle cores; others may use them, too."""
+DRAW_SECONDS = 120
+SAMPLES = 64
+NOISE = 3.0
+"""Mean over the object of the difference between two pictures of the same thing, sRGB 0..255, stays below this."""
+DROP = """(base64) => {
+  const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+  const files = new DataTransfer();
+  files.items.add(new File([bytes], 'Little sample.zip', { type: 'application/zip' }));
+  for (const type of ['dragenter', 'dragover', 'drop'])
+    document.body.dispatchEvent(new DragEvent(type, { dataTransfer: files, bubbles: true, cancelable: true }));
+}"""
+DRAG_SLIDER = """(slider, values) => {
+  for (const value of values) {
+    slider.value = value;
+    slider.dispatchEvent(new Event('input', { bubbles: true }));
+  }
+  slider.dispatchEvent(new Event('change', { bubbles: true }));
+}"""
+READ_CANVAS = "document.querySelector('canvas.traced').toDataURL('image/png')"
+
+
+def small_capture() -> bytes:
+    """The sample capture with fewer and smaller photographs, zipped."""
+    transforms = json.loads((CAPTURE / "transforms_train.json").read_text())
+    transforms["frames"] = transforms["frames"][::VIEW_STEP]
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("transforms_train.json", json.dumps(transforms))
+        for frame in transforms["frames"]:
+            name = frame["file_path"].removeprefix("./") + ".png"
+            photo = io.BytesIO()
+            with Image.open(CAPTURE / name) as full:
+                full.resize((SIDE, SIDE), Image.Resampling.BOX).save(photo, "PNG")
+            archive.writestr(name, photo.getvalue())
+    return packed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def worker(server: RunningServer) -> Iterator[None]:
+    """A worker process on the server's data directory."""
+    environment = os.environ | {"DRGS_BUILDER": "tests.web.short_builder:build"}
+    running = subprocess.Popen([sys.executable, "-m", "worker", "--data", str(server.data)], env=environment, cwd=ROOT)
+    yield
+    running.terminate()
+    try:
+        running.wait(STOP_SECONDS)
+    except subprocess.TimeoutExpired:
+        running.kill()
+
+
+@pytest.fixture(scope="module")
+def path(server: RunningServer, browser: Browser, worker: None) -> Iterator[Viewer]:
+    """A page in which nobody has been before."""
+    page = browser.new_page(viewport={"width": 1000, "height": 620}, device_scale_factor=0.5, color_scheme="dark")
+    shown = Viewer(page, server)
+    page.on("pageerror", lambda error: shown.complaints.append(str(error)))
+    page.on("console", lambda message: shown.complaints.append(message.text) if message.type == "error" else None)
+    page.goto(f"{server.address}/#token={server.token}")
+    yield shown
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def first(path: Viewer) -> np.ndarray:
+    """The object before any edit; the tests before the first user of it have opened it and chosen how it is shown."""
+    return refined_picture(path)
+
+
+def refined_picture(viewer: Viewer) -> np.ndarray:
+    """(height, width, 4) float sRGB and alpha 0..255 of the traced picture with all its samples, of the newest edits."""
+
+    def is_refined() -> bool:
+        viewer.settle()
+        return int(viewer.stage()["samples"]) >= SAMPLES
+
+    wait_until(is_refined, lambda: f"all samples; the page says {viewer.stage()}", DRAW_SECONDS)
+    data = viewer.page.evaluate(READ_CANVAS)
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGBA"), float)
+
+
+def wait_for_picture(viewer: Viewer, holds: Callable[[np.ndarray], bool], what: str) -> np.ndarray:
+    """The first refined picture of which `holds` is true. The log is written before the picture is drawn."""
+
+    def picture() -> list[np.ndarray]:
+        now = refined_picture(viewer)
+        return [now] if holds(now) else []
+
+    return wait_until(picture, what, DRAW_SECONDS)[0]
+
+
+def silhouette(picture: np.ndarray) -> np.ndarray:
+    return picture[..., 3] > 127
+
+
+def change(before: np.ndarray, after: np.ndarray, where: np.ndarray) -> float:
+    """Mean difference of colour, 0..255, over some pixels."""
+    return float(np.abs(after - before)[where][:, :3].mean())
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of two silhouettes."""
+    return float((silhouette(a) & silhouette(b)).sum() / (silhouette(a) | silhouette(b)).sum())
+
+
+def brightness(picture: np.ndarray) -> np.ndarray:
+    return picture[..., :3].mean(-1)
+
+
+def jobs_of(viewer: Viewer) -> list[dict]:
+    return [job for job in viewer.server.ask("/api/jobs")["jobs"] if job["name"] == "Little sample"]
+
+
+def test_a_dropped_capture_becomes_a_job_whose_progress_is_shown(path: Viewer) -> None:
+    path.page.get_by_role("radio", name="Draft").check()
+    path.page.evaluate(DROP, base64.b64encode(small_capture()).decode())
+    listed = path.page.get_by_role("listitem", name="Build Little sample")
+    expect(listed).to_be_visible(timeout=60_000)
+    (job,) = wait_until(lambda: jobs_of(path), "a job on the server", 60)
+    assert (job["kind"], job["preset"]) == ("build", "draft")
+    bar = listed.get_by_role("progressbar", name="Progress of Little sample")
+    wait_until(lambda: bar.count() and int(bar.get_attribute("aria-valuenow") or 0) > 0, "progress on the page", BUILD_SECONDS)
+    (running,) = jobs_of(path)
+    assert running["state"] in ("running", "done") and running["fraction"] > 0
+
+
+def test_the_finished_asset_opens_by_itself(path: Viewer) -> None:
+    expect(path.page.get_by_role("heading", name="Little sample", exact=True)).to_be_visible(timeout=BUILD_SECONDS * 1000)
+    (job,) = jobs_of(path)
+    assert job["state"] == "done" and job["asset_id"] in path.page.url
+    asset = path.server.ask(f"/api/assets/{job['asset_id']}")
+    assert asset["source"] == "build" and asset["surfel_count"] > 1000 and asset["face_count"] > 1000
+    log = path.session()
+    assert (log["edits"], log["can_undo"]) == ([], False)
+    # From here on every picture is of the object alone, and has few samples: they are waited for often.
+    path.page.get_by_role("button", name="Library").click()
+    path.open_tab("View")
+    path.page.get_by_role("radio", name=str(SAMPLES), exact=True).check()
+    path.open_tab("Light")
+    path.page.get_by_role("radio", name="None", exact=True).check()
+    path.page.keyboard.press("Escape")
+    path.page.keyboard.press("Shift+F")
+    picture = wait_for_picture(path, lambda now: now[0, 0, 3] == 0 and silhouette(now).any(), "the object on nothing")
+    inside = picture[silhouette(picture)]
+    assert 0.03 < silhouette(picture).mean() < 0.7, "the object fills part of the picture"
+    assert inside[:, :3].std() > 10 and inside[:, :3].mean() > 20, "it is lit, and not one flat colour"
+    red, _, blue = inside[:, :3].T
+    assert (blue > 1.3 * red).mean() > 0.1, "some of it is of the photographs' blue glaze"
+
+
+def test_a_part_picked_by_a_click_alone_turns_to_gold(path: Viewer, first: np.ndarray) -> None:
+    captured_metal = metallic_picture(path)
+    x, y = middle_of_the_blue(first)
+    path.open_tab("Material")
+    path.page.get_by_role("radio", name="Region", exact=True).check()
+    click_pixel(path, first, x, y)
+    expect(path.page.get_by_text("% of the object is selected")).to_be_visible()
+    path.page.get_by_role("button", name="Gold", exact=True).click()
+    (edit,) = path.wait_for_edits(1)
+    assert edit["op"] == "material" and edit["select"]["region"] is not None and edit["set"]["metallic"] == 1
+    assert path.session()["can_undo"]
+    part = (metallic_picture(path) - captured_metal)[..., 0] > 100
+    rest = silhouette(first) & ~ndimage.binary_dilation(part, iterations=10)
+    assert part[y, x] and part.sum() > 100, "the clicked part is of metal now"
+    assert rest.sum() > 500, "and not the whole object"
+    gold = wait_for_picture(path, lambda now: change(first, now, part) > 20, "another colour on the part")
+    red, green, blue = gold[part][:, :3].mean(0)
+    assert red > green > 1.2 * blue, f"gold is yellow, not {red:.0f}, {green:.0f}, {blue:.0f}"
+    assert change(first, gold, rest) < 0.25 * change(first, gold, part), "but for light from the gold, the rest stays"
+
+
+def test_another_light_shines_and_turns_with_alt_drag(path: Viewer, first: np.ndarray) -> None:
+    inside = silhouette(first)
+    before = refined_picture(path)
+    path.open_tab("Light")
+    path.page.get_by_role("radio", name="Studio", exact=True).check()
+    _, chosen = path.wait_for_edits(2)
+    assert (chosen["op"], chosen["file"], chosen["rotation"]) == ("environment", "studio.exr", 0)
+    studio = wait_for_picture(path, lambda now: change(before, now, inside) > 2 * NOISE, "the object in the studio")
+    path.page.keyboard.down("Alt")
+    path.page.mouse.move(200, 120)
+    path.page.mouse.down()
+    path.page.mouse.move(500, 120, steps=5)
+    path.page.mouse.up()
+    path.page.keyboard.up("Alt")
+    wait_until(lambda: [edit.get("rotation") for edit in path.edits()] == [None, 0, 120], "a turn by 300 pixels, 0.4 degrees each")
+    assert path.edits()[2]["file"] == "studio.exr"
+    turned = wait_for_picture(path, lambda now: change(studio, now, inside) > 2 * NOISE, "the object in the turned studio")
+    assert overlap(turned, studio) > 0.99, "the light turns, not the object"
+    gained = (brightness(turned) - brightness(studio))[inside]
+    assert min((gained > 10).mean(), (gained < -10).mean()) > 0.05, "bright places are elsewhere: some darken, others light up"
+
+
+def test_a_slider_twists_the_object(path: Viewer) -> None:
+    before = refined_picture(path)
+    path.open_tab("Shape")
+    path.page.get_by_label("Twist", exact=True).evaluate(DRAG_SLIDER, [40, 80, 120])
+    *_, twist = path.wait_for_edits(4)
+    assert twist["op"] == "deform" and twist["map"]["type"] == "twist"
+    height = np.ptp(stored_mesh(path).vertices[:, 1])  # glTF's y is up
+    wait_until(lambda: abs(path.edits()[3]["map"]["rate"] * height - np.radians(120)) < np.radians(2), "the slider's last value")
+    wait_for_picture(path, lambda now: overlap(now, before) < 0.95, "another outline")
+
+
+def test_undoing_all_brings_the_first_picture_back(path: Viewer, first: np.ndarray) -> None:
+    undo = path.page.get_by_role("button", name="Undo", exact=True)
+    for left in (3, 2, 1, 0):
+        expect(undo).to_be_enabled(timeout=30_000)
+        undo.click()
+        path.wait_for_edits(left)
+    expect(undo).to_be_disabled(timeout=30_000)
+    log = path.session()
+    assert (log["edits"], log["can_undo"], log["can_redo"]) == ([], False, True)
+    again = wait_for_picture(path, lambda now: change(first, now, silhouette(first)) < NOISE, "the first picture")
+    assert overlap(again, first) > 0.99
+
+
+def test_the_object_is_exported_as_a_textured_mesh(path: Viewer) -> None:
+    path.open_tab("Export")
+    download = downloaded(path, path.page.get_by_role("link", name="Mesh (GLB)"))
+    assert download.suggested_filename.endswith(".glb")
+    (mesh,) = trimesh.load_scene(download.path(), file_type="glb").geometry.values()
+    stored = stored_mesh(path)
+    assert len(mesh.faces) == len(stored.faces)
+    assert np.allclose(mesh.bounds, stored.bounds, atol=1e-3 * np.ptp(stored.bounds))
+    material = mesh.visual.material
+    color = np.asarray(material.baseColorTexture.convert("RGB"), float)
+    assert min(color.shape[:2]) >= 256 and color.std() > 10, "a texture with something on it"
+    assert material.metallicRoughnessTexture.size == material.baseColorTexture.size
+
+
+def test_the_picture_is_exported_as_a_png(path: Viewer, first: np.ndarray) -> None:
+    path.page.get_by_role("radio", name="Window", exact=True).check()
+    path.page.get_by_role("radio", name="32", exact=True).check()
+    path.page.get_by_role("switch", name="Transparent background").check()
+    download = downloaded(path, path.page.get_by_role("button", name="Render PNG"))
+    assert download.suggested_filename == "Little sample.png"
+    picture = Image.open(download.path())
+    assert (picture.format, picture.mode, picture.size) == ("PNG", "RGBA", (first.shape[1], first.shape[0]))
+    pixels = np.asarray(picture, float)
+    assert overlap(pixels, first) > 0.98, "what is saved is what is on the canvas"
+    assert change(first, pixels, silhouette(first) & silhouette(pixels)) < 3 * NOISE, "in the same colours; it has fewer samples"
+    assert path.edits() == [], "saving is no edit"
+
+
+def test_the_page_logged_no_errors(path: Viewer) -> None:
+    assert path.complaints == []
+
+
+def metallic_picture(viewer: Viewer) -> np.ndarray:
+    """The metallic channel, 0..255; the final picture is asked for again."""
+    viewer.page.keyboard.press("Escape")
+    viewer.page.keyboard.press("4")
+    picture = viewer.settled_picture()
+    viewer.page.keyboard.press("1")
+    return picture
+
+
+def middle_of_the_blue(picture: np.ndarray) -> tuple[int, int]:
+    """(x, y) of the pixel that is farthest from the edge of what is blue."""
+    red, green, blue = np.moveaxis(picture[..., :3], -1, 0)
+    depth = ndimage.distance_transform_edt(silhouette(picture) & (blue > 1.3 * red) & (blue > 0.8 * green))
+    y, x = np.unravel_index(depth.argmax(), depth.shape)
+    return int(x), int(y)
+
+
+def click_pixel(viewer: Viewer, picture: np.ndarray, x: int, y: int) -> None:
+    scale = viewer.page.evaluate("document.querySelector('.stage').clientWidth") / picture.shape[1]
+    viewer.page.mouse.click((x + 0.5) * scale, (y + 0.5) * scale)
+
+
+def stored_mesh(viewer: Viewer) -> trimesh.Trimesh:
+    """The open asset's mesh as the server keeps it, in glTF's frame."""
+    path = viewer.server.data / "assets" / viewer.session()["asset"] / "mesh.glb"
+    return trimesh.load_mesh(path, process=False)
+
+
+def downloaded(viewer: Viewer, what: Locator) -> Download:
+    with viewer.page.expect_download(timeout=DRAW_SECONDS * 1000) as download:
+        what.click()
+    return download.value
