@@ -181,12 +181,13 @@ def test_a_part_picked_by_a_click_alone_turns_to_gold(path: Viewer, first: np.nd
     captured_metal = metallic_picture(path)
     x, y = middle_of_the_blue(first)
     path.open_tab("Material")
-    path.page.get_by_role("radio", name="Region", exact=True).check()
+    # Not a region: where those end depends on how well the few iterations told materials apart.
+    path.page.get_by_role("radio", name="Sphere", exact=True).check()
     click_pixel(path, first, x, y)
     expect(path.page.get_by_text("% of the object is selected")).to_be_visible()
     path.page.get_by_role("button", name="Gold", exact=True).click()
     (edit,) = path.wait_for_edits(1)
-    assert edit["op"] == "material" and edit["select"]["region"] is not None and edit["set"]["metallic"] == 1
+    assert edit["op"] == "material" and edit["select"]["sphere"]["radius"] > 0 and edit["set"]["metallic"] == 1
     assert path.session()["can_undo"]
     part = (metallic_picture(path) - captured_metal)[..., 0] > 100
     rest = silhouette(first) & ~ndimage.binary_dilation(part, iterations=10)
@@ -248,10 +249,11 @@ def test_the_object_is_exported_as_a_textured_mesh(path: Viewer) -> None:
     path.open_tab("Export")
     download = downloaded(path, path.page.get_by_role("link", name="Mesh (GLB)"))
     assert download.suggested_filename.endswith(".glb")
-    (mesh,) = trimesh.load_scene(download.path(), file_type="glb").geometry.values()
+    scene = trimesh.load_scene(download.path(), file_type="glb")
+    (mesh,) = scene.geometry.values()
     stored = stored_mesh(path)
     assert len(mesh.faces) == len(stored.faces)
-    assert np.allclose(mesh.bounds, stored.bounds, atol=1e-3 * np.ptp(stored.bounds))
+    assert np.allclose(scene.bounds, stored.bounds, atol=1e-3 * np.ptp(stored.bounds))
     material = mesh.visual.material
     color = np.asarray(material.baseColorTexture.convert("RGB"), float)
     assert min(color.shape[:2]) >= 256 and color.std() > 10, "a texture with something on it"

@@ -4,6 +4,7 @@ import * as api from './api';
 import type { AssetInfo, BuildRequest, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
 import { editLight, openAsset } from './session';
 import { assets, attempt, environments, jobs, notify, psnrCurves, session, workersAlive } from './state';
+import { holdsAsset } from './zip';
 
 const BUSY_MS = 1000;
 const IDLE_MS = 6000;
@@ -115,7 +116,7 @@ export async function takeFile(file: File, choice: BuildChoice, onProgress: (sha
     editLight({ file: added.name });
     return 'environment';
   }
-  if (/\.(glb|obj|ply)$/.test(name)) {
+  if (/\.(glb|obj|ply)$/.test(name) || (name.endsWith('.zip') && (await holdsAsset(file)))) {
     const added: AssetInfo | null = await attempt(api.uploadAsset(file, onProgress));
     if (!added) return null;
     await attempt(refreshAssets());
