@@ -95,9 +95,15 @@ SCROLL_DOWN = """() => {
 
 def job(name: str, **said: object) -> JobInfo:
     """A finished build, but for what is said."""
-    done: dict = dict(id=name.replace(" ", "-"), kind="build", name=name, preset="fast", priority=100, state="done", created_at=NOW)
-    done |= dict(finished_at=NOW, stage="", iteration=0, iterations=0, fraction=1.0, psnr=None, eta_seconds=None, message="", attempts=1)
-    done |= dict(asset_id=None, source_asset=None, clip=None, error=None, preview_version=0)
+    done = dict.fromkeys(JobInfo.model_fields) | {
+        "id": name.replace(" ", "-"),
+        "name": name,
+        "kind": "build",
+        "preset": "fast",
+        "state": "done",
+    }
+    done |= {"priority": 100, "created_at": NOW, "stage": "", "message": "", "attempts": 1, "iteration": 0, "iterations": 0}
+    done |= {"fraction": 1.0, "preview_version": 0}
     return JobInfo(**(done | said))
 
 
