@@ -111,7 +111,7 @@ def jobs_at(moment: int) -> JobList:
     """One of each sort, and a build that has come a little further each time somebody asks."""
     quality = 31.5 - 14 / (1 + moment)
     running = job("A jug with a long name that says where it was photographed", state="running", finished_at=None, stage="fit")
-    further = {"iteration": 40 * moment, "iterations": 1400, "fraction": min(0.9, 0.05 * moment), "psnr": quality, "eta_seconds": 214.0}
+    further = {"iteration": min(1260, 70 * moment), "iterations": 1400, "fraction": min(0.9, 0.05 * moment), "psnr": quality, "eta_seconds": 214.0}
     listed = [
         running.model_copy(update=further | {"message": "14 203 surfels", "preview_version": moment}),
         job("Cup", state="queued", finished_at=None, fraction=0.0),
