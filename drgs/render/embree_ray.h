@@ -18,9 +18,10 @@ const auto prepare = [](RayHit& ray, const float* origin, const float* direction
     ray.mask = ~0u;
     ray.id = ray.flags = 0;
 };
-// Whether there is a first hit; it is then in `ray`.
-const auto first_hit = [&](unsigned long intersect, RayHit& ray, const float* origin, const float* direction) -> bool {
+// Whether there is a first hit within reach; it is then in `ray`.
+const auto first_hit = [&](unsigned long intersect, RayHit& ray, const float* origin, const float* direction, float reach = __builtin_huge_valf()) -> bool {
     prepare(ray, origin, direction);
+    ray.far = reach;
     ray.triangle = ray.geometry = ~0u;
     for (int k = 0; k < 14; ++k) ray.spare[k] = ~0u;
     ((Question)intersect)((void*)tree, &ray, nullptr);

@@ -63,11 +63,10 @@ def carry_to_mesh(
         if attempt == 2:
             reach = FAR * extent
             facing = -1.0
-        embree_closest(question, tree, here + reach * axis, -axis, i, distance, met, barycentric)
+        embree_closest(question, tree, here + reach * axis, -axis, 2.0 * reach, i, distance, met, barycentric)
         if met[i] >= 0:
             outward = face_normals[met[i]]
-            near = distance[i] < 2.0 * reach
-            if near and wp.dot(outward, n) > facing and wp.dot(outward, axis) > 0.0:  # the outside of the surface
+            if wp.dot(outward, n) > facing and wp.dot(outward, axis) > 0.0:  # the outside of the surface
                 start[i] = here + (reach - distance[i]) * axis + lift * outward
                 surface_normal[i] = outward
                 face[i] = met[i]

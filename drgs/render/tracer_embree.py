@@ -30,7 +30,7 @@ _IS_VOID += "const float along[3] = {direction[0], direction[1], direction[2]};\
     + _IS_VOID
     + """
 RayHit ray;
-const bool met = !is_void && first_hit(question, ray, from, along);
+const bool met = !is_void && first_hit(question, ray, from, along, reach);
 distance.data[i] = met ? ray.far : __builtin_huge_valf();
 face.data[i] = met ? (int)ray.triangle : -1;
 float* const weights = (float*)barycentric.data + 2 * (long)i;
@@ -39,7 +39,7 @@ weights[1] = met ? ray.v : 0.0f;
 """
 )
 def embree_closest(
-    question: wp.uint64, tree: wp.uint64, origin: wp.vec3, direction: wp.vec3, i: int,
+    question: wp.uint64, tree: wp.uint64, origin: wp.vec3, direction: wp.vec3, reach: float, i: int,
     distance: wp.array(dtype=float), face: wp.array(dtype=int), barycentric: wp.array(dtype=wp.vec2),
 ): ...  # fmt: skip
 
@@ -63,7 +63,7 @@ def ask_closest(
     barycentric: wp.array[wp.vec2],
 ):
     i = wp.tid()
-    embree_closest(question, tree, origins[i], directions[i], i, distance, face, barycentric)
+    embree_closest(question, tree, origins[i], directions[i], wp.inf, i, distance, face, barycentric)
     hit[i] = face[i] >= 0
 
 
