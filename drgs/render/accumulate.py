@@ -49,8 +49,9 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-SLICES_A_THREAD = 2
-"""Slices of the image for each thread when passes run side by side: some hold more surface than others."""
+SLICES_A_THREAD = (2, 8)
+"""Slices of the image for each thread when passes run side by side, fewest and most: with few, some thread waits, for one slice's rays may
+cost twice another's; many are worth it where each still holds half of PIXELS_AT_ONCE."""
 PIXELS_AT_ONCE = 32768
 """Camera rays that a thread takes together, of as many passes as that makes: Python's share of the time falls with it."""
 SUMS = ("diffuse", "specular", "weight", "luminance", "luminance_squared", "scatter", "visibility")
@@ -301,7 +302,9 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
             points += len(primary.points.pixel)
         return points, tracing, primary.starts.face
 
-    done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // (SLICES_A_THREAD * thread_count()))))
+    fewest, most = (slices * thread_count() for slices in SLICES_A_THREAD)
+    slices = min(max(fewest, 2 * len(pixels) * count // PIXELS_AT_ONCE), most)
+    done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // slices)))
     traced = sum(seconds for _, seconds, _ in done) / max(1, min(thread_count(), len(done)))
     seconds = {"trace_primary": traced, "shade": max(0.0, time.perf_counter() - clock - traced)}
     starts = torch.cat([faces for *_, faces in done if faces is not None])
