@@ -261,7 +261,7 @@ def _box_lanes(low: Tensor, high: Tensor) -> Tensor:
 class Horizons:
     """The horizons of a mesh's faces, found a share at a time as rays show that they will be needed. Final.
 
-    Rays pay for them: after each pass but the first as many faces are looked at as make up a fixed share of the pass's own cost. The first TRIAL of
+    Rays pay for them, once as many were traced as TRIAL of the faces cost: after each pass as many faces are looked at as make up a fixed share of the pass's own cost. The first TRIAL of
     all faces come in a scattered order, and when they say that hardly a ray would be let off, the search ends; then those that rays
     start from, then the rest.
     """
@@ -287,7 +287,7 @@ class Horizons:
         self._mesh = mesh
         self._lift = lift
         self._rays = 0
-        self._again = False
+        self._waited = 0
         self._open_sky = 0.0
         self._known = torch.zeros(len(mesh.faces), dtype=torch.bool, device=device)
 
@@ -344,10 +344,10 @@ class Horizons:
         """
         if self.found == self.faces or self._hopeless():
             return
-        self._rays += rays
-        if not self._again:  # a mesh that moves with every frame would pay for nothing
-            self._again = True
+        if self._waited < RAYS_A_FACE * TRIAL * self.faces:  # short renders and meshes that move with every frame would never earn it back
+            self._waited += rays
             return
+        self._rays += rays
         trial = math.ceil(TRIAL * self.faces) - self.found
         if trial > 0:
             which, price = self._ahead(trial), RAYS_A_FACE

@@ -19,6 +19,8 @@ from drgs.warp_torch import in_thread_pool, load_kernel, thread_count, thread_po
 
 SLICE_RAYS = 65536
 """Rays of a CPU slice: long enough to hide Python, short enough to balance threads."""
+SHORTEST_SLICE = 4096
+"""Fewer rays are not cut up further to give every thread some."""
 SLICE_RAYS_GPU = 1 << 24
 EXTENTS = (1e-5, 1e9)
 """Diagonals of a mesh's box between which squared areas of triangles neither under- nor overflow [world units]."""
@@ -61,7 +63,7 @@ def over_slices(
     """
     if count == 0:
         return []
-    length = slice_length or (SLICE_RAYS if device.type == "cpu" else SLICE_RAYS_GPU)
+    length = slice_length or (min(SLICE_RAYS, max(SHORTEST_SLICE, -(-count // thread_count()))) if device.type == "cpu" else SLICE_RAYS_GPU)
     if shortest is None:
         slices = -(-count // length)
         edges = [count * k // slices for k in range(slices + 1)]
