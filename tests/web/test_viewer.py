@@ -79,8 +79,8 @@ def test_the_local_picture_agrees_under_another_tone_curve_and_before_a_blurred_
     viewer.page.get_by_role("radio", name="Light", exact=True).check()
     # A lower sun is another environment, which the server computes, and the same tile of the gallery.
     day = viewer.settled_color()
-    viewer.page.get_by_label("Sun height, exact value").fill("3")
-    viewer.page.get_by_label("Sun height, exact value").press("Enter")
+    viewer.page.get_by_label("Elevation, exact value").fill("3")
+    viewer.page.get_by_label("Elevation, exact value").press("Enter")
     wait_until(lambda: viewer.edits()[-1]["file"] == "sun-and-sky-3.exr", "the edit in the server's log")
     expect(viewer.page.get_by_role("radio", name="Sun and sky")).to_be_checked()
     wait_until(lambda: sum(viewer.settled_color()) < 0.7 * sum(day), "an evening")

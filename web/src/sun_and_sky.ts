@@ -19,6 +19,7 @@ export function elevationOf(file: string | null): number | null {
 export function environmentTitle(file: string): string {
   const elevation = elevationOf(file);
   if (elevation !== null) return elevation === USUAL_SUN ? 'Sun and sky' : `Sun ${elevation}° high`;
+  if (file === 'three-point-lights.exr') return 'Three-point';
   const words = file.replace(/\.(exr|hdr)$/i, '').replace(/[-_]/g, ' ');
   return words.charAt(0).toUpperCase() + words.slice(1);
 }

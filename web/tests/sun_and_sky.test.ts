@@ -8,5 +8,6 @@ it('a name tells the height of the sun that it was made of, and other names tell
 
 it('a list calls lights by words', () => {
   expect([40, 12].map((degrees) => environmentTitle(sunAndSky(degrees)))).toEqual(['Sun and sky', 'Sun 12° high']);
+  expect(environmentTitle('three-point-lights.exr')).toBe('Three-point');
   expect(environmentTitle('my-sky_2.exr')).toBe('My sky 2');
 });

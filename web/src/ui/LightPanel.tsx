@@ -57,7 +57,7 @@ function Environment() {
       </div>
       {elevation !== null && (
         <Slider
-          label="Sun height"
+          label="Elevation"
           unit="°"
           value={elevation}
           min={LOWEST_SUN}
@@ -70,7 +70,7 @@ function Environment() {
       )}
       <Slider label="Rotation" unit="°" value={rotation} min={0} max={360} step={1} onChange={(value) => editLight({ rotation: value })} onReset={rotation ? () => editLight({ rotation: 0 }) : undefined} />
       <Slider label="Intensity" unit="×" value={intensity} min={0} max={4} step={0.01} onChange={(value) => editLight({ intensity: value })} onReset={intensity !== 1 ? () => editLight({ intensity: 1 }) : undefined} />
-      <p class="hint">Alt+drag on the picture turns the light{elevation !== null && ', and the sun with it'}.</p>
+      <p class="hint">{elevation !== null && 'Elevation is how high the sun stands. '}Alt+drag on the picture turns the light.</p>
     </Section>
   );
 }
