@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.scene.edits import Edit
+from server.channels import channel_pixels
+from server.indirect_picture import IndirectPicture
 from server.messages import CameraMessage, Settings
 from server.render_session import (
     AbstractLoadedAsset,
@@ -30,12 +32,13 @@ from server.render_session import (
     Pixels,
     view_of_bounds,
 )
+from server.surfel_picture import SurfelPicture
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from drgs.render.accumulate import FrameState
-    from drgs.render.records import Frame, GBuffer
+    from drgs.render.records import Frame
     from drgs.render.tracer import AbstractTracer
     from drgs.scene.asset import Asset
     from drgs.scene.environment import Environment
@@ -49,6 +52,10 @@ CHANNEL_SAMPLES = 32
 """Behind a picture of albedo, normals ...: passes are its antialiasing."""
 _MAPS = {"normal": "normal_world"}
 """Names that the G-buffer has for channels, where they differ."""
+
+
+LIGHT_CHANNELS = ("final", "visibility", "variance")
+"""Channels of Picture that are summed over rays; the others are known once the surface is."""
 
 
 class DrgsRenderer(AbstractRenderer):
@@ -131,21 +138,56 @@ class Pose(AbstractPose):
     def region_of(self, vertex: int) -> int:
         return int(self._regions[vertex])
 
+    def _begin_indirect(
+        self, camera: CameraMessage, settings: Settings, width: int, height: int, previous: AbstractPicture | None
+    ) -> IndirectPicture:
+        light = settings.model_copy(update={"channel": "final", "denoise": False, "background": "transparent"})
+        before = (previous.whole, previous.direct) if isinstance(previous, IndirectPicture) else (previous, None)
+        bounces = (max(1, settings.bounces), 0)  # with none there would be nothing to see
+        pictures = [
+            self.begin(camera, light.model_copy(update={"bounces": count}), width, height, known)
+            for count, known in zip(bounces, before, strict=True)
+        ]
+        whole, direct = (picture for picture in pictures if isinstance(picture, Picture))
+        return IndirectPicture(whole, direct, settings.exposure_stops)
+
+    @cached_property
+    def _under_white_sky(self) -> "PosedScene":
+        """Where every direction is asked about: under the true sky rays towards black texels are not."""
+        import torch
+
+        from drgs.scene.environment import Environment
+
+        white = Environment(torch.ones(8, 16, 3, device=self.scene.mesh.vertices.device))
+        return replace(self.scene, environment=white, environment_rotation_degrees=0.0, environment_intensity=1.0)
+
     @cached_property
     def _regions(self) -> "Tensor":
         from drgs.scene.select_vertices import mesh_regions
 
         return mesh_regions(self.asset.mesh)
 
-    def begin(self, camera: CameraMessage, settings: Settings, width: int, height: int, previous: AbstractPicture | None) -> "Picture":
+    def begin(
+        self, camera: CameraMessage, settings: Settings, width: int, height: int, previous: AbstractPicture | None
+    ) -> AbstractPicture:
         from drgs.render.accumulate import start_frame
 
+        if settings.channel == "indirect":
+            return self._begin_indirect(camera, settings, width, height, previous)
+        if isinstance(previous, SurfelPicture):
+            previous = previous.before
+        if isinstance(previous, IndirectPicture):
+            previous = previous.whole
         known = previous if isinstance(previous, Picture) else None
+        if settings.channel == "surfels":
+            maps = settings.model_copy(update={"channel": "depth"})
+            return SurfelPicture(self.scene, _camera(camera, width, height), known, lambda: self.begin(camera, maps, width, height, known))
         same_view = known is not None and known.view_key == _view_key(camera, width, height)
         if known is not None and same_view and known.pose is self and known.rays_key == _rays_key(settings):
             return known.shown_with(settings)
         before = None if known is None else known._state
-        state = start_frame(self.scene, _camera(camera, width, height), _render_settings(settings), self.tracer, previous=before)
+        scene = self._under_white_sky if settings.channel == "visibility" else self.scene
+        state = start_frame(scene, _camera(camera, width, height), _render_settings(settings), self.tracer, previous=before)
         return Picture(self, state, settings, _view_key(camera, width, height))
 
 
@@ -169,8 +211,9 @@ class Picture(AbstractPicture):
 
     @property
     def samples_target(self) -> int:  # type: ignore[override]
-        wanted = self._settings.spp_target if self._settings.channel == "final" else min(CHANNEL_SAMPLES, self._settings.spp_target)
-        if self._settings.channel != "final" and self._state.fixed is not None:
+        of_light = self._settings.channel in LIGHT_CHANNELS
+        wanted = self._settings.spp_target if of_light else min(CHANNEL_SAMPLES, self._settings.spp_target)
+        if not of_light and self._state.fixed is not None:
             wanted = 1  # maps of Gaussians are exact from the first pass on
         return max(wanted, self._samples_a_pass)
 
@@ -180,12 +223,14 @@ class Picture(AbstractPicture):
         picture._passes_at_once = self._passes_at_once
         return picture
 
-    def refine(self) -> None:
+    def refine(self, up_to: int | None = None) -> None:
+        """Add samples for about REFINE_SECONDS; no more than `up_to` in all, where somebody keeps two pictures in step."""
         from drgs.render.accumulate import refine_frame
 
         if self.samples >= self.samples_target:
             return
-        left = -(-(self.samples_target - self.samples) // self._samples_a_pass)
+        target = self.samples_target if up_to is None else up_to
+        left = -(-(target - self.samples) // self._samples_a_pass)
         passes = min(self._passes_at_once, left)
         start = time.perf_counter()
         self._state = refine_frame(self._state, passes)
@@ -195,7 +240,13 @@ class Picture(AbstractPicture):
     def resolve(self) -> Pixels:
         from drgs.render.accumulate import resolve_frame
 
-        return _pixels(resolve_frame(self._state), self._settings)
+        return channel_pixels(resolve_frame(self._state), self._settings)
+
+    def frame(self) -> "Frame":
+        """With everything that is known so far."""
+        from drgs.render.accumulate import resolve_frame
+
+        return resolve_frame(self._state)
 
     def linear(self) -> LinearPixels:
         import torch
@@ -250,7 +301,9 @@ def _view_key(camera: CameraMessage, width: int, height: int) -> tuple:
 
 def _rays_key(settings: Settings) -> tuple:
     """What of the settings changes the light that is summed, not only how it is shown."""
-    return (settings.bounces if settings.channel == "final" else 0,)
+    if settings.channel in ("final", "variance"):
+        return (settings.bounces, "all")
+    return (0, "sky" if settings.channel == "visibility" else "none")
 
 
 def _camera(message: CameraMessage, width: int, height: int):
@@ -267,17 +320,20 @@ def _camera(message: CameraMessage, width: int, height: int):
 
 def _render_settings(settings: Settings):
     from drgs.render.accumulate import RenderSettings
+    from drgs.render.sample_rays import SampleCounts
 
     background: Any = settings.background
-    if settings.channel != "final":
+    channel = settings.channel
+    if channel != "final":
         background = "transparent"
     elif isinstance(background, tuple):
         background = tuple(_linear(value) for value in background)
     return RenderSettings(
         samples_per_pixel=settings.spp_target,
         samples_per_pass=SAMPLES_PER_PASS,
+        counts=SampleCounts(SAMPLES_PER_PASS, 0, 0) if channel == "visibility" else None,
         bounces=_rays_key(settings)[0],
-        denoise="svgf" if settings.denoise and settings.channel == "final" else "none",
+        denoise="svgf" if settings.denoise and channel == "final" else "none",
         exposure=settings.exposure_stops,
         tone_curve=settings.tone_curve,
         background=background,
@@ -287,34 +343,3 @@ def _render_settings(settings: Settings):
 def _linear(srgb: float) -> float:
     srgb = min(max(srgb, 0.0), 1.0)
     return srgb / 12.92 if srgb <= 0.04045 else ((srgb + 0.055) / 1.055) ** 2.4
-
-
-def _pixels(frame: "Frame", settings: Settings) -> Pixels:
-    import torch
-
-    if settings.channel == "final":
-        rgba = frame.rgba_srgb
-    else:
-        coverage = frame.gbuffer.coverage
-        color = torch.where(coverage[..., None] > 0, _channel(frame.gbuffer, settings.channel), 0.0)
-        rgba = torch.cat([color.clamp(0, 1), coverage.clamp(0, 1)[..., None]], -1)
-    return (rgba.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
-
-
-def _channel(maps: "GBuffer", channel: str) -> "Tensor":
-    """(height, width, 3) in 0..1 for showing."""
-    import torch
-
-    from drgs.maths.color import srgb_from_linear
-
-    if channel == "albedo":
-        return srgb_from_linear(maps.albedo.clamp(0, 1))
-    if channel == "normal":
-        return maps.normal_world * 0.5 + 0.5
-    if channel in ("roughness", "metallic"):
-        return getattr(maps, channel)[..., None].expand(-1, -1, 3)
-    depth = maps.depth[maps.coverage > 0.5]
-    near, far = (float(depth.min()), float(depth.max())) if len(depth) else (0.0, 1.0)
-    # Near is bright; the farthest point stays visible before black.
-    shade = 1 - 0.9 * (maps.depth - near) / max(far - near, 1e-6)
-    return torch.nan_to_num(shade, 0.0, 0.0, 0.0)[..., None].expand(-1, -1, 3)

@@ -35,6 +35,7 @@ _CONSTANTS = (
     "FLAG_CONVERGED",
     "FLAG_ALPHA",
     "CAMERA_NUMBER_SHIFT",
+    "LEAST_SHOWN_ERROR",
 )
 
 _REQUESTS: tuple[type[BaseModel], ...] = (

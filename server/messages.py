@@ -32,7 +32,10 @@ MAX_STILL_SAMPLES = MAX_PICTURE_SAMPLES
 MAX_SPP_TARGET = 65535
 """The header holds 16 bits."""
 
-Channel = Literal["final", "albedo", "roughness", "metallic", "normal", "depth"]
+Channel = Literal["final", "albedo", "roughness", "metallic", "normal", "depth", "visibility", "indirect", "variance", "surfels"]
+"""visibility: open share of the cosine-weighted sky. indirect: light that met another surface. variance: standard error of the pixels'
+luminance, in colours from LEAST_SHOWN_ERROR to 1 (white). surfels: the Gaussians themselves."""
+LEAST_SHOWN_ERROR = 1e-3
 Phase = Literal["loading", "moving", "still", "converged", "paused"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Row = tuple[Finite, Finite, Finite, Finite]

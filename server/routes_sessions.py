@@ -14,7 +14,7 @@ from server.answers import session_info, snapshot_info
 from server.context import ServerContext, context_of
 from server.edit_log import EventKind
 from server.encode import encode_exr_still, encode_jpeg, encode_png
-from server.messages import MAX_SIDE, MAX_STILL_PIXELS, MAX_STILL_SAMPLES, CameraMessage, EditLog, Settings
+from server.messages import MAX_SIDE, MAX_STILL_PIXELS, MAX_STILL_SAMPLES, CameraMessage, Channel, EditLog, Settings
 from server.problems import ProblemError
 from server.render_session import LINEAR_CHANNELS
 from server.rest_records import (
@@ -139,7 +139,7 @@ class FrameQuery(BaseModel):
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
     tone_curve: ToneCurve = "standard"
     background: Literal["environment", "blurred", "transparent"] = "environment"
-    channel: Literal["final", "albedo", "roughness", "metallic", "normal", "depth"] = "final"
+    channel: Channel = "final"
     denoise: bool = False
     world_from_camera: Annotated[str, Field(max_length=1000)] | None = None
     """16 numbers, rows, separated by commas: OpenGL camera-to-world. The start view when absent."""

@@ -172,6 +172,53 @@ def test_the_split_shows_the_object_as_captured_beside_the_present_one(captured:
     captured.wait_for_edits(0)
 
 
+def middle(viewer: Viewer) -> np.ndarray:
+    """Mean colour of the ball's middle, which is that of what the inspector leaves of the window."""
+    picture = viewer.settled_picture()
+    share = viewer.page.locator(".inspector").bounding_box()["x"] / 2 / viewer.page.evaluate("innerWidth")
+    x, y = int(share * picture.shape[1]), picture.shape[0] // 2
+    return picture[y - 12 : y + 12, x - 12 : x + 12].mean((0, 1))
+
+
+def test_number_keys_show_what_lies_behind_the_picture_with_a_legend(captured: Viewer) -> None:
+    shown = captured.page.get_by_role("group", name="Show")
+    captured.page.keyboard.press("7")
+    expect(shown.get_by_role("radio", name="Open sky")).to_be_checked()
+    expect(captured.page.get_by_text("White sees all of the sky")).to_be_visible()
+    wait_until(lambda: middle(captured).min() > 250, "a ball that sees all of the sky")
+    captured.page.keyboard.press("8")
+    wait_until(lambda: middle(captured).max() < 4, "a ball without indirect light")
+    captured.page.keyboard.press("9")
+    expect(captured.page.locator(".legend .scale.heat")).to_be_visible()
+    # From the dark blue of the scale's beginning on; the ball's own red is not on it.
+    wait_until(lambda: (color := middle(captured))[2] > color[0] and color.max() > 8, "blue for little noise")
+    captured.page.keyboard.press("0")
+    expect(captured.page.get_by_text("it has no surfels to show")).to_be_visible()
+    wait_until(lambda: middle(captured).max() < 4, "nothing")
+    captured.page.keyboard.press("1")
+    wait_until(lambda: middle(captured)[0] > 100, "the final picture")
+
+
+def orange_share(viewer: Viewer) -> float:
+    """Share of the screen that has the colour of edges, a mixture with what lies under them."""
+    red, green, blue = np.moveaxis(
+        np.asarray(Image.open(io.BytesIO(viewer.page.screenshot())).convert("RGB"), float)[30:180, 20:210], -1, 0
+    )
+    return float(((red - green > 25) & (green - blue > 25)).mean())
+
+
+def test_the_edges_of_the_mesh_lie_over_any_channel(captured: Viewer) -> None:
+    captured.page.keyboard.press("7")
+    wait_until(lambda: middle(captured).min() > 250, "a white ball")
+    assert orange_share(captured) < 0.002
+    captured.page.get_by_role("switch", name="Edges of the mesh").check()
+    wait_until(lambda: orange_share(captured) > 0.05, "edges over the white ball")
+    captured.page.keyboard.press("e")
+    wait_until(lambda: orange_share(captured) < 0.002, "no edges")
+    captured.page.keyboard.press("1")
+    captured.settle()
+
+
 def test_an_imported_mesh_says_that_it_has_no_photographs(captured: Viewer, ball_file: Path) -> None:
     captured.page.get_by_role("button", name="Library").click()
     captured.page.get_by_label("Capture or mesh").set_input_files(ball_file)

@@ -21,6 +21,7 @@ import {
   LinearToneMapping,
   Matrix4,
   Mesh,
+  MeshBasicMaterial,
   MeshStandardMaterial,
   NeutralToneMapping,
   PerspectiveCamera,
@@ -59,6 +60,8 @@ export class LocalPicture {
   private readonly root = new Group();
   private readonly eye = new PerspectiveCamera();
   private readonly material = new MeshStandardMaterial({ roughness: 1, metalness: 1 });
+  private readonly wireMaterial = new MeshBasicMaterial({ color: EDGE_COLOUR, wireframe: true, transparent: true, opacity: 0.6, toneMapped: false });
+  private wire: Mesh | null = null;
   private readonly pmrem: PMREMGenerator;
   private radiance: WebGLRenderTarget | null = null;
   private sky: Texture | null = null;
@@ -101,7 +104,7 @@ export class LocalPicture {
     this.object?.geometry.dispose();
     this.captured?.geometry.dispose();
     this.root.clear();
-    this.object = this.captured = this.rest = null;
+    this.object = this.captured = this.wire = this.rest = null;
   }
 
   /**
@@ -121,7 +124,9 @@ export class LocalPicture {
     this.dropMesh();
     this.object = new Mesh(geometry, this.material);
     this.object.frustumCulled = false; // its shape changes; it is nearly always in sight
-    this.root.add(this.object);
+    this.wire = new Mesh(geometry, this.wireMaterial);
+    this.wire.frustumCulled = this.wire.visible = false;
+    this.root.add(this.object, this.wire);
     this.rest = {
       positions: copy('position'),
       normals: copy('normal'),
@@ -160,6 +165,11 @@ export class LocalPicture {
     this.write('color', albedo);
     this.write('_roughness', roughness);
     this.write('_metallic', metallic);
+  }
+
+  /** Whether the edges that are not hidden are drawn over the object. */
+  showEdges(on: boolean): void {
+    if (this.wire) this.wire.visible = on;
   }
 
   setHighlighted(weights: Float32Array): void {
@@ -275,7 +285,7 @@ export class LocalPicture {
   }
 
   private drawHalves(split: number | null): void {
-    const { renderer, object } = this;
+    const { renderer, object, wire } = this;
     const captured = split === null ? this.captured : this.capturedMesh();
     if (captured) captured.visible = false;
     if (split === null || !captured || !object) return renderer.render(this.scene, this.eye);
@@ -284,10 +294,13 @@ export class LocalPicture {
     renderer.setScissorTest(true);
     renderer.setScissor(line, 0, width - line, height);
     renderer.render(this.scene, this.eye);
+    const edges = wire?.visible ?? false;
     [object.visible, captured.visible] = [false, true];
+    this.showEdges(false);
     renderer.setScissor(0, 0, line, height);
     renderer.render(this.scene, this.eye);
     [object.visible, captured.visible] = [true, false];
+    this.showEdges(edges);
     renderer.setScissorTest(false);
   }
 
@@ -328,6 +341,8 @@ export class LocalPicture {
   /** Teach the standard material to take roughness and metallic from vertices, as the asset's mesh holds them. */
   private readVertexMaterials(): void {
     this.material.vertexColors = true;
+    this.material.polygonOffset = true; // edges that lie in the surface win
+    this.material.polygonOffsetFactor = this.material.polygonOffsetUnits = 1;
     this.material.onBeforeCompile = (shader) => {
       Object.assign(shader.uniforms, this.uniforms);
       shader.vertexShader = shader.vertexShader
@@ -362,6 +377,8 @@ function completeVertexMaterials(geometry: BufferGeometry, authored: MeshStandar
   return count;
 }
 
+/** Of the mesh's edges: seen on black and on white. */
+const EDGE_COLOUR = 0xf0a63c;
 /** Of selected parts, as GLSL: a blue that few captured things have. */
 const HIGHLIGHT = 'vec3(0.1, 0.65, 1.0)';
 

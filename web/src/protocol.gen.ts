@@ -14,6 +14,7 @@ export const FLAG_MOVING = 1;
 export const FLAG_CONVERGED = 2;
 export const FLAG_ALPHA = 4;
 export const CAMERA_NUMBER_SHIFT = 8;
+export const LEAST_SHOWN_ERROR = 0.001;
 
 /** The 24 little-endian bytes before each picture; see docs/protocol.md. */
 export interface FrameHeader {
@@ -582,7 +583,7 @@ export interface Settings {
   spp_target?: number;
   /** Indirect bounces; 0 is direct light with shadows only. */
   bounces?: number;
-  channel?: "final" | "albedo" | "roughness" | "metallic" | "normal" | "depth";
+  channel?: "final" | "albedo" | "roughness" | "metallic" | "normal" | "depth" | "visibility" | "indirect" | "variance" | "surfels";
   /** Filter what is left of the noise; the filter follows the measured variance, so it fades as samples add up. */
   denoise?: boolean;
 }

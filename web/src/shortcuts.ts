@@ -12,7 +12,8 @@ export interface Shortcut {
 
 export type ActionName =
   | 'frame' | 'home' | 'undo' | 'redo' | 'help' | 'escape' | 'local' | 'theme' | 'library' | 'inspector'
-  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'still' | 'remove' | 'turn' | 'before' | 'fly' | 'all' | 'copy' | 'paste' | 'show'
+  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'channel7' | 'channel8' | 'channel9' | 'channel10'
+  | 'wireframe' | 'still' | 'remove' | 'turn' | 'before' | 'fly' | 'all' | 'copy' | 'paste' | 'show'
   | 'photographs' | 'previousView' | 'nextView' | 'split';
 
 export const shortcuts: Shortcut[] = [
@@ -44,6 +45,11 @@ export const shortcuts: Shortcut[] = [
   { group: 'View', chords: ['4'], text: 'Metallic', action: 'channel4' },
   { group: 'View', chords: ['5'], text: 'Normal', action: 'channel5' },
   { group: 'View', chords: ['6'], text: 'Depth', action: 'channel6' },
+  { group: 'View', chords: ['7'], text: 'Open sky (visibility)', action: 'channel7' },
+  { group: 'View', chords: ['8'], text: 'Indirect light', action: 'channel8' },
+  { group: 'View', chords: ['9'], text: 'Noise (variance)', action: 'channel9' },
+  { group: 'View', chords: ['0'], text: 'Surfels', action: 'channel10' },
+  { group: 'View', chords: ['e'], text: 'Edges of the mesh', action: 'wireframe' },
   { group: 'View', chords: ['c'], text: 'Compare with a photograph, or leave it', action: 'photographs' },
   { group: 'View', chords: ['arrowleft'], text: 'Comparing: the photograph before', action: 'previousView' },
   { group: 'View', chords: ['arrowright'], text: 'Comparing: the next photograph', action: 'nextView' },

@@ -9,6 +9,7 @@ import { effect, untracked } from '@preact/signals';
 import CameraControls from 'camera-controls';
 import { Box3, Matrix4, MOUSE, PerspectiveCamera, Quaternion, Raycaster, Sphere, Spherical, Vector2, Vector3, Vector4 } from 'three';
 import * as api from './api';
+import { wireframe } from './channels';
 import { Flight } from './flight';
 import { frameBox } from './framing';
 import { Gizmo } from './gizmo';
@@ -254,6 +255,10 @@ export class Viewport {
       this.flight.turn(flying.value);
     });
     effect(() => {
+      wireframe.value;
+      this.localDirty = true;
+    });
+    effect(() => {
       this.stage.dataset.split = String(this.splitAt !== null);
       this.stage.style.setProperty('--split', `${100 * (this.splitAt ?? 0)}%`);
       this.localDirty = true;
@@ -359,7 +364,9 @@ export class Viewport {
     const marks = this.marksPins;
     const strength = marks ? PINS_STRENGTH : !flashing ? 0 : this.stillMotion ? 0.5 : 0.85 * Math.sin((2 * Math.PI * since) / FLASH_MS) ** 2;
     // Over a traced picture only the selection is drawn, on nothing.
-    const overlay = ((flashing && isAnalytic(edits.value)) || marks) && !(this.localShows && !this.fresh) && !before.value && this.splitAt === null;
+    const edges = wireframe.value && isAnalytic(edits.value) && !before.value;
+    this.local.showEdges(edges);
+    const overlay = ((flashing && isAnalytic(edits.value)) || marks || edges) && !(this.localShows && !this.fresh) && !before.value && this.splitAt === null;
     if (flashing || this.stage.dataset.overlay !== String(overlay)) this.localDirty = true;
     this.stage.dataset.overlay = String(overlay);
     if (!this.localShows && !overlay && !before.value && this.splitAt === null) return;

@@ -1,6 +1,7 @@
 /** The page: full-window stage, panels over it, files dropped anywhere. */
 
 import { useEffect, useRef, useState } from 'preact/hooks';
+import { CHANNELS, wireframe } from '../channels';
 import { stepView, turnPhotographs, viewNumber } from '../photographs';
 import { redo, undo, changeSettings } from '../session';
 import { selectAll } from '../selecting';
@@ -35,7 +36,6 @@ export function App() {
     void import('../viewport').then(({ Viewport }) => {
       if (!gone) viewport.current = new Viewport(stage.current!, traced.current!, local.current!);
     });
-    const channel = (name: 'final' | 'albedo' | 'roughness' | 'metallic' | 'normal' | 'depth') => () => changeSettings({ channel: name });
     const actions: Actions = {
       frame: () => viewport.current?.frame(),
       home: () => viewport.current?.reset(),
@@ -60,12 +60,8 @@ export function App() {
       theme: () => (theme.value = theme.value === 'dark' ? 'light' : 'dark'),
       library: () => (libraryOpen.value = !libraryOpen.value),
       inspector: () => (inspectorOpen.value = !inspectorOpen.value),
-      channel1: channel('final'),
-      channel2: channel('albedo'),
-      channel3: channel('roughness'),
-      channel4: channel('metallic'),
-      channel5: channel('normal'),
-      channel6: channel('depth'),
+      ...Object.fromEntries(CHANNELS.map(({ value }, i) => [`channel${i + 1}`, () => changeSettings({ channel: value })])),
+      wireframe: () => session.value && (wireframe.value = !wireframe.value),
       photographs: () => session.value && turnPhotographs(viewNumber.value === null),
       previousView: () => stepView(-1),
       nextView: () => stepView(1),

@@ -1,5 +1,6 @@
 /** What the picture is right now: samples, size, speed, and whether the server is there. */
 
+import { entryOf } from '../channels';
 import { connection, session, settings, status } from '../state';
 
 const PHASE_TEXT = { loading: 'Loading the asset…', moving: 'Moving', still: 'Refining', converged: 'Converged', paused: 'Paused' };
@@ -17,7 +18,7 @@ export function Hud() {
       <span role="status">{state}</span>
       {now && now.width > 0 && link === 'open' && (
         <>
-          {settings.value.channel === 'final' && (
+          {entryOf(settings.value.channel).lit && (
             <span class="hud-samples">
               Sample {now.spp}/{now.spp_target}
             </span>
@@ -35,7 +36,7 @@ export function Hud() {
           )}
         </>
       )}
-      {now && link === 'open' && now.phase !== 'converged' && settings.value.channel === 'final' && (
+      {now && link === 'open' && now.phase !== 'converged' && entryOf(settings.value.channel).lit && (
         <div class="hud-bar" aria-hidden="true">
           <div style={{ width: `${(100 * now.spp) / Math.max(1, now.spp_target)}%` }} />
         </div>

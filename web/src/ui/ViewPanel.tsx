@@ -1,20 +1,35 @@
 /** What the picture shows, and how well. */
 
-import type { Settings } from '../protocol.gen';
+import { CHANNELS, entryOf, wireframe } from '../channels';
 import { changeSettings } from '../session';
-import { titleFor } from '../shortcuts';
-import { flying, localPicture, resolution, settings, status } from '../state';
+import { titleFor, type ActionName } from '../shortcuts';
+import { isAnalytic } from '../shape';
+import { assets, edits, flying, localPicture, resolution, session, settings, status } from '../state';
 import { CompareSection } from './Compare';
 import { Choice, Section, Switch } from './fields';
 
-export const CHANNELS: { value: NonNullable<Settings['channel']>; text: string }[] = [
-  { value: 'final', text: 'Final' },
-  { value: 'albedo', text: 'Albedo' },
-  { value: 'roughness', text: 'Rough' },
-  { value: 'metallic', text: 'Metal' },
-  { value: 'normal', text: 'Normal' },
-  { value: 'depth', text: 'Depth' },
-];
+function Legend() {
+  const { channel } = settings.value;
+  const { legend, scale } = entryOf(channel);
+  const meshOnly = assets.value?.find(({ id }) => id === session.value?.asset)?.surfel_count === 0;
+  if (channel === 'surfels' && meshOnly) return <p class="hint">This asset was made from a mesh: it has no surfels to show.</p>;
+  if (!legend) return null;
+  return (
+    <div class="legend">
+      {scale && (
+        <>
+          <div class={`scale ${scale.kind}`} aria-hidden="true" />
+          <div class="marks" aria-hidden="true">
+            {scale.marks.map((mark) => (
+              <span>{mark}</span>
+            ))}
+          </div>
+        </>
+      )}
+      <p class="hint">{legend}</p>
+    </div>
+  );
+}
 
 export function ViewPanel() {
   const { channel, spp_target, bounces, denoise } = settings.value;
@@ -22,7 +37,17 @@ export function ViewPanel() {
   return (
     <>
       <Section title="Channel">
-        <Choice bare label="Show" value={channel} options={CHANNELS} onChange={(value) => changeSettings({ channel: value })} />
+        <Choice
+          bare
+          columns={5}
+          label="Show"
+          value={channel}
+          options={CHANNELS.map(({ value, text, title }, i) => ({ value, text, title: titleFor(`channel${i + 1}` as ActionName, title) }))}
+          onChange={(value) => changeSettings({ channel: value })}
+        />
+        <Legend />
+        <Switch label="Edges of the mesh" title={titleFor('wireframe', 'Drawn over the picture by the browser')} value={wireframe.value} onChange={(value) => (wireframe.value = value)} />
+        {wireframe.value && !isAnalytic(edits.value) && <p class="hint">The browser does not know the shape of a simulation or a clip: its edges are not shown.</p>}
       </Section>
       <Section title="Quality">
         <Choice

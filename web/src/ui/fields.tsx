@@ -237,16 +237,18 @@ interface ChoiceProps<T extends string> {
   options: { value: T; text: string; title?: string }[];
   /** Show no label: what stands above says it already. */
   bare?: boolean;
+  /** Absent: all in one row. */
+  columns?: number;
   onChange(value: T): void;
 }
 
 /** One of a few, as joined buttons (radio buttons to a screen reader and the arrow keys). */
-export function Choice<T extends string>({ label, value, options, bare, onChange }: ChoiceProps<T>) {
+export function Choice<T extends string>({ label, value, options, bare, columns, onChange }: ChoiceProps<T>) {
   const name = `choice-${label.toLowerCase().replace(/\W+/g, '-')}`;
   return (
     <fieldset class="choice">
       <legend class={bare ? 'visually-hidden' : undefined}>{label}</legend>
-      <div class="choice-row">
+      <div class={columns ? 'choice-row grid' : 'choice-row'} style={columns ? { '--columns': columns } : undefined}>
         {options.map((option) => (
           <label title={option.title}>
             <input type="radio" name={name} value={option.value} checked={option.value === value} onChange={() => onChange(option.value)} />

@@ -1,0 +1,119 @@
+"""Each channel shows what its name says, on scenes where that is known."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from drgs.maths.color import srgb_from_linear
+from drgs.scene.asset import Asset
+from drgs.scene.environment import Environment
+from drgs.scene.mesh import TriangleMesh
+from server.channels import HEAT_SRGB, heat
+from server.drgs_renderer import LoadedAsset, Picture, Pose
+from server.indirect_picture import IndirectPicture
+from server.messages import LEAST_SHOWN_ERROR, CameraMessage, Channel, Settings
+from server.render_session import AbstractPicture
+from server.surfel_picture import NO_SURFELS
+from tests.build.surfel_spheres import surfel_sphere
+from tests.render.closed_form_scenes import constant_sky, mesh_of, sphere_mesh, sunny_sky, two_spheres
+
+SIDE = 32
+FRONT = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, -6.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+"""Looks along +y at the origin."""
+
+
+def posed(mesh: TriangleMesh, sky: Environment | None = None, **parts: object) -> Pose:
+    asset = Asset(None, mesh, None, sky or constant_sky(), **parts)  # type: ignore[arg-type]
+    return LoadedAsset(asset, Path("none")).pose([], None)
+
+
+def picture_of(pose: Pose, channel: Channel, previous: AbstractPicture | None = None, camera=FRONT, fov: float = 40, **settings):
+    message = CameraMessage(type="camera", world_from_camera=camera, fov_y_degrees=fov, width=SIDE, height=SIDE)
+    picture = pose.begin(message, Settings(channel=channel, **settings), SIDE, SIDE, previous)
+    while picture.samples < picture.samples_target:
+        picture.refine()
+    return picture
+
+
+def seen(picture: AbstractPicture) -> np.ndarray:
+    """(n, 3) colours of the pixels that the object covers wholly."""
+    pixels = picture.resolve()
+    return pixels[pixels[..., 3] == 255][:, :3].astype(float)
+
+
+def test_a_ball_in_the_open_sees_all_of_the_sky_even_a_black_one_and_two_balls_hide_some_of_it() -> None:
+    black_below = constant_sky()
+    black_below.radiance[8:] = 0
+    assert seen(picture_of(posed(sphere_mesh(), black_below), "visibility", spp_target=16)).min() == 255
+    pair = seen(picture_of(posed(two_spheres()), "visibility", spp_target=64))
+    assert pair.min() < 200 and pair.max() == 255
+
+
+def test_the_floor_before_a_wall_sees_as_much_sky_as_its_form_factor_leaves() -> None:
+    floor = trimesh.Trimesh([[-60, -60, 0], [60, -60, 0], [60, 0, 0], [-60, 0, 0]], [[0, 1, 2], [0, 2, 3]])
+    wall = trimesh.Trimesh([[-60, 0, 0], [60, 0, 0], [60, 0, 2], [-60, 0, 2]], [[0, 1, 2], [0, 2, 3]])
+    pose = posed(mesh_of(trimesh.util.concatenate([floor, wall]), 0.5, 0.5, 0.0), sunny_sky())
+    distance, height = 0.5, 2.0
+    above = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, -distance), (0.0, 0.0, 1.0, 1.5), (0.0, 0.0, 0.0, 1.0))
+    values = seen(picture_of(pose, "visibility", camera=above, fov=1.0, spp_target=256))
+    hidden = 0.5 * (1 - distance / math.hypot(distance, height))
+    assert values.mean() / 255 == pytest.approx(1 - hidden, abs=0.01)
+
+
+def test_a_ball_alone_has_no_indirect_light_and_between_two_it_is_what_bounces_add() -> None:
+    assert seen(picture_of(posed(sphere_mesh(), sunny_sky()), "indirect", spp_target=16, bounces=2, denoise=False)).max() == 0
+    pose, light = posed(two_spheres(), sunny_sky()), {"denoise": False, "spp_target": 32}
+    indirect = picture_of(pose, "indirect", **light)
+    assert isinstance(indirect, IndirectPicture) and indirect.whole.samples == indirect.direct.samples == 32
+    whole, direct = (picture_of(pose, "final", bounces=bounces, **light).frame().radiance_linear for bounces in (1, 0))
+    added = srgb_from_linear((whole - direct).clamp(0, 1)).numpy()
+    shown = indirect.resolve()
+    covered = shown[..., 3] == 255
+    assert float((whole - direct).min()) > -1e-5 and np.abs(shown[covered][:, :3] / 255 - added[covered]).max() < 0.005
+    assert seen(indirect).max() > 60
+    # With no bounces set the channel still shows one: nothing else would be seen of it.
+    assert seen(picture_of(posed(two_spheres()), "indirect", spp_target=16, bounces=0)).max() > 20
+
+
+def test_the_noise_that_is_shown_falls_as_samples_add_up() -> None:
+    pose = posed(two_spheres(), sunny_sky())
+    errors = []
+    for samples in (16, 256):
+        picture = picture_of(pose, "variance", spp_target=samples)
+        colors = torch.tensor(seen(picture)) / 255
+        scale = heat(10.0 ** torch.linspace(-3, 0, 400))
+        place = (colors[:, None] - scale).square().sum(-1).argmin(-1).double() / 399
+        errors.append(float((10 ** (3 * place - 3)).mean()))
+    assert errors[1] < 0.4 * errors[0] and errors[0] > 2 * LEAST_SHOWN_ERROR
+
+
+def test_errors_become_colours_that_grow_brighter_from_end_to_end_of_the_scale() -> None:
+    ends = heat(torch.tensor([0.0, LEAST_SHOWN_ERROR, 1.0, 50.0])) * 255
+    assert torch.allclose(ends, torch.tensor([HEAT_SRGB[0], HEAT_SRGB[0], HEAT_SRGB[-1], HEAT_SRGB[-1]]).float(), atol=1e-3)
+    brightness = heat(10.0 ** torch.linspace(-3, 0, 50)) @ torch.tensor([0.2126, 0.7152, 0.0722])
+    assert bool((brightness.diff() > 0).all())
+
+
+def test_surfels_are_shown_in_many_colours_and_the_next_picture_goes_on_with_the_one_before() -> None:
+    asset = Asset(surfel_sphere(300), sphere_mesh(), None, constant_sky())
+    pose = LoadedAsset(asset, Path("none")).pose([], None)
+    final = picture_of(pose, "final", spp_target=16)
+    surfels = picture_of(pose, "surfels", final)
+    hues = {tuple(color) for color in (seen(surfels) // 64).tolist()}
+    assert len(hues) > 8, "grey plastic has one colour"
+    picked = surfels.pick(0.5, 0.5)
+    assert picked is not None and picked.position[1] == pytest.approx(-1, abs=0.05) and surfels.pick(0.01, 0.01) is None
+    again = pose.begin(
+        CameraMessage(type="camera", world_from_camera=FRONT, fov_y_degrees=40, width=SIDE, height=SIDE),
+        Settings(channel="final", spp_target=16), SIDE, SIDE, surfels,
+    )  # fmt: skip
+    assert isinstance(again, Picture) and again.samples == final.samples
+
+
+def test_a_mesh_has_no_surfels_and_says_so() -> None:
+    picture = picture_of(posed(sphere_mesh()), "surfels")
+    assert picture.resolve().max() == 0 and picture.notes == (NO_SURFELS,)
