@@ -149,7 +149,7 @@ class Pose(AbstractPose):
             for count, known in zip(bounces, before, strict=True)
         ]
         whole, direct = (picture for picture in pictures if isinstance(picture, Picture))
-        return IndirectPicture(whole, direct, settings.exposure_stops)
+        return IndirectPicture(whole, direct, settings)
 
     @cached_property
     def _under_white_sky(self) -> "PosedScene":

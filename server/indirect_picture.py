@@ -6,6 +6,7 @@ Both are summed side by side. They draw the same numbers, so that what they shar
 from typing import TYPE_CHECKING
 
 from server.channels import eight_bit
+from server.messages import Settings
 from server.render_session import AbstractPicture, Explanation, LinearPixels, Picked, Pixels
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 class IndirectPicture(AbstractPicture):
     """Final."""
 
-    def __init__(self, whole: "Picture", direct: "Picture", exposure_stops: float) -> None:
+    def __init__(self, whole: "Picture", direct: "Picture", settings: Settings) -> None:
         """
         Args:
             whole: with bounces, not denoised. direct: the same view with none.
@@ -23,7 +24,7 @@ class IndirectPicture(AbstractPicture):
         self.whole, self.direct = whole, direct
         self.width, self.height = whole.width, whole.height
         self.notes = whole.notes
-        self._exposure_stops = exposure_stops
+        self._settings = settings
 
     @property
     def samples(self) -> int:  # type: ignore[override]
@@ -47,7 +48,7 @@ class IndirectPicture(AbstractPicture):
 
         whole, direct = self.whole.frame(), self.direct.frame()
         linear = (whole.radiance_linear - direct.radiance_linear).clamp(min=0)
-        return eight_bit(tonemap(linear, whole.gbuffer.coverage, self._exposure_stops))
+        return eight_bit(tonemap(linear, whole.gbuffer.coverage, self._settings.exposure_stops, curve=self._settings.tone_curve))
 
     def linear(self) -> LinearPixels:
         raise ValueError("indirect light is for looking at only")

@@ -223,5 +223,5 @@ def test_an_imported_mesh_says_that_it_has_no_photographs(captured: Viewer, ball
     captured.page.get_by_role("button", name="Library").click()
     captured.page.get_by_label("Capture or mesh").set_input_files(ball_file)
     expect(captured.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=120_000)
-    expect(captured.page.get_by_text("this asset was made from a mesh")).to_be_visible()
+    expect(captured.page.get_by_text("this asset was made from a mesh")).to_be_visible(timeout=30_000)
     assert captured.complaints == []
