@@ -1,6 +1,7 @@
 /** From where an object fills what panels leave of the window. */
 
 import { Vector2, Vector3, type Box3, type PerspectiveCamera } from 'three';
+import { freeArea } from './free_area';
 
 /** Room around a framed object: 1 is none. */
 const MARGIN = 1.06;
@@ -24,22 +25,4 @@ export function frameBox(box: Box3, direction: Vector3, camera: PerspectiveCamer
   const unitsPerPixel = (2 * tangent * distance) / height;
   const focalOffset = new Vector2((width / 2 - free.x) * unitsPerPixel, (height / 2 - free.y) * unitsPerPixel);
   return { eye: back.multiplyScalar(distance).add(center), center, focalOffset };
-}
-
-/** Centre and size of what bars and open panels leave of the window [CSS pixels]. */
-function freeArea(width: number, height: number): { x: number; y: number; width: number; height: number } {
-  const { left, right, top, bottom } = freeEdges(width, height);
-  return { x: (left + right) / 2, y: (top + bottom) / 2, width: right - left, height: bottom - top };
-}
-
-/** Of what bars and open panels leave of the window [CSS pixels]. */
-export function freeEdges(width: number, height: number): { left: number; right: number; top: number; bottom: number } {
-  const edge = (selector: string, side: 'left' | 'right' | 'top' | 'bottom') => document.querySelector(selector)?.getBoundingClientRect()[side];
-  const narrow = width < 620; // panels lie below the picture then
-  return {
-    left: narrow ? 0 : (edge('.library', 'right') ?? 0),
-    right: narrow ? width : (edge('.inspector', 'left') ?? width),
-    top: edge('.topbar', 'bottom') ?? 0,
-    bottom: (narrow ? edge('.panel', 'top') : (edge('.view-bar', 'top') ?? edge('.hud', 'top'))) ?? height,
-  };
 }

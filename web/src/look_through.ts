@@ -2,7 +2,7 @@
 
 import type CameraControls from 'camera-controls';
 import { Matrix4, Quaternion, Vector3, type PerspectiveCamera, type Sphere } from 'three';
-import { freeEdges } from './framing';
+import { freeEdges } from './free_area';
 import { photographPlace, placeView, viewInSight } from './photographs';
 import type { TrainingView } from './protocol.gen';
 

@@ -1,19 +1,23 @@
 /** Photograph, captured object and divider over the picture, and what the View page says of them. */
 
 import * as api from '../api';
+import { freeEdges } from '../free_area';
 import { photographInSight, photographOpacity, photographPlace, split, stepView, trainingViews, turnPhotographs, viewInSight, viewNumber } from '../photographs';
 import { titleFor } from '../shortcuts';
 import { session } from '../state';
 import { Section, Slider, Switch } from './fields';
 import { Icon } from './icons';
 
-const FIRST_SPLIT = 0.5;
 const STEP = 0.01;
 const BIG_STEP = 0.1;
 /** The divider can't be pushed out of the window. */
 const EDGE = 0.02;
 
-export const turnSplit = () => (split.value = split.value === null ? FIRST_SPLIT : null);
+/** At first through the middle of what the panels leave free, where the object is. */
+export function turnSplit(): void {
+  const { left, right } = freeEdges(window.innerWidth, window.innerHeight);
+  split.value = split.value === null ? (left + right) / 2 / window.innerWidth : null;
+}
 
 /** The photograph where the camera shows the same; it takes no pointer. */
 function Photograph() {
