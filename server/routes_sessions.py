@@ -8,7 +8,7 @@ from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from drgs.scene.edits import Edit
+from drgs.scene.edits import Edit, EnvironmentEdit
 from drgs.scene.tone_curve import ToneCurve
 from server.answers import session_info, snapshot_info
 from server.context import ServerContext, context_of
@@ -141,6 +141,8 @@ class FrameQuery(BaseModel):
     background: Literal["environment", "blurred", "transparent"] = "environment"
     channel: Channel = "final"
     denoise: bool = False
+    captured: bool = False
+    """Without what was done to material and shape; the light stays."""
     world_from_camera: Annotated[str, Field(max_length=1000)] | None = None
     """16 numbers, rows, separated by commas: OpenGL camera-to-world. The start view when absent."""
     fov_y_degrees: Annotated[float, Field(gt=0.1, lt=175)] | None = None
@@ -185,8 +187,11 @@ async def read_frame(
         channel=query.channel,
         denoise=query.denoise,
     )
-    call = context.render_thread.call
-    picture = await asyncio.wrap_future(call(lambda: posed.pose.begin(camera, settings, query.width, query.height, None)))
+    call, pose = context.render_thread.call, posed.pose
+    if query.captured:
+        loaded, light = session.loaded, [edit for edit in session.log.done if isinstance(edit, EnvironmentEdit)]
+        pose = await asyncio.wrap_future(call(lambda: loaded.pose(light, posed.pose)))
+    picture = await asyncio.wrap_future(call(lambda: pose.begin(camera, settings, query.width, query.height, None)))
     # One call a refinement: viewers get their turns in between.
     while picture.samples < picture.samples_target:
         await asyncio.wrap_future(call(picture.refine))

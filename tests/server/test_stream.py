@@ -314,6 +314,10 @@ def test_one_picture_over_rest(service: Service) -> None:
     assert response.headers["content-type"] == "image/png" and response.headers["x-drgs-revision"] == "1"
     picture = np.asarray(Image.open(io.BytesIO(response.content)))
     assert picture.shape == (30, 40, 3) and picture[0, 0].tolist() == [1, 138, 16]
+    service.client.post(f"{url}/edits", json={"edit": {"op": "environment", "rotation": 30}})
+    as_captured = service.client.get(f"{url}/frame.png?width=40&height=30&spp=16&captured=true")
+    # The light is an edit too, and stays.
+    assert np.asarray(Image.open(io.BytesIO(as_captured.content)))[0, 0, 0] == 1
     assert service.client.get(f"{url}/frame.jpg").headers["content-type"] == "image/jpeg"
     bad = service.client.get(f"{url}/frame.png?world_from_camera=1,2")
     assert bad.status_code == 422 and "16 numbers" in bad.json()["detail"]

@@ -161,6 +161,9 @@ def test_the_split_shows_the_object_as_captured_beside_the_present_one(captured:
         return left.max() > 100 and right.max() < 90
 
     wait_until(is_black_on_the_right_only, lambda: f"colours left and right of the divider: {halves(captured)}")
+    # Traced as well, once the camera has been still for a while.
+    expect(captured.page.locator(".captured-still")).to_be_visible(timeout=60_000)
+    wait_until(is_black_on_the_right_only, lambda: f"colours beside the divider: {halves(captured)}")
     box = divider.bounding_box()
     captured.page.mouse.move(box["x"] + 12, 150)
     captured.page.mouse.down()

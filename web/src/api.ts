@@ -146,6 +146,9 @@ export function frameQuery(view: View, { width, height }: { width: number; heigh
   return query.toString();
 }
 
+/** A picture of the object without what was done to its material and shape, under the present light. */
+export const capturedPicture = async (session: string, query: string) => (await file(`/api/sessions/${part(session)}/frame.jpg?${query}&captured=true`)).blob();
+
 export type StillFormat = 'png' | 'exr';
 
 export const stillPicture = async (session: string, query: string, format: StillFormat) => (await file(`/api/sessions/${part(session)}/frame.${format}?${query}`)).blob();

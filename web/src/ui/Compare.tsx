@@ -1,6 +1,7 @@
 /** Photograph, captured object and divider over the picture, and what the View page says of them. */
 
 import * as api from '../api';
+import { capturedStill } from '../captured_still';
 import { freeEdges } from '../free_area';
 import { photographInSight, photographOpacity, photographPlace, split, stepView, trainingViews, turnPhotographs, viewInSight, viewNumber } from '../photographs';
 import { titleFor } from '../shortcuts';
@@ -38,6 +39,13 @@ function Photograph() {
       }}
     />
   );
+}
+
+/** Over the local picture of the same, once it is there. */
+function CapturedStill() {
+  const url = capturedStill.value;
+  if (url === null || split.value === null) return null;
+  return <img class="captured-still" src={url} alt="The object as captured" style={{ clipPath: `inset(0 ${100 * (1 - split.value)}% 0 0)` }} />;
 }
 
 function Divider() {
@@ -101,6 +109,7 @@ function ViewBar() {
 export function Compare() {
   return (
     <>
+      <CapturedStill />
       <Photograph />
       <Divider />
       <ViewBar />
