@@ -121,7 +121,10 @@ def build(
     if json_progress:
         print(json.dumps({"stage": "done", "fraction": 1.0, "asset": str(out), "provenance": asset.provenance}), flush=True)
     else:
-        print(f"Asset written to {out}: {len(asset.mesh.faces)} faces. Look at it with: drgs serve", file=sys.stderr)
+        print(
+            f"Asset written to {out}: {len(asset.mesh.faces)} faces. To look at it: drgs serve, and drop the folder, zipped, on its page",
+            file=sys.stderr,
+        )
 
 
 @app.command()

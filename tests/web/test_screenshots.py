@@ -91,6 +91,10 @@ SCROLL_DOWN = """() => {
   }
   return any;
 }"""
+PICTURES_ARE_THERE = """() => [...document.querySelectorAll('.panel img')].every((image) => {
+  const { top, bottom } = image.getBoundingClientRect();
+  return image.complete || bottom < 0 || top > innerHeight;
+})"""
 
 
 def job(name: str, **said: object) -> JobInfo:
@@ -111,7 +115,13 @@ def jobs_at(moment: int) -> JobList:
     """One of each sort, and a build that has come a little further each time somebody asks."""
     quality = 31.5 - 14 / (1 + moment)
     running = job("A jug with a long name that says where it was photographed", state="running", finished_at=None, stage="fit")
-    further = {"iteration": min(1260, 70 * moment), "iterations": 1400, "fraction": min(0.9, 0.05 * moment), "psnr": quality, "eta_seconds": 214.0}
+    further = {
+        "iteration": min(1260, 70 * moment),
+        "iterations": 1400,
+        "fraction": min(0.9, 0.05 * moment),
+        "psnr": quality,
+        "eta_seconds": 214.0,
+    }
     listed = [
         running.model_copy(update=further | {"message": "14 203 surfels", "preview_version": moment}),
         job("Cup", state="queued", finished_at=None, fraction=0.0),
@@ -178,6 +188,7 @@ def shown(server: RunningServer, browser: Browser, ball_file: Path) -> Iterator[
 def look(viewer: Viewer, folder: Path, name: str) -> list[str]:
     """Keep a picture, a second one of what a panel has further down, and say what is wrong with what is shown."""
     viewer.page.mouse.move(5, viewer.page.viewport_size["height"] - 5)
+    viewer.page.wait_for_function(PICTURES_ARE_THERE)
     viewer.page.screenshot(path=folder / f"{name}.png")
     if viewer.page.evaluate(SCROLL_DOWN):
         viewer.page.screenshot(path=folder / f"{name}-end.png")
