@@ -2,11 +2,9 @@
 
 import CameraControls from 'camera-controls';
 import { Vector3, type PerspectiveCamera, type Sphere } from 'three';
+import { flightStep } from './flight_step';
 import { flying } from './state';
 
-/** In object radii a second; shift makes it so many times faster, alt slower. */
-const SPEED = 0.8;
-const FACTOR = 4;
 /** Physical keys, so that they lie together on every keyboard. */
 const CODES = ['KeyW', 'KeyA', 'KeyS', 'KeyD', 'KeyQ', 'KeyE'];
 
@@ -52,13 +50,7 @@ export class Flight {
   /** Once each animation frame. */
   move(seconds: number): void {
     if (!flying.value || this.held.size === 0) return;
-    const has = (...codes: string[]) => (codes.some((code) => this.held.has(code)) ? 1 : 0);
-    const faster = has('ShiftLeft', 'ShiftRight') ? FACTOR : has('AltLeft', 'AltRight') ? 1 / FACTOR : 1;
-    const step = SPEED * faster * this.bounds.radius * Math.min(seconds, 0.1);
-    const move = this.camera.getWorldDirection(new Vector3()).multiplyScalar((has('KeyW') - has('KeyS')) * step);
-    move.addScaledVector(new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0), (has('KeyD') - has('KeyA')) * step);
-    move.addScaledVector(this.camera.up, (has('KeyE') - has('KeyQ')) * step);
-    const target = this.controls.getTarget(new Vector3()).add(move);
+    const target = this.controls.getTarget(new Vector3()).add(flightStep(this.held, this.camera, this.bounds.radius, seconds));
     void this.controls.moveTo(target.x, target.y, target.z, true);
   }
 }

@@ -3,6 +3,7 @@
 /** Centre and size of what bars and open panels leave of the window [CSS pixels]. */
 export function freeArea(width: number, height: number): { x: number; y: number; width: number; height: number } {
   const { left, right, top, bottom } = freeEdges(width, height);
+  if (right <= left || bottom <= top) return { x: width / 2, y: height / 2, width, height }; // panels cover all
   return { x: (left + right) / 2, y: (top + bottom) / 2, width: right - left, height: bottom - top };
 }
 

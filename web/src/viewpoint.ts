@@ -1,6 +1,7 @@
 /** Where the picture is seen from, for whatever else wants the same picture: stills and scripts. Written by the viewport. */
 
 import { signal } from '@preact/signals';
+import type { PerspectiveCamera } from 'three';
 
 export type Row = [number, number, number, number];
 
@@ -10,6 +11,13 @@ export interface View {
   fov_y_degrees: number;
   width: number;
   height: number;
+}
+
+/** Of three.js' camera, whose matrices are up to date, for a picture of this size. */
+export function viewOf(camera: PerspectiveCamera, size: { width: number; height: number }): View {
+  const e = camera.matrixWorld.elements; // columns
+  const row = (i: number): Row => [e[i]!, e[4 + i]!, e[8 + i]!, e[12 + i]!];
+  return { world_from_camera: [row(0), row(1), row(2), [0, 0, 0, 1]], fov_y_degrees: camera.fov, width: size.width, height: size.height };
 }
 
 /** Null until there is a picture. */

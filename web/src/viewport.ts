@@ -23,7 +23,7 @@ import { pinWeights } from './pins';
 import { listenToPointers } from './pointers';
 import { shapeTool } from './shaping';
 import { Touching } from './touching';
-import { aimNow, viewNow, wantedAim, type Row, type View } from './viewpoint';
+import { aimNow, viewNow, viewOf, wantedAim, type View } from './viewpoint';
 import { deformPoints, isAnalytic } from './shape';
 import { balls, ballsWanted, before, capturedLight, draft, edits, flash, flying, light, localPicture, log, materials, mesh, notify, pending, resolution, selectionWeights, session, settings, tool } from './state';
 
@@ -121,9 +121,7 @@ export class Viewport {
 
   /** Camera and size of the picture now, as REST and stream take them. */
   private get pose(): View {
-    const e = this.camera.matrixWorld.elements; // columns
-    const row = (i: number): Row => [e[i]!, e[4 + i]!, e[8 + i]!, e[12 + i]!];
-    return { world_from_camera: [row(0), row(1), row(2), [0, 0, 0, 1]], fov_y_degrees: this.camera.fov, ...this.pictureSize() };
+    return viewOf(this.camera, this.pictureSize());
   }
 
   // ---- from the server ---------------------------------------------------------------------------------------------------

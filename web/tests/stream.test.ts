@@ -1,5 +1,5 @@
 import { afterEach, beforeEach, expect, it, vi } from 'vitest';
-import type { ClientMessage } from '../src/protocol.gen';
+import { CAMERA_NUMBER_SHIFT, FLAG_CONVERGED, FRAME_HEADER_BYTES, type ClientMessage } from '../src/protocol.gen';
 import { Stream } from '../src/stream';
 
 /** The other end of the connection: what the page sent, and a way to answer. */
@@ -10,7 +10,7 @@ class FakeSocket {
   binaryType = '';
   sent: ClientMessage[] = [];
   onopen = () => {};
-  onmessage = (_: { data: string }) => {};
+  onmessage = (_: { data: string | ArrayBuffer }) => {};
   onclose = (_: { code: number; reason: string }) => {};
   constructor(readonly url: string) {
     FakeSocket.all.push(this);
@@ -21,6 +21,15 @@ class FakeSocket {
   close() {}
   say(message: object) {
     this.onmessage({ data: JSON.stringify(message) });
+  }
+  /** A frame whose header says so, before a picture of one byte. */
+  show(frameId: number, flags: number, picture: number) {
+    const bytes = new DataView(new ArrayBuffer(FRAME_HEADER_BYTES + 1));
+    bytes.setUint16(2, flags, true);
+    bytes.setUint32(4, frameId, true);
+    bytes.setUint16(12, 800, true);
+    bytes.setUint8(FRAME_HEADER_BYTES, picture);
+    this.onmessage({ data: bytes.buffer });
   }
   greet() {
     this.onopen();
@@ -97,4 +106,58 @@ it('sends what was not answered again under the same key after a reconnection', 
   expect(new Set(before.map((message) => message.key)).size).toBe(3);
   expect(stream.idle).toBe(false);
   expect([stream.awaits('undo'), stream.awaits('redo')]).toEqual([true, false]);
+});
+
+/** A decoder that ends when the test says, and fails for pictures that start with 0. */
+function slowDecoder() {
+  const waiting = new Map<number, () => void>();
+  const closed: number[] = [];
+  vi.stubGlobal('createImageBitmap', async (blob: Blob) => {
+    const [first] = new Uint8Array(await blob.arrayBuffer());
+    await new Promise<void>((resolve) => waiting.set(first!, resolve));
+    if (first === 0) throw new Error('no picture');
+    return { first, close: () => closed.push(first!) };
+  });
+  const decode = async (first: number) => {
+    await vi.waitUntil(() => waiting.has(first));
+    waiting.get(first)!();
+    await vi.advanceTimersByTimeAsync(1);
+  };
+  return { decode, closed };
+}
+
+it('decodes frames, says which camera they show, and acknowledges every one', async () => {
+  const { decode, closed } = slowDecoder();
+  const shown: unknown[] = [];
+  stream.close();
+  stream = new Stream('s', { ...silent, frame: (header, picture, camera) => shown.push([header.frameId, header.width, header.flags & FLAG_CONVERGED, (picture as never as { first: number }).first, camera]) });
+  const socket = FakeSocket.all.at(-1)!;
+  socket.greet();
+  socket.take();
+  socket.show(1, FLAG_CONVERGED | (200 << CAMERA_NUMBER_SHIFT), 7);
+  await decode(7);
+  expect(shown).toEqual([[1, 800, FLAG_CONVERGED, 7, 200]]);
+  socket.show(2, 0, 0); // damaged
+  await decode(0);
+  expect(shown.length).toBe(1);
+  socket.onmessage({ data: new ArrayBuffer(FRAME_HEADER_BYTES) }); // a header alone
+  // The second of two is decoded first: the first is late then, and dropped.
+  socket.show(3, 0, 3);
+  socket.show(4, 0, 4);
+  await decode(4);
+  await decode(3);
+  expect(shown.map((frame) => (frame as number[])[0])).toEqual([1, 4]);
+  expect(closed).toEqual([3]);
+  expect(socket.take()).toEqual([1, 2, 4, 3].map((frame_id) => ({ type: 'ack', frame_id })));
+});
+
+it('answers a pick with what the server says of that very click', async () => {
+  const [socket] = FakeSocket.all as [FakeSocket];
+  socket.greet();
+  socket.take();
+  const [first, second] = [stream.pick(0.1, 0.2), stream.pick(0.3, 0.4)];
+  const [a, b] = socket.take() as { id: number; x: number }[];
+  socket.say({ type: 'picked', id: b!.id, hit: true });
+  socket.say({ type: 'picked', id: a!.id, hit: false });
+  expect([(await first).hit, (await second).hit]).toEqual([false, true]);
 });

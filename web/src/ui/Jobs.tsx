@@ -52,7 +52,6 @@ function Job({ job }: { job: JobInfo }) {
     job.eta_seconds !== null && `${duration(job.eta_seconds)} left`,
     job.attempts > 1 && `attempt ${job.attempts}`,
   ].filter(Boolean);
-  const unreadable = job.capture?.findings.some((finding) => finding.level === 'error') ?? false;
   const again = job.state === 'failed' || job.state === 'cancelled' || job.state === 'unknown';
   return (
     <li class={`job ${job.state}`} aria-label={`${KIND_TEXT[job.kind]} ${job.name}: ${STATE_TEXT[job.state]}`}>
@@ -68,7 +67,7 @@ function Job({ job }: { job: JobInfo }) {
       {active && job.message && facts.length > 0 && <p class="facts">{job.message}</p>}
       {job.error && <p class="warning">{job.error}</p>}
       {job.capture && <Findings report={job.capture} said={job.error} open={active || job.state === 'failed'} />}
-      {job.state === 'failed' && unreadable && <p class="hint">Then drop the mended folder here, zipped. “Retry” reads the same pictures again.</p>}
+      {job.state === 'failed' && isUnreadable(job.capture) && <p class="hint">Then drop the mended folder here, zipped. “Retry” reads the same pictures again.</p>}
       {job.state === 'done' && (job.kind === 'render' || job.kind === 'export') && <JobFiles job={job} />}
       <div class="buttons">
         {active && <button onClick={() => void cancel(job)}>Cancel</button>}
@@ -81,39 +80,46 @@ function Job({ job }: { job: JobInfo }) {
   );
 }
 
-const LEVEL_TEXT = { error: 'Error', warning: 'Mind', info: 'Note' };
+const LEVEL_TEXT = { error: 'Error', warning: 'Warning', info: 'Note' };
+const counted = (count: number, word: string) => (count > 0 ? [`${count} ${word}${count > 1 ? 's' : ''}`] : []);
 
 /** What the doctor says of the capture. `said`: what stands above already. */
 function Findings({ report, said, open }: { report: CaptureReport; said: string | null; open: boolean }) {
   const { summary, findings } = report;
-  const warnings = findings.filter((finding) => finding.level !== 'info').length;
-  const notes = findings.length - warnings;
-  const counts = [warnings > 0 && `${warnings} to mind`, notes > 0 && `${notes} to note`].filter(Boolean).join(', ');
+  const warnings = findings.filter((finding) => finding.level === 'warning').length;
+  const counts = [...counted(warnings, 'warning'), ...counted(findings.length - warnings, 'note')].join(', ');
+  const list = (
+    <ul>
+      {findings.map(({ level, sentence, advice }) => (
+        <li class={level}>
+          {sentence !== said && (
+            <p>
+              <strong>{LEVEL_TEXT[level]}:</strong> {sentence}
+            </p>
+          )}
+          {advice && <p class="hint">{advice}</p>}
+        </li>
+      ))}
+    </ul>
+  );
   return (
     <div class="findings">
       {summary && <p class="facts">{summary}</p>}
       {findings.length === 0 ? (
         <p class="facts good">Nothing about this capture stands in the way.</p>
+      ) : isUnreadable(report) ? (
+        list
       ) : (
         <details class="fold" open={open && warnings > 0}>
           <summary>About this capture: {counts}</summary>
-          <ul>
-            {findings.map(({ level, sentence, advice }) => (
-              <li class={level}>
-                {sentence !== said && (
-                  <p>
-                    <strong>{LEVEL_TEXT[level]}:</strong> {sentence}
-                  </p>
-                )}
-                {advice && <p class="hint">{advice}</p>}
-              </li>
-            ))}
-          </ul>
+          {list}
         </details>
       )}
     </div>
   );
 }
+
+const isUnreadable = (report: CaptureReport | null) => report?.findings.some((finding) => finding.level === 'error') ?? false;
 
 /** Quality against progress; nothing until there are two points. */
 function PsnrCurve({ curve }: { curve: [number, number][] }) {

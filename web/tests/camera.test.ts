@@ -1,0 +1,51 @@
+import { PerspectiveCamera, Vector3 } from 'three';
+import { expect, it } from 'vitest';
+import { worldFromCamera } from '../src/camera_path';
+import { flightStep } from '../src/flight_step';
+import { viewOf } from '../src/viewpoint';
+
+function cameraAt(eye: [number, number, number], target: [number, number, number]): PerspectiveCamera {
+  const camera = new PerspectiveCamera(40, 4 / 3, 0.01, 100);
+  camera.up.set(0, 0, 1);
+  camera.position.set(...eye);
+  camera.lookAt(...target);
+  camera.updateMatrixWorld();
+  return camera;
+}
+
+it('a view is an OpenGL camera-to-world in rows: right, up, backward, place', () => {
+  const { world_from_camera, fov_y_degrees, width, height } = viewOf(cameraAt([5, 0, 1], [0, 0, 1]), { width: 640, height: 480 });
+  // Seen from +x with z up, right is +y.
+  const wanted = [[0, 0, 1, 5], [1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 0, 1]];
+  world_from_camera.forEach((row, i) => row.forEach((value, k) => expect(value).toBeCloseTo(wanted[i]![k]!, 12)));
+  expect([fov_y_degrees, width, height]).toEqual([40, 640, 480]);
+});
+
+it('a point goes through the rows of a view to where three.js draws it', () => {
+  const camera = cameraAt([1.5, -2.1, 1.3], [0.1, 0.2, 0]);
+  const { world_from_camera: rows, fov_y_degrees } = viewOf(camera, { width: 400, height: 300 });
+  const point = [0.4, -0.3, 0.7];
+  const local = [0, 1, 2].map((axis) => point.reduce((sum, value, i) => sum + rows[i]![axis]! * (value - rows[i]![3]), 0));
+  const focal = 1 / Math.tan((fov_y_degrees * Math.PI) / 360);
+  const drawn = new Vector3(...(point as [number, number, number])).project(camera);
+  expect((focal * local[1]!) / -local[2]!).toBeCloseTo(drawn.y, 9);
+  expect((focal * local[0]! * 300) / 400 / -local[2]!).toBeCloseTo(drawn.x, 9);
+});
+
+it('an aim becomes the matrix of the camera that stands and looks so', () => {
+  const [eye, target] = [[1.5, -2.1, 1.3], [0.1, 0.2, 0]] as [number, number, number][];
+  const seen = viewOf(cameraAt(eye!, target!), { width: 1, height: 1 }).world_from_camera;
+  worldFromCamera({ eye: eye!, target: target!, fov_y_degrees: 40 }).forEach((row, i) => row.forEach((value, k) => expect(value).toBeCloseTo(seen[i]![k]!, 9)));
+});
+
+it('flying goes 0.8 radii a second along the look, four times as fast with Shift, never far in one step', () => {
+  const camera = cameraAt([0, -3, 0], [0, 0, 0]);
+  const step = (codes: string[], seconds = 0.05, radius = 2) => flightStep(new Set(codes), camera, radius, seconds).toArray();
+  const close = (found: number[], wanted: number[]) => found.forEach((value, i) => expect(value).toBeCloseTo(wanted[i]!, 9));
+  close(step(['KeyW']), [0, 0.08, 0]);
+  close(step(['KeyS', 'ShiftLeft']), [0, -0.32, 0]);
+  close(step(['KeyD', 'AltRight']), [0.02, 0, 0]);
+  close(step(['KeyE', 'KeyA']), [-0.08, 0, 0.08]);
+  close(step(['KeyW', 'KeyS']), [0, 0, 0]);
+  close(step(['KeyW'], 5), step(['KeyW'], 0.1)); // after a pause of the page
+});
