@@ -30,6 +30,14 @@ export interface Aim {
   fov_y_degrees: number;
 }
 
+/** Of a view: its target is where its axis comes nearest to a point. */
+export function aimOf({ world_from_camera: rows, fov_y_degrees }: View, near: [number, number, number]): Aim {
+  const eye = rows.slice(0, 3).map((row) => row[3]) as Aim['eye'];
+  const forward = rows.slice(0, 3).map((row) => -row[2]);
+  const distance = Math.max(1e-6, forward.reduce((sum, value, i) => sum + value * (near[i]! - eye[i]!), 0));
+  return { eye, target: eye.map((value, i) => value + distance * forward[i]!) as Aim['target'], fov_y_degrees };
+}
+
 /** The same without the shift that keeps the object clear of the panels: for pictures of another shape than the window's. Written with viewNow. */
 export const aimNow = signal<Aim | null>(null);
 /** Where the viewport shall look from next: written by whoever wants it, obeyed by the viewport. */

@@ -23,7 +23,7 @@ import { pinWeights } from './pins';
 import { listenToPointers } from './pointers';
 import { shapeTool } from './shaping';
 import { Touching } from './touching';
-import { aimNow, viewNow, viewOf, wantedAim, type View } from './viewpoint';
+import { aimNow, aimOf, viewNow, viewOf, wantedAim, type View } from './viewpoint';
 import { deformPoints, isAnalytic } from './shape';
 import { balls, ballsWanted, before, capturedLight, draft, edits, flash, flying, light, localPicture, log, materials, mesh, notify, pending, resolution, selectionWeights, session, settings, tool } from './state';
 
@@ -274,6 +274,7 @@ export class Viewport {
     effect(() => {
       const wanted = wantedAim.value;
       if (!wanted) return;
+      untracked(() => this.leaveView());
       this.camera.fov = wanted.fov_y_degrees;
       this.camera.updateProjectionMatrix();
       void this.controls.setLookAt(...wanted.eye, ...wanted.target, wanted.smooth);
@@ -403,7 +404,10 @@ export class Viewport {
     this.cameraNumber = number;
     if (this.framedSession === session.value?.asset) {
       viewNow.value = pose;
-      aimNow.value = { eye: this.controls.getPosition(new Vector3()).toArray(), target: this.controls.getTarget(new Vector3()).toArray(), fov_y_degrees: this.camera.fov };
+      aimNow.value =
+        viewNumber.value === null
+          ? { eye: this.controls.getPosition(new Vector3()).toArray(), target: this.controls.getTarget(new Vector3()).toArray(), fov_y_degrees: this.camera.fov }
+          : aimOf(pose, this.bounds.center.toArray());
     }
     this.setFresh(this.drawnIsNewest && this.drawn.enough); // its picture may be here already
   }

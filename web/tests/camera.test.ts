@@ -2,7 +2,7 @@ import { PerspectiveCamera, Vector3 } from 'three';
 import { expect, it } from 'vitest';
 import { worldFromCamera } from '../src/camera_path';
 import { flightStep } from '../src/flight_step';
-import { viewOf } from '../src/viewpoint';
+import { aimOf, viewOf } from '../src/viewpoint';
 
 function cameraAt(eye: [number, number, number], target: [number, number, number]): PerspectiveCamera {
   const camera = new PerspectiveCamera(40, 4 / 3, 0.01, 100);
@@ -36,6 +36,13 @@ it('an aim becomes the matrix of the camera that stands and looks so', () => {
   const [eye, target] = [[1.5, -2.1, 1.3], [0.1, 0.2, 0]] as [number, number, number][];
   const seen = viewOf(cameraAt(eye!, target!), { width: 1, height: 1 }).world_from_camera;
   worldFromCamera({ eye: eye!, target: target!, fov_y_degrees: 40 }).forEach((row, i) => row.forEach((value, k) => expect(value).toBeCloseTo(seen[i]![k]!, 9)));
+});
+
+it('the aim of a view looks the same way, at the point of its axis that is nearest to a given one', () => {
+  const view = viewOf(cameraAt([3, -2, 1.5], [0.2, 0.1, 0.4]), { width: 64, height: 48 });
+  aimOf(view, [0.2, 0.1, 0.4]).target.forEach((value, i) => expect(value).toBeCloseTo([0.2, 0.1, 0.4][i]!, 9));
+  const beside = aimOf(view, [0.3, 0.2, 0.9]);
+  worldFromCamera(beside).flat().forEach((value, i) => expect(value).toBeCloseTo(view.world_from_camera.flat()[i]!, 9));
 });
 
 it('flying goes 0.8 radii a second along the look, four times as fast with Shift, never far in one step', () => {
