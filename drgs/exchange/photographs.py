@@ -39,8 +39,8 @@ def encode_photographs(pictures: Sequence[np.ndarray]) -> bytes:
             picture = Image.fromarray(np.ascontiguousarray(pixels))
             factor = LONGEST_SIDE / max(picture.size)
             if factor < 1:
-                size = tuple(max(1, round(side * factor)) for side in picture.size)
-                picture = picture.resize(size, Image.Resampling.LANCZOS)
+                width, height = (max(1, round(side * factor)) for side in picture.size)
+                picture = picture.resize((width, height), Image.Resampling.LANCZOS)
             file = io.BytesIO()
             picture.save(file, "WEBP", quality=QUALITY, method=2)
             info = zipfile.ZipInfo(entry_name(number), _FIRST_DATE)
