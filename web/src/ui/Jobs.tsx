@@ -111,7 +111,7 @@ function Findings({ report, said, open }: { report: CaptureReport; said: string 
         list
       ) : (
         <details class="fold" open={open && warnings > 0}>
-          <summary>About this capture: {counts}</summary>
+          <summary>The capture: {counts}</summary>
           {list}
         </details>
       )}

@@ -28,7 +28,7 @@ const transparent = signal(false);
 const rendering = signal(false);
 
 const FORMATS: { value: api.StillFormat; text: string; title: string }[] = [
-  { value: 'png', text: 'PNG', title: 'As on screen: 8 bits, sRGB, with the exposure' },
+  { value: 'png', text: 'PNG', title: 'As on screen: 8 bits, sRGB, with exposure and tone curve' },
   { value: 'exr', text: 'EXR', title: 'The light itself: linear 32-bit floats without exposure or tone curve, for compositing' },
 ];
 
