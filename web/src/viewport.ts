@@ -241,6 +241,8 @@ export class Viewport {
       const marked = this.marksPins ? pinWeights.value : selectionWeights.value;
       if (marked) this.local?.setHighlighted(marked);
       this.localDirty = true;
+    });
+    effect(() => {
       if (flash.value > 0) this.flashedAt = NaN; // from the next picture on, however late that is
     });
     effect(() => {
