@@ -36,7 +36,8 @@ def give_way() -> None:
     if sys.platform != "linux":
         return
     try:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), MODESTY)
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + MODESTY)  # the system stops at 19
     except OSError as error:  # a sandbox may forbid it; pictures are made all the same
         logging.getLogger(__name__).warning("rendering keeps the priority of the server: %s", error)
 
