@@ -44,6 +44,11 @@ def jobs(viewer: Viewer) -> Iterator[Jobs]:
     viewer.page.unroute_all(behavior="wait")
 
 
+def wait_for_a_request(page: Page, jobs: Jobs) -> None:
+    """Playwright hands requests to `answer` only while it is being asked something."""
+    wait_until(lambda: page.wait_for_timeout(20) or jobs.asked, "the server to hear of it")
+
+
 def shown(page: Page, jobs: Jobs, **values: object) -> Locator:
     """The card of a job that is as in the examples but for these."""
     jobs.list = [RUNNING | values]
@@ -67,7 +72,7 @@ def test_a_running_build_shows_picture_quality_time_left_and_findings(viewer: Vi
     page.reload()
     expect(card.get_by_role("img", name="Quality from 20.0 to 26.5 dB")).to_be_visible(timeout=30_000)
     card.get_by_role("button", name="Cancel").click()
-    wait_until(lambda: jobs.asked, "the server to hear of it")
+    wait_for_a_request(page, jobs)
     assert ("POST", f"/{RUNNING['id']}/cancel") in jobs.asked
 
 
@@ -77,7 +82,7 @@ def test_a_capture_that_cannot_be_built_says_why_and_what_to_do(viewer: Viewer, 
     expect(card.get_by_text("Mend that first.")).to_be_visible()
     expect(card.get_by_text("Then drop the mended folder here, zipped.")).to_be_visible()
     card.get_by_role("button", name="Retry").click()
-    wait_until(lambda: jobs.asked, "the server to hear of it")
+    wait_for_a_request(viewer.page, jobs)
     assert ("POST", f"/{RUNNING['id']}/retry") in jobs.asked
 
 
