@@ -2,7 +2,8 @@
 
 /** Shares of the screen's own sharpness; slow machines go down this list. */
 const SCALES = [1, 0.75, 0.55, 0.4, 0.3];
-const SLOW_FRAME_MS = 40;
+/** Thirty pictures a second are the least that feels attached to the hand. */
+const SLOW_FRAME_MS = 32;
 const AIMED_FRAME_MS = 25;
 const QUICK_FRAME_MS = 17.5;
 const FRAMES_BEFORE_STEP = 4;
@@ -21,13 +22,18 @@ export class LocalPace {
   measure(elapsedMs: number): boolean {
     this.frameMs += 0.4 * (Math.min(elapsedMs, 500) - this.frameMs);
     if (++this.framesMeasured < FRAMES_BEFORE_STEP || (this.frameMs < SLOW_FRAME_MS && this.frameMs > QUICK_FRAME_MS)) return false;
-    const wanted = this.scale * Math.sqrt(AIMED_FRAME_MS / this.frameMs);
-    const fitting = SCALES.findIndex((scale) => scale <= wanted * 1.05);
-    const next = fitting < 0 ? SCALES.length - 1 : Math.max(fitting, this.step - 1);
+    // A screen shows no more than sixty a second, so how much room there is cannot be seen: one step costs less than twice the time.
+    const next = this.frameMs <= QUICK_FRAME_MS ? Math.max(0, this.step - 1) : this.fitting();
     this.framesMeasured = 0;
     if (next === this.step) return false;
     this.step = next;
     this.frameMs = AIMED_FRAME_MS; // measure anew before the next step
     return true;
+  }
+
+  private fitting(): number {
+    const wanted = this.scale * Math.sqrt(AIMED_FRAME_MS / this.frameMs);
+    const step = SCALES.findIndex((scale) => scale <= wanted * 1.05);
+    return step < 0 ? SCALES.length - 1 : step;
   }
 }
