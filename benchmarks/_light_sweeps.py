@@ -9,28 +9,31 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from drgs.reference import shade as twin
 from drgs.reference.rasterize_gbuffer import rasterize as rasterize_twin
-from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, start_frame
-from drgs.render.environment_table import build_environment_table, environment_light
-from drgs.render.horizon import Horizons
-from drgs.render.rasterize_gbuffer import RasterSettings, rasterize
-from drgs.render.rasterize_gbuffer.gbuffer import near_plane
-from drgs.render.records import ShadingPoints
-from drgs.render.sample_rays import SampleCounts
-from drgs.render.shade import PointLight, RayStarts, shade
-from drgs.render.trace_rays import build_tracer
+from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.integrate.choose_integrator import choose_integrator
+from drgs.render.integrate.environment_table import build_environment_table, environment_light
+from drgs.render.integrate.integrator import IntegratorSettings
+from drgs.render.intersect.horizon import Horizons
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.progressive.refine import refine_frame
+from drgs.render.progressive.start_frame import start_frame
+from drgs.render.records import DenoiseMethod, RayStarts, RenderSettings, SampleCounts, ShadedPoints, ShadingPoints
+from drgs.render.visible.rasterize import RasterSettings, rasterize
+from drgs.render.visible.rasterize.gbuffer import near_plane
 from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.materials import Materials
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedScene, PosedSurfels
-from tests.build.surfel_spheres import surfel_sphere
+from tests.reconstruct.surfel_spheres import surfel_sphere
 from tests.render.closed_form_scenes import constant_sky, front_camera, points_seen_at, sphere_mesh, sunny_sky, two_spheres
 
 ANGLES = [0.0, 30.0, 60.0, 80.0, 89.0, 89.9, 89.99]
@@ -79,10 +82,11 @@ def refusal(case: str, attempt: Callable[[], object]) -> Row:
 # The estimator at single points, nothing in the way.
 
 
-def estimate(points: ShadingPoints, sky: Environment, counts: SampleCounts, bounces: int = 0, seed: int = 3) -> PointLight:
+def estimate(points: ShadingPoints, sky: Environment, counts: SampleCounts, bounces: int = 0, seed: int = 3) -> ShadedPoints:
     starts = RayStarts(points.position_world + 100 * points.normal_world, points.normal_world)
     light = environment_light(build_environment_table(sky))
-    return shade(points, starts, light, build_tracer(sphere_mesh(1, radius=1e-3)), counts, bounces, seed)
+    integrator = choose_integrator(build_tracer(sphere_mesh(1, radius=1e-3)))
+    return integrator.shade(points, starts, light, IntegratorSettings(counts, bounces, seed))
 
 
 def against_twin(case: str, points: ShadingPoints, sky: Environment, counts: SampleCounts | None = None, seed: int = 3) -> Row:
@@ -92,7 +96,7 @@ def against_twin(case: str, points: ShadingPoints, sky: Environment, counts: Sam
     exact = ShadingPoints(*(t.double() if t.is_floating_point() else t for t in vars(points).values()))
     starts = RayStarts(exact.position_world + 100 * exact.normal_world, exact.normal_world)
     sky64, tracer = Environment(sky.radiance.double()), build_tracer(sphere_mesh(1, radius=1e-3))
-    diffuse, specular = twin.shade(exact, starts, sky64, build_environment_table(sky64), tracer, counts, seed)
+    diffuse, specular = twin.shade(exact, starts, sky64, build_environment_table(sky64), tracer, IntegratorSettings(counts, seed=seed))
     row = compared(case, found.diffuse + found.specular, diffuse + specular)
     others = sum(int((~torch.isfinite(t)).sum()) for t in (found.variance, found.visibility))
     return dataclasses.replace(row, not_finite=row.not_finite + others)
@@ -176,7 +180,7 @@ def covered_mean(linear: Tensor) -> Tensor:
 
 
 def picture(
-    scene: PosedScene, camera: Camera, bounces: int = 1, samples: int = 64, denoise: str = "none", horizons: bool = False
+    scene: PosedScene, camera: Camera, bounces: int = 1, samples: int = 64, denoise: DenoiseMethod = "none", horizons: bool = False
 ) -> Tensor:
     """(height, width, 3) linear radiance.
 
@@ -264,7 +268,7 @@ def image_rows() -> list[Row]:
         rows.append(Row(f"picture of {width}×{height}", not_finite=int((~torch.isfinite(linear)).sum())))
     for width, height in ((0, 0), (0, 4), (3, 0)):
         empty = dataclasses.replace(camera, width=width, height=height)
-        rows.append(refusal(f"picture of {width}×{height}", lambda empty=empty: picture(scene, empty)))
+        rows.append(refusal(f"picture of {width}×{height}", partial(picture, scene, empty)))
     return rows
 
 
@@ -276,12 +280,12 @@ def refused_rows() -> list[Row]:
     for case, value in (("NaN", math.nan), ("infinite", math.inf), ("negative", -1.0), ("1e20", 1e20)):
         radiance = sky.radiance.clone()
         radiance[3, 7, 1] = value
-        rows.append(refusal(f"a texel that is {case}", lambda r=radiance: picture(PosedScene(None, mesh, Environment(r)), camera)))
+        rows.append(refusal(f"a texel that is {case}", partial(picture, PosedScene(None, mesh, Environment(radiance)), camera)))
     hole = mesh.vertices.clone()
     hole[5, 1] = math.nan
     rows.append(refusal("a vertex that is NaN", lambda: build_tracer(dataclasses.replace(mesh, vertices=hole))))
     for scale in (1e-9, 1e12):
-        rows.append(refusal(f"scale {scale:g}", lambda scale=scale: build_tracer(moved(mesh, scale, nowhere))))
+        rows.append(refusal(f"scale {scale:g}", partial(build_tracer, moved(mesh, scale, nowhere))))
     rows.append(refusal("1e6 from the origin", lambda: build_tracer(moved(mesh, 1.0, nowhere + 1e6))))
     return rows
 
@@ -334,10 +338,12 @@ def surfel_rows(count: int, size: int) -> list[Row]:
             compared(f"frame of surfels, scale {scale:g}", picture(PosedScene(small, mesh, sunny_sky()), seen_by, samples=32), whole)
         )
     for case, (surfels, seen_by) in cases.items():
-        given = (surfels.centers, surfels.tangents, surfels.opacities, surfels.materials.albedo)
         shown = (crosses(surfels) > 0).nonzero().squeeze(-1)  # the kernel drops surfels without area, the twin knows no such rule
         settings = RasterSettings(near=near_plane(surfels.centers))
-        found, exact = rasterize(*given, seen_by, settings), rasterize_twin(*(t.double()[shown] for t in given), seen_by, settings)
+        found = rasterize(surfels.centers, surfels.tangents, surfels.opacities, surfels.materials.albedo, seen_by, settings)
+        centers, tangents = surfels.centers[shown].double(), surfels.tangents[shown].double()
+        opacities, albedo = surfels.opacities[shown].double(), surfels.materials.albedo[shown].double()
+        exact = rasterize_twin(centers, tangents, opacities, albedo, seen_by, settings)
         row = compared(case, torch.cat([found.features, found.coverage[None]]), torch.cat([exact.features, exact.coverage[None]]))
         sky = sunny_sky()
         frame = picture(PosedScene(surfels, sphere_mesh(3, radius=0.97), sky), seen_by, samples=32, denoise="svgf")

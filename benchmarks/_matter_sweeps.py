@@ -15,6 +15,7 @@ from drgs.deform.carry_gaussians import carry_normals, carry_tangents, decompose
 from drgs.deform.drive_mesh import vertex_gradients
 from drgs.deform.gmls import build_weights, interpolate
 from drgs.deform.mpm import LAWS, Material, Model, MpmSettings, State, advance, measure_balance, rest_state
+from drgs.deform.mpm.records import Law
 
 DETERMINANTS = (-1.0, -1e-3, -1e-6, 0.0, 1e-6, 1e-3, 1.0, 1e3)
 SPACING = 1 / 16
@@ -65,7 +66,7 @@ def surfel_rows(count: int) -> list[Row]:
     return rows
 
 
-def strained_rows(particles: int, seconds: float, determinants: Iterable[float] = DETERMINANTS, laws: Iterable[str] = LAWS) -> list[Row]:
+def strained_rows(particles: int, seconds: float, determinants: Iterable[float] = DETERMINANTS, laws: Iterable[Law] = LAWS) -> list[Row]:
     """A cube of which one corner is let go with an elastic F of every determinant, in every law: how much of it must be stopped."""
     rows = []
     for law in laws:
@@ -178,7 +179,7 @@ def room_rows(particles: int, seconds: float) -> list[Row]:
     def build() -> Model:
         from drgs.deform.mpm import make_model
 
-        return make_model(outside, model.volumes, (Material(),), torch.zeros(len(outside)), model.grid)
+        return make_model(outside, model.volumes, (Material(),), torch.zeros(len(outside), dtype=torch.int32), model.grid)
 
     long = falling_cube(4096, Material(young_modulus=1e9))
     return [

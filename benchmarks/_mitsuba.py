@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.maths.brdf import MIN_ROUGHNESS
+from drgs.maths.constants import F0, MIN_ROUGHNESS
 from drgs.scene.camera import Camera, opengl_from_camera
 from drgs.scene.mesh import TriangleMesh
 
@@ -99,7 +99,7 @@ def _register_brdf(mi: Any) -> None:
             albedo = si.shape.eval_attribute_3("vertex_albedo", si, active)
             metallic = si.shape.eval_attribute_1("vertex_metallic", si, active)
             roughness = dr.maximum(si.shape.eval_attribute_1("vertex_roughness", si, active), MIN_ROUGHNESS)
-            f0 = 0.04 * (1 - metallic) + albedo * metallic
+            f0 = F0 * (1 - metallic) + albedo * metallic
             diffuse = (1 - metallic) * dr.max(albedo)
             fresnel = dr.max(f0) + (1 - dr.max(f0)) * (1 - dr.maximum(mi.Frame3f.cos_theta(si.wi), 0)) ** 5
             share = dr.clip(fresnel / (fresnel + diffuse), 0.1, 1)

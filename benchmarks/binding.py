@@ -18,37 +18,39 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
-from drgs.build.build_asset import PRESETS, BuildSettings, build_asset, build_stages
-from drgs.build.checkpoint import read_tensors
-from drgs.build.durable_stages import CHECKPOINTS, read_geometry
-from drgs.build.fit_gaussians import environment_table, render_stage_one
-from drgs.build.fit_mesh_surfels import MeshFitSettings, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
-from drgs.build.initial_points import initial_points
-from drgs.build.load_views import load_cameras, load_views
-from drgs.build.mesh_from_gaussians import reduced_mesh
-from drgs.build.mesh_surfels import mesh_surfels
-from drgs.build.split_sum import filter_environment
 from drgs.deform.carry_gaussians import carry_tangents
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.maps import evaluate_map
 from drgs.deform.pose_scene import pose_scene
+from drgs.evaluate.metrics import picture_figures, score_renders, truth_folders
 from drgs.maths.color import srgb_from_linear
-from drgs.metrics import picture_figures, score_renders, truth_folders
+from drgs.reconstruct.build_asset import PRESETS, BuildSettings, build_asset, build_stages
+from drgs.reconstruct.capture.initial_points import initial_points, near_plane
+from drgs.reconstruct.capture.load_views import load_cameras, load_views
+from drgs.reconstruct.checkpoints import read_tensors
+from drgs.reconstruct.fit.environment_pyramid import environment_table
+from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
+from drgs.reconstruct.fit.render_stage_one import render_stage_one
+from drgs.reconstruct.fit.split_sum import filter_environment
+from drgs.reconstruct.geometry.mesh_from_gaussians import reduced_mesh
+from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
+from drgs.reconstruct.stages import CHECKPOINTS, read_geometry
+from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
-from drgs.render.render_frame import RenderSettings
 from drgs.scene.asset import Asset
 from drgs.scene.edits import DeformEdit, Edit, parse_edits
 from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.posed_scene import PosedScene
 from drgs.warp_torch import device_from_name
 
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "mesh": {},
     "mesh_without_offset": {"learn_offset": False},
     "mesh_without_opacity": {"learn_opacity": False},
@@ -115,7 +117,7 @@ def static_table(dataset: Path, work: Path, preset_name: str, iterations: int, d
     radius = initial_points(views, preset.points, 0).bounds_radius
     tensors, _ = read_tensors(work / "particles.build" / "stage1.safetensors", device)
     stage_one = {name.removeprefix("parameter."): value for name, value in tensors.items() if name.startswith("parameter.")}
-    gaussians, mesh, _ = read_geometry(work / "particles.build" / "mesh.safetensors", device)
+    gaussians, mesh = read_geometry(work / "particles.build" / "mesh.safetensors", device)
     table = {"particles": {"surfels": len(stage_one["centers"])} | figures_of_fit(stage_one, dataset, radius)}
     coarse = reduced_mesh(mesh, preset.fit.densify.budget, radius)
     for name, changes in VARIANTS.items():
@@ -142,7 +144,7 @@ def figures_of_fit(parameters: dict[str, Tensor], dataset: Path, radius: float) 
     with torch.no_grad():
         tables = filter_environment(environment_table(parameters))
         for camera in load_cameras(dataset / "transforms_test.json"):
-            maps = render_stage_one(parameters, tables, camera.to(parameters["centers"].device), 0.01 * radius, 3)
+            maps = render_stage_one(parameters, tables, camera.to(parameters["centers"].device), near_plane(radius), 3)
             rgba = torch.cat([srgb_from_linear(maps.radiance_linear).clamp(0, 1), maps.coverage.clamp(0, 1)[..., None]], -1)
             with Image.open(dataset / "test" / f"{camera.name}.png") as picture:
                 pairs.append((rgba.double().cpu().numpy(), np.asarray(picture.convert("RGBA"), np.float64) / 255))

@@ -5,12 +5,12 @@ python -m benchmarks build DATASET [--preset fast] [--out FOLDER] [--spp N] [--j
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
+
+from benchmarks.measures.build_process import cli_command, run_build
 
 
 def main(arguments: list[str]) -> None:
@@ -37,36 +37,8 @@ def measure_build(dataset: Path, asset: Path, preset: str, device: str) -> dict:
     Raises:
         ValueError: the build failed; its own words are on stderr.
     """
-    command = [
-        sys.executable,
-        "-m",
-        "drgs.cli",
-        "build",
-        str(dataset),
-        str(asset),
-        "--preset",
-        preset,
-        "--device",
-        device,
-        "--json-progress",
-    ]
-    start = time.perf_counter()
-    finished: dict = {}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            finished = json.loads(line)  # the last one is the asset's own account
-    if process.returncode != 0:
-        raise ValueError(f"drgs build ended with exit code {process.returncode}")
-    # The largest of the processes waited for so far: the build is the only one yet. Linux counts in KiB, macOS in bytes.
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    return {
-        "dataset": dataset.name,
-        "preset": preset,
-        "seconds": round(time.perf_counter() - start, 2),
-        "seconds_per_stage": {stage: round(seconds, 2) for stage, seconds in finished["provenance"]["seconds"].items()},
-        "peak_memory_mib": round(peak / 2**20),
-    }
+    run = run_build(cli_command(dataset, asset, preset, device=device, resume=False))
+    return {"dataset": dataset.name, "preset": preset} | vars(run)
 
 
 def evaluate(asset: Path, dataset: Path, renders: Path, samples_per_pixel: int, device: str) -> dict:

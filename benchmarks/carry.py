@@ -12,6 +12,7 @@ import json
 import math
 import statistics
 import time
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -122,11 +123,11 @@ def sweep(surfels: int, particles: int, repeats: int) -> dict:
         rest, points = cloud(count, surfels)
         moved, gradients = evaluate_map(BEND, rest)
         truth, truth_gradient = evaluate_map(BEND, points)
-        for variant, order in (("paper_centred", 1), ("paper_centred", 2), ("taylor", 1), ("taylor", 2)):
+        for title, settings in SWEPT.items():
             for neighbours in (8, 12, 16, 24, 32):
                 clock = time.perf_counter()
-                told = torch.eye(3).expand_as(gradients).contiguous() if (variant, order) == ("taylor", 1) else gradients
-                weights = build_weights(rest, points, GmlsSettings(neighbours=neighbours, variant=variant, order=order))
+                told = torch.eye(3).expand_as(gradients).contiguous() if (settings.variant, settings.order) == ("taylor", 1) else gradients
+                weights = build_weights(rest, points, replace(settings, neighbours=neighbours))
                 built, times = time.perf_counter() - clock, []
                 for _ in range(repeats + 1):
                     clock = time.perf_counter()
@@ -137,7 +138,7 @@ def sweep(surfels: int, particles: int, repeats: int) -> dict:
                 rows.append(
                     {
                         "particles": len(rest),
-                        "variant": SWEPT[variant, order],
+                        "variant": title,
                         "neighbours": neighbours,
                         "position_rms": float(distance.square().mean().sqrt() / spacing),
                         "position_max": float(distance.max() / spacing),
@@ -150,10 +151,10 @@ def sweep(surfels: int, particles: int, repeats: int) -> dict:
 
 
 SWEPT = {
-    ("paper_centred", 1): "paper, p = 1",
-    ("paper_centred", 2): "paper, p = 2",
-    ("taylor", 1): "ours, p = 1",
-    ("taylor", 2): "ours, p = 2",
+    "paper, p = 1": GmlsSettings(variant="paper_centred", order=1),
+    "paper, p = 2": GmlsSettings(variant="paper_centred", order=2),
+    "ours, p = 1": GmlsSettings(variant="taylor", order=1),
+    "ours, p = 2": GmlsSettings(variant="taylor", order=2),
 }
 """ours: weights that reproduce affine maps; p = 1 with the positions alone, p = 2 as in use, where F of the particles corrects them."""
 
@@ -174,7 +175,7 @@ def surfel_errors() -> list[dict]:
     for name, matrix in cases.items():
         gradient = matrix.double()[None]
         exact = carry_tangents(tangents, gradient)
-        row = {"gradient": name}
+        row: dict[str, str | float] = {"gradient": name}
         for order in ("ascending", "descending"):
             paper = carry_tangents(tangents, gradient, variant="paper", order=order)
             covariance, other = exact @ exact.mT, paper @ paper.mT

@@ -23,11 +23,15 @@ from torch import Tensor
 
 from benchmarks._plot import Curve, log_log_svg
 from benchmarks.integrator import compare, mitsuba_rows, read_cameras, read_exr
-from drgs.build.import_mesh import import_mesh
-from drgs.render.accumulate import FrameState, RenderSettings, refine_frame, resolve_frame, samples_a_pass, start_frame
-from drgs.render.denoise_oidn import oidn_filter
-from drgs.render.records import Frame
-from drgs.render.trace_rays import build_tracer
+from drgs.convert.import_mesh import import_mesh
+from drgs.render.film.denoise.oidn import oidn_filter
+from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.integrate.plan import samples_per_pass
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.progressive.frame_state import FrameState, with_settings
+from drgs.render.progressive.refine import refine_frame
+from drgs.render.progressive.start_frame import start_frame
+from drgs.render.records import Frame, RenderSettings
 from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
 from drgs.scene.posed_scene import PosedScene
@@ -35,7 +39,7 @@ from drgs.scene.posed_scene import PosedScene
 
 def shown(state: FrameState, method: str) -> Frame:
     """The picture so far through another denoiser."""
-    return resolve_frame(replace(state, settings=replace(state.settings, denoise=method)))
+    return resolve_frame(with_settings(state, denoise=method))
 
 
 def premultiplied(frame: Frame) -> Tensor:
@@ -49,7 +53,7 @@ def relmse(found: Tensor, truth: Tensor, covered: Tensor) -> float:
 
 def with_passes(state: FrameState, spp: int) -> FrameState:
     """Refined to at least `spp` samples a pixel."""
-    return refine_frame(state, max(0, -(-spp // samples_a_pass(state.settings, state.fixed is None).total) - state.passes))
+    return refine_frame(state, max(0, -(-spp // samples_per_pass(state.inputs).total) - state.passes))
 
 
 def convergence(

@@ -26,18 +26,21 @@ from subprocess import PIPE, Popen
 import psutil
 import torch
 
-from drgs.client import Client, Stream
 from drgs.deform.pose_scene import pose_scene
-from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, start_frame
+from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.progressive.refine import refine_frame
+from drgs.render.progressive.start_frame import start_frame
+from drgs.render.records import PrimarySurface, RenderSettings
 from drgs.scene.asset import Asset, load_asset
 from drgs.scene.camera import Camera, camera_from_opengl
 from drgs.warp_torch import device_from_name
-from server.messages import AcceptedMessage
+from drgs_server.client import Client, Stream
+from drgs_server.live.messages import AcceptedMessage
 
 EDITS = 8
 IDLE_SECONDS = 4.0
 PROGRAM = (
-    "import sys; from pathlib import Path; from server.run import serve;"
+    "import sys; from pathlib import Path; from drgs_server.run import serve;"
     "sys.exit(serve(Path(sys.argv[1]), port=0, with_worker=False, device=sys.argv[2], ready=lambda address: print(address, flush=True)))"
 )
 
@@ -87,7 +90,7 @@ def orbit(asset: Asset, size: int) -> Iterator[Camera]:
         degrees += 1
 
 
-def moving(asset: Asset, size: int, samples: int, frames: int, primary: str | None) -> dict:
+def moving(asset: Asset, size: int, samples: int, frames: int, primary: PrimarySurface | None) -> dict:
     """Frame times of a camera that turns."""
     scene, cameras = pose_scene(asset, []), orbit(asset, size)
     settings = RenderSettings(samples_per_pixel=samples, samples_per_pass=samples, primary=primary, denoise="svgf")

@@ -27,11 +27,15 @@ import OpenEXR
 import torch
 
 from benchmarks._plot import Curve, log_log_svg
-from drgs.render.accumulate import FrameState, RenderSettings, refine_frame, resolve_frame, samples_a_pass, start_frame
-from drgs.render.denoise_oidn import oidn_filter
-from drgs.render.sample_rays import SampleCounts
-from drgs.render.trace_rays import build_tracer
-from drgs.render.tracer import AbstractTracer
+from drgs.render.film.denoise.oidn import oidn_filter
+from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.integrate.plan import samples_per_pass
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.render.progressive.frame_state import FrameState, with_settings
+from drgs.render.progressive.refine import refine_frame
+from drgs.render.progressive.start_frame import start_frame
+from drgs.render.records import RenderSettings, SampleCounts
 from drgs.scene.camera import Camera, camera_from_opengl
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh
@@ -142,7 +146,7 @@ class Shot:
 def shot(variant: str, state: FrameState, seconds: float, cpu_seconds: float, denoise: str = "none") -> Shot:
     """The sums so far, shown; what showing takes is added to the time where it denoises."""
     clock, cpu_clock = time.perf_counter(), time.process_time()
-    frame = resolve_frame(replace(state, settings=replace(state.settings, denoise=denoise)))
+    frame = resolve_frame(with_settings(state, denoise=denoise))
     if denoise != "none":
         seconds, cpu_seconds = seconds + time.perf_counter() - clock, cpu_seconds + time.process_time() - cpu_clock
     coverage = frame.gbuffer.coverage
@@ -167,7 +171,7 @@ def ours(
         for spp in sorted(samples):
             clock, cpu_clock = time.perf_counter(), time.process_time()
             state = start_frame(scene, camera, settings, tracer) if state is None else state
-            state = refine_frame(state, max(0, -(-spp // samples_a_pass(settings, True).total) - state.passes))
+            state = refine_frame(state, max(0, -(-spp // samples_per_pass(state.inputs).total) - state.passes))
             seconds, cpu_seconds = seconds + time.perf_counter() - clock, cpu_seconds + time.process_time() - cpu_clock
             for name in shown:
                 if name == "paper":
@@ -183,7 +187,7 @@ def independent(scene: PosedScene, camera: Camera, settings: RenderSettings, tra
     settings = replace(settings, counts=SampleCounts(2, 1, 1), skip=False)
     state = start_frame(scene, camera, settings, tracer)
     for number in range(-(-spp // 4)):
-        state = refine_frame(replace(state, settings=replace(settings, seed=settings.seed + 7919 * (number + 1))))
+        state = refine_frame(with_settings(state, seed=settings.seed + 7919 * (number + 1)))
     return state
 
 

@@ -15,16 +15,20 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-import torch
-
 from drgs.deform.pose_scene import pose_scene
-from drgs.render.accumulate import FrameState, RenderSettings, refine_frame, resolve_frame, samples_a_pass, start_frame
-from drgs.render.horizon import Horizons
-from drgs.render.records import Frame
-from drgs.render.trace_rays import build_tracer
-from drgs.render.tracer import AbstractTracer
+from drgs.maths.color import luminance
+from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.integrate.plan import samples_per_pass
+from drgs.render.intersect.horizon import Horizons
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.render.progressive.frame_state import FrameState, with_settings
+from drgs.render.progressive.refine import refine_frame
+from drgs.render.progressive.start_frame import start_frame
+from drgs.render.records import Frame, FrameInputs, PrimarySurface, RenderSettings
 from drgs.scene.asset import load_asset
 from drgs.scene.camera import Camera
 from drgs.scene.load_environment import load_environment
@@ -47,11 +51,12 @@ def switched_on(what: str, off: FrameState, on: FrameState) -> FrameState | None
         off, on: frames before their first pass, without and with the plan.
     """
     if what == EMPTY:
-        return replace(off, seen=on.seen, active=on.active.clone())
+        return replace(off, tiles=replace(off.tiles, covered=on.tiles.covered, active=on.tiles.active.clone()))
     if what.startswith(MATERIAL):
         return replace(off, plan=replace(off.plan, by_material=True))
     if what.startswith(HORIZON):
-        return replace(off, tracer=horizons_known(off.scene), settings=replace(off.settings, skip=True, skip_error=on.settings.skip_error))
+        known = replace(off, traced=replace(off.traced, tracer=horizons_known(off.inputs.scene)))
+        return with_settings(known, skip=True, skip_error=on.inputs.settings.skip_error)
     if what == DARK or what.endswith(STRATEGY):
         return replace(off, plan=replace(off.plan, counts=on.plan.counts, bounces=on.plan.bounces))
     return None
@@ -61,6 +66,10 @@ def relmse(frame: Frame, truth: Frame) -> float:
     covered = truth.gbuffer.coverage > 0
     x, y = (f.radiance_linear[covered].double() * f.gbuffer.coverage[covered][:, None] for f in (frame, truth))
     return float(((x - y) ** 2 / (y * y + 0.01)).mean())
+
+
+def _same(state: FrameState) -> FrameState:
+    return state
 
 
 def timed(start: Callable[[], FrameState], passes: int, repeats: int) -> tuple[Frame, float]:
@@ -76,8 +85,8 @@ def timed(start: Callable[[], FrameState], passes: int, repeats: int) -> tuple[F
 def mean_and_error(frame: Frame) -> tuple[float, float]:
     """Mean luminance over the picture and its standard error."""
     covered = frame.gbuffer.coverage > 0
-    luminance = frame.radiance_linear[covered].double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
-    return float(luminance.mean()), float(frame.radiance.variance[covered].double().sum().sqrt()) / max(1, int(covered.sum()))
+    brightness = luminance(frame.radiance_linear[covered].double())
+    return float(brightness.mean()), float(frame.radiance.variance[covered].double().sum().sqrt()) / max(1, int(covered.sum()))
 
 
 def compare(what: str, bound: str, found: Frame, plain: Frame, seconds: tuple[float, float]) -> dict:
@@ -98,14 +107,14 @@ def measure_skips(scene: PosedScene, camera: Camera, settings: RenderSettings, p
     """One row for each skip of the plan that the settings lead to."""
     plain_settings = replace(settings, skip=False)
     on, off = start_frame(scene, camera, settings), start_frame(scene, camera, plain_settings)
-    plain, seconds_plain = timed(lambda: off, passes, repeats)
+    plain, seconds_plain = timed(partial(_same, off), passes, repeats)
     rows = []
     for skip in on.plan.skips:
         alone = switched_on(skip.what, off, on)
         if alone is None:
             rows.append({"what": skip.what, "bound": skip.bound, "note": "no switch for it here"})
             continue
-        found, seconds = timed(lambda alone=alone: alone, passes, repeats)
+        found, seconds = timed(partial(_same, alone), passes, repeats)
         rows.append(compare(skip.what, skip.bound, found, plain, (seconds, seconds_plain)))
     return rows
 
@@ -152,8 +161,8 @@ def measure_taken_over(scene: PosedScene, camera: Camera, settings: RenderSettin
     }
     rows = []
     for name, changed in changes.items():
-        fresh, seconds_fresh = timed(lambda c=changed: start_frame(c, camera, settings), 1, repeats)
-        after, seconds = timed(lambda c=changed: start_frame(c, camera, settings, previous=old), 1, repeats)
+        fresh, seconds_fresh = timed(partial(start_frame, changed, camera, settings), 1, repeats)
+        after, seconds = timed(partial(start_frame, changed, camera, settings, previous=old), 1, repeats)
         rows.append(compare(name, "exact", after, fresh, (seconds, seconds_fresh)))
     return rows
 
@@ -187,10 +196,10 @@ def main(arguments: list[str]) -> None:
     scene = pose_scene(asset, [])
     if given.env:
         scene = replace(scene, environment=load_environment(given.env))
-    primary = given.primary or ("mesh" if scene.surfels is None else "gaussians")
+    primary: PrimarySurface = given.primary or ("mesh" if scene.surfels is None else "gaussians")
     settings = RenderSettings(bounces=given.bounces, primary=primary, skip_error=given.skip_error)
     camera = resized(asset.cameras[given.camera], given.size)
-    per_pass = samples_a_pass(settings, primary == "mesh").total
+    per_pass = samples_per_pass(FrameInputs(scene, camera, settings)).total
     passes, truth_passes = (max(1, -(-samples // per_pass)) for samples in (given.spp, given.truth))
     refine_frame(start_frame(scene, camera, settings))  # compile and warm up
     report = {"asset": given.asset.name, "primary": primary, "bounces": given.bounces, "spp": passes * per_pass, "size": given.size}

@@ -11,11 +11,13 @@ import json
 import statistics
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from drgs.render.rasterize_gbuffer import RasterSettings, rasterize
+from drgs.render.visible.rasterize import PUBLISHED_FILTER_SIGMA, RasterSettings, rasterize
 from drgs.scene.camera import Camera
 from drgs.warp_torch import device_from_name, thread_count
 
@@ -37,7 +39,7 @@ def main(arguments: list[str]) -> None:
     if given.repeats < MIN_REPEATS:
         raise ValueError(f"--repeats is {given.repeats}; a median of fewer than {MIN_REPEATS} means little")
     camera, surfels = load_workload(given.scene, device_from_name(given.device))
-    settings = RasterSettings(depth=given.depth)
+    settings = RasterSettings(depth=given.depth, filter_sigma=PUBLISHED_FILTER_SIGMA)
     if given.dump:
         with torch.no_grad():
             np.save(given.dump, rasterize(*surfels, camera, settings).features.permute(1, 2, 0).contiguous().cpu().numpy())
@@ -47,23 +49,35 @@ def main(arguments: list[str]) -> None:
     print(json.dumps(result, indent=None if given.json else 1))
 
 
-def load_workload(path: Path, device: torch.device) -> tuple[Camera, tuple[torch.Tensor, ...]]:
-    """The camera, and centres, tangents, opacities, features as leaves that want gradients."""
+class Workload(NamedTuple):
+    """What is blended, as leaves that want gradients."""
+
+    centers: Tensor
+    tangents: Tensor
+    opacities: Tensor
+    features: Tensor
+
+
+def load_workload(path: Path, device: torch.device) -> tuple[Camera, Workload]:
+    """A stored scene."""
     with np.load(path, allow_pickle=False) as stored:
         arrays = {name: torch.from_numpy(stored[name]) for name in stored.files}
     width, height = (int(x) for x in arrays["size"])
     camera = Camera(arrays["camera_from_world"].float(), arrays["K"].float(), width, height).to(device)
     tangents = torch.stack([arrays["tangents_u"], arrays["tangents_v"]], -1) * arrays["scales"][:, None, :]
-    surfels = (arrays["centers"], tangents, arrays["opacities"], arrays["features"])
-    return camera, tuple(tensor.float().to(device).contiguous().requires_grad_() for tensor in surfels)
+
+    def leaf(values: Tensor) -> Tensor:
+        return values.float().to(device).contiguous().requires_grad_()
+
+    return camera, Workload(leaf(arrays["centers"]), leaf(tangents), leaf(arrays["opacities"]), leaf(arrays["features"]))
 
 
-def difference_from_twin(camera: Camera, surfels: tuple[torch.Tensor, ...], tile: int = 20) -> dict:
+def difference_from_twin(camera: Camera, surfels: Workload, tile: int = 20) -> dict:
     """Largest and mean absolute difference of the image from drgs/reference, tile by tile, each with the surfels whose sphere it may see."""
     from drgs.reference.rasterize_gbuffer import rasterize as rasterize_reference
 
     with torch.no_grad():
-        image = rasterize(*surfels, camera, RasterSettings(depth=False)).features.double().cpu()
+        image = rasterize(*surfels, camera, RasterSettings(depth=False, filter_sigma=PUBLISHED_FILTER_SIGMA)).features.double().cpu()
         centers, tangents, opacities, features = (tensor.detach().double().cpu() for tensor in surfels)
         camera = camera.to("cpu")
         inside = centers @ camera.camera_from_world[:3, :3].double().T + camera.camera_from_world[:3, 3].double()
@@ -83,18 +97,20 @@ def difference_from_twin(camera: Camera, surfels: tuple[torch.Tensor, ...], tile
                 shifted[1, 2] -= top
                 width, height = min(tile, camera.width - left), min(tile, camera.height - top)
                 window = Camera(camera.camera_from_world, shifted.float(), width, height)
-                chosen = (x[seen] for x in (centers, tangents, opacities, features))
-                truth = rasterize_reference(*chosen, window, RasterSettings(depth=False), depth_origin=0.0).features
+                chosen = Workload(centers[seen], tangents[seen], opacities[seen], features[seen])
+                truth = rasterize_reference(
+                    *chosen, window, RasterSettings(depth=False, filter_sigma=PUBLISHED_FILTER_SIGMA), depth_origin=0.0
+                ).features
                 difference = (image[:, top : top + height, left : left + width] - truth).abs()
                 worst, total = max(worst, float(difference.max())), total + float(difference.sum())
     return {"twin_max_difference": worst, "twin_mean_difference": total / image.numel()}
 
 
-def measure(camera: Camera, surfels: tuple[torch.Tensor, ...], settings: RasterSettings, repeats: int) -> dict:
+def measure(camera: Camera, surfels: Workload, settings: RasterSettings, repeats: int) -> dict:
     """Medians [ms] over the repeats, after two that compile and warm up."""
-    device = surfels[0].device
+    device = surfels.centers.device
     generator = torch.Generator().manual_seed(0)
-    image_gradient = torch.randn(surfels[3].shape[1], camera.height, camera.width, generator=generator).to(device)
+    image_gradient = torch.randn(surfels.features.shape[1], camera.height, camera.width, generator=generator).to(device)
     depth_gradient = torch.randn(camera.height, camera.width, generator=generator).to(device)
 
     def clock() -> float:
@@ -122,8 +138,8 @@ def measure(camera: Camera, surfels: tuple[torch.Tensor, ...], settings: RasterS
         "threads": thread_count(),
         "repeats": repeats,
         "fastest_forward_backward_ms": round(min(forward + backward for forward, backward in times), 3),
-        "surfels": len(surfels[0]),
-        "channels": surfels[3].shape[1],
+        "surfels": len(surfels.centers),
+        "channels": surfels.features.shape[1],
         "size": [camera.width, camera.height],
         "device": str(device),
     }

@@ -29,10 +29,10 @@ from pathlib import Path
 import psutil
 from websockets.asyncio.client import ClientConnection, connect
 
-from drgs.client import Client
-from server.messages import ServerHello, server_message, unpack_frame
+from drgs_server.client import Client
+from drgs_server.live.messages import ServerHello, server_message, unpack_frame
 
-SERVE = "import sys; from pathlib import Path; from server.run import serve; serve(Path(sys.argv[1]), port=0, with_worker=False, ready=lambda a: print(a, flush=True))"
+SERVE = "import sys; from pathlib import Path; from drgs_server.run import serve; serve(Path(sys.argv[1]), port=0, with_worker=False, ready=lambda a: print(a, flush=True))"
 CAMERAS_A_SECOND = 10
 MOVING_SHARE = 0.5
 """Of each viewer's time; it rests for the other half."""
@@ -153,9 +153,9 @@ def _asset_file(asset: Path | None, folder: Path) -> Path:
 
 def _queue_jobs(data: Path, count: int) -> None:
     """As POST /api/jobs does, without as many uploads."""
-    from worker.data_directory import open_data_directory
-    from worker.database import JobRow, now, open_database
-    from worker.queue import JobQueue
+    from drgs_worker.jobs.queue import JobQueue
+    from drgs_worker.store.data_directory import open_data_directory
+    from drgs_worker.store.database import JobRow, now, open_database
 
     directory = open_data_directory(data)
     engine = open_database(directory)
@@ -241,10 +241,15 @@ async def _move(socket: ClientConnection, hello: ServerHello, index: int, end_at
         if phase < MOVING_SHARE or number == 0:
             number += 1
             angle = 0.02 * number
-            turn = [[math.cos(angle), -math.sin(angle), 0, 0], [math.sin(angle), math.cos(angle), 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+            turn: list[list[float]] = [
+                [math.cos(angle), -math.sin(angle), 0, 0],
+                [math.sin(angle), math.cos(angle), 0, 0],
+                [0, 0, 1, 0],
+                [0, 0, 0, 1],
+            ]
             matrix = [[sum(row[k] * start.world_from_camera[k][column] for k in range(4)) for column in range(4)] for row in turn]
             camera = {"type": "camera", "number": number, "world_from_camera": matrix, "fov_y_degrees": start.fov_y_degrees}
-            await socket.send(json.dumps(camera | {"width": width, "height": height}))
+            await socket.send(json.dumps({**camera, "width": width, "height": height}))
         await asyncio.sleep(1 / CAMERAS_A_SECOND)
 
 
@@ -292,8 +297,8 @@ def _revisions_after_kill(server: subprocess.Popen, folder: Path, sessions: list
     from sqlalchemy import func, select
     from sqlalchemy.orm import Session
 
-    from worker.data_directory import open_data_directory
-    from worker.database import SessionEventRow, open_database
+    from drgs_worker.store.data_directory import open_data_directory
+    from drgs_worker.store.database import SessionEventRow, open_database
 
     engine = open_database(open_data_directory(folder / "data"))
     with Session(engine) as database:

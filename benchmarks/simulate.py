@@ -62,7 +62,9 @@ def falling_cube(particles: int, material: Material, device: str = "cpu", drop: 
     volumes = torch.full((len(points),), 1 / len(points))
     floor = Condition(Plane((0, 0, 0), (0, 0, 1)), friction=0.3)
     chosen = device_from_name(device)
-    return make_model(points.to(chosen), volumes.to(chosen), (material,), torch.zeros(len(points)), grid, (0, 0, -9.81), (floor,))
+    return make_model(
+        points.to(chosen), volumes.to(chosen), (material,), torch.zeros(len(points), dtype=torch.int32), grid, (0, 0, -9.81), (floor,)
+    )
 
 
 def measure(model: Model, frames: int) -> dict:

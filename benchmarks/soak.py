@@ -19,15 +19,16 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 from websockets.asyncio.client import connect
 
 from benchmarks.service import SERVE
-from drgs.client import Client, RemoteSession
+from drgs_server.client import Client, RemoteSession
 
 ON_THEIR_WAY = 8
-PICTURE = {"width": 160, "height": 120, "spp": 16}
+PICTURE: dict[str, Any] = {"width": 160, "height": 120, "spp": 16}
 SHARES = {"edit": 6, "undo": 3, "redo": 1}
 SEED = 7
 
@@ -55,7 +56,7 @@ def measure(changes: int, folder: Path) -> dict:
         _digest(session)  # kernels are compiled once a machine; that is not what is measured
         process = psutil.Process(server.pid)
         rss_before, cpu_before, start = process.memory_info().rss, sum(process.cpu_times()[:2]), time.monotonic()
-        seconds = asyncio.run(_send(client, session.id, _messages(changes)))
+        seconds, received = asyncio.run(_send(client, session.id, _messages(changes)))
         took, cpu = time.monotonic() - start, sum(process.cpu_times()[:2]) - cpu_before
         rss_after = process.memory_info().rss
         info, picture = session.info(), _digest(session)
@@ -88,6 +89,7 @@ def measure(changes: int, folder: Path) -> dict:
         "server_cpu_seconds": round(cpu, 1),
         "ms_a_change_first_tenth": round(1e3 * statistics.mean(seconds[:tenth]), 2),
         "ms_a_change_last_tenth": round(1e3 * statistics.mean(seconds[-tenth:]), 2),
+        "bytes_to_the_viewer": received,
         "replay_seconds": round(replay_seconds, 2),
         "memory_mib_before": round(rss_before / 2**20),
         "memory_mib_after": round(rss_after / 2**20),
@@ -134,38 +136,40 @@ def _edit(chooser: random.Random) -> dict:
     }
 
 
-async def _send(client: Client, session: str, messages: list[dict]) -> list[float]:
-    """Seconds between each change's acknowledgement and the one before.
+async def _send(client: Client, session: str, messages: list[dict]) -> tuple[list[float], int]:
+    """Seconds between each change's acknowledgement and the one before; and the bytes that came meanwhile.
 
     Raises:
         ValueError: one was not accepted.
     """
     address = client.address.replace("http", "ws", 1) + f"/api/sessions/{session}/stream"
     seconds: list[float] = []
+    received = 0
     async with connect(address, additional_headers=client._headers, compression=None, max_size=1 << 26) as socket:
-        await socket.send(json.dumps({"type": "hello", "v": 1, "client": "soak"}))
+        await socket.send(json.dumps({"type": "hello", "v": 1, "changes": True, "client": "soak"}))
         sent, at = 0, time.monotonic()
         while len(seconds) < len(messages):
             while sent < len(messages) and sent - len(seconds) < ON_THEIR_WAY:
                 await socket.send(json.dumps(messages[sent] | {"id": sent}))
                 sent += 1
             said = await socket.recv()
+            received += len(said)
             if isinstance(said, str) and said.startswith(('{"type":"rejected"', '{"type":"error"')):
                 raise ValueError(f"a change was refused: {said[:300]}")
             if isinstance(said, str) and said.startswith('{"type":"accepted"'):
                 seconds.append(time.monotonic() - at)
                 at = time.monotonic()
-    return seconds
+    return seconds, received
 
 
 def _replayed(folder: Path, session: str) -> tuple[int, tuple]:
     from sqlalchemy import select
     from sqlalchemy.orm import Session
 
-    from server.edit_log import EditLog
-    from server.sessions import _change_of
-    from worker.data_directory import open_data_directory
-    from worker.database import SessionEventRow, open_database
+    from drgs_server.live.edit_log import EditLog
+    from drgs_server.live.sessions import _change_of
+    from drgs_worker.store.data_directory import open_data_directory
+    from drgs_worker.store.database import SessionEventRow, open_database
 
     engine, log = open_database(open_data_directory(folder / "data")), EditLog()
     with Session(engine) as database:

@@ -52,6 +52,8 @@ TIME_EDIT = """async (value) => {
   return done;
 }"""
 SETTLED = "document.querySelector('.stage').dataset.fresh === 'true' && document.querySelector('.stage').dataset.moving === 'false'"
+STATIC = ROOT / "server" / "drgs_server" / "static"
+"""The page as it is built."""
 
 
 def main(arguments: list[str]) -> None:
@@ -72,7 +74,7 @@ def measure(mesh: Path | None, repeats: int, turn_seconds: float) -> dict[str, f
     Raises:
         ValueError: the viewer is not built, or no Chromium is there.
     """
-    if not (ROOT / "server" / "static" / "index.html").is_file():
+    if not (STATIC / "index.html").is_file():
         raise ValueError("the viewer is not built; run: python web/build.py")
     with tempfile.TemporaryDirectory(prefix="drgs-viewer-") as folder:
         if mesh is None:
@@ -94,7 +96,7 @@ def measure(mesh: Path | None, repeats: int, turn_seconds: float) -> dict[str, f
 
 def bundle_bytes() -> int:
     """Of all that a browser may fetch of the page, each file gzipped."""
-    return sum(len(gzip.compress(path.read_bytes(), 6)) for path in (ROOT / "server" / "static").rglob("*") if path.is_file())
+    return sum(len(gzip.compress(path.read_bytes(), 6)) for path in (STATIC).rglob("*") if path.is_file())
 
 
 def _open(browser: Browser, server: RunningServer, width: int, height: int, local: bool) -> Page:

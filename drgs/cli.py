@@ -1,22 +1,38 @@
 """The command line: `drgs build · render · import · export · simulate · eval · doctor · serve · worker · bench`.
 
 Each command reads its arguments, calls one function of the library and prints. Heavy modules are imported inside the commands, so
-that `drgs --help` answers at once. Wrong input ends with one sentence on stderr and exit code 2, Ctrl-C with 130; DRGS_TRACEBACK=1
-shows where a sentence came from. With --json stdout holds one JSON document and nothing else.
+that `drgs --help` answers at once. Wrong input and full disks end with one sentence on stderr and exit code 1, a command that is called wrongly
+with 2, Ctrl-C with 130; DRGS_TRACEBACK=1 shows where a sentence came from. With --json stdout holds one JSON document and nothing else.
 """
 
+import errno
 import json
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from drgs.exchange.export_formats import EXPORT_FORMATS, FILE_KINDS, ExportFormat, export_format_of
+from drgs.installation import missing_package, unsupported_system
+from drgs.scene.tone_curve import ToneCurve
+
 if TYPE_CHECKING:
     from drgs.scene.asset import Asset
+
+
+INPUT_EXIT_CODE = 1
+USAGE_EXIT_CODE = 2
+
+
+class UsageError(ValueError):
+    """The command was called wrongly, which can be seen without looking at any file."""
 
 
 class _Commands(TyperGroup):
@@ -32,8 +48,8 @@ class _Commands(TyperGroup):
         except (ValueError, OSError) as error:
             if os.environ.get("DRGS_TRACEBACK"):
                 raise
-            print(f"drgs: {' '.join(str(error).split())}", file=sys.stderr)
-            raise typer.Exit(2) from None
+            print(f"drgs: {_sentence(error)}", file=sys.stderr)
+            raise typer.Exit(USAGE_EXIT_CODE if isinstance(error, UsageError) else INPUT_EXIT_CODE) from None
 
 
 app = typer.Typer(cls=_Commands, add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
@@ -67,29 +83,30 @@ class Denoiser(StrEnum):
     oidn = "oidn"
 
 
-class ToneCurveName(StrEnum):
-    standard = "standard"
-    filmic = "filmic"
-    agx = "agx"
-    neutral = "neutral"
-
-
-class ExportFormat(StrEnum):
-    ply = "ply"
-    ply3 = "ply3"
-    glb = "glb"
-    usd = "usd"
-    env = "env"
-
-
+EXPORT_HELP = "; ".join(f"{name}: {FILE_KINDS[name].title}" for name in EXPORT_FORMATS)
 AssetPath = Annotated[Path, typer.Argument(metavar="ASSET", help="Asset folder, or the same zipped.")]
 DatasetPath = Annotated[Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP or NeRO folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
-DataFolder = Annotated[Path | None, typer.Option("--data", help="Folder of assets, jobs and the token.", show_default="data")]
+DataFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--data", help="Folder of assets, jobs and the token.", show_default="data in a checkout, else a folder of the user's own"
+    ),
+]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from drgs import __version__
+
+        print(f"drgs {__version__}")
+        raise typer.Exit
 
 
 @app.callback()
-def about() -> None:
+def about(
+    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")] = False,
+) -> None:
     """Relightable, deformable, editable 2D Gaussians: photos in, an asset out."""
 
 
@@ -107,8 +124,8 @@ def build(
     json_progress: Annotated[bool, typer.Option("--json-progress", help="Print one JSON line for each progress report on stdout.")] = False,
 ) -> None:
     """Build an asset from posed photographs."""
-    from drgs.build.build_asset import BuildSettings, BuildStopped, build_asset
     from drgs.cli_progress import StopOnInterrupt, build_progress
+    from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
 
     settings = BuildSettings(preset=preset.value, binding=binding.value, device=device.value, seed=seed, resume=resume)
     with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
@@ -127,6 +144,7 @@ def build(
         )
 
 
+# Many arguments because each is an option of the command.
 @app.command()
 def render(
     asset: AssetPath,
@@ -139,9 +157,7 @@ def render(
     bounces: Annotated[int, typer.Option(min=0, help="Indirect bounces.")] = 1,
     primary: Annotated[Primary | None, typer.Option(help="What the camera sees; by default the Gaussians where there are some.")] = None,
     denoise: Annotated[Denoiser, typer.Option()] = Denoiser.none,
-    tone_curve: Annotated[ToneCurveName, typer.Option(help="How bright light is brought to the screen; EXR files stay linear.")] = (
-        ToneCurveName.standard
-    ),
+    tone_curve: Annotated[ToneCurve, typer.Option(help="How bright light is brought to the screen; EXR files stay linear.")] = "standard",
     aov: Annotated[bool, typer.Option("--aov", help="Write <name>.exr with the maps behind the picture, too.")] = False,
     seed: Annotated[int, typer.Option()] = 0,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Picture size instead of the file's.")] = None,
@@ -152,11 +168,11 @@ def render(
     as_json: Json = False,
 ) -> None:
     """Render an asset from the cameras of a file: <name>.png (RGBA, straight alpha, sRGB), and maps with --aov."""
-    from drgs.build.load_views import load_cameras
     from drgs.cli_progress import frame_progress
     from drgs.deform.pose_scene import pose_scene
+    from drgs.reconstruct.capture.load_views import load_cameras
+    from drgs.render.records import RenderSettings
     from drgs.render.render_cameras import render_cameras
-    from drgs.render.render_frame import RenderSettings
     from drgs.scene.edits import EnvironmentEdit, load_edits
 
     changes = load_edits(edits) if edits else []
@@ -169,7 +185,7 @@ def render(
         bounces=bounces,
         primary=primary.value if primary else ("gaussians" if scene.surfels is not None else "mesh"),
         denoise=denoise.value,
-        tone_curve=tone_curve.value,
+        tone_curve=tone_curve,
         target_error=error,
         skip=skip,
         seed=seed,
@@ -191,7 +207,7 @@ def import_(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Asset folder to write.")],
 ) -> None:
     """Make an asset of a mesh, without training."""
-    from drgs.build.import_mesh import import_mesh
+    from drgs.convert.import_mesh import import_mesh
     from drgs.scene.asset import save_asset
 
     save_asset(import_mesh(mesh), out)
@@ -202,13 +218,18 @@ def import_(
 def export(
     asset: AssetPath,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write.")],
-    format: Annotated[ExportFormat, typer.Option(help="ply: 2D Gaussians; glb: textured mesh; env: the light as EXR.")],
+    format: Annotated[ExportFormat | None, typer.Option(help=EXPORT_HELP, show_default="by OUT's suffix")] = None,
 ) -> None:
     """Write an asset as a file that other programs read."""
-    from drgs.build.export_asset import export_asset
+    try:
+        chosen = format or export_format_of(out)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+    from drgs.convert.export_asset import export_asset
     from drgs.scene.asset import load_asset
 
-    export_asset(load_asset(asset), out, format.value)
+    export_asset(load_asset(asset), out, chosen)
     print(f"Wrote {out}", file=sys.stderr)
 
 
@@ -253,8 +274,8 @@ def eval_(
     as_json: Json = False,
 ) -> None:
     """Render an asset's test views and score them against the truth."""
-    from drgs.build.evaluate_asset import EvaluationSettings, evaluate_asset
     from drgs.cli_progress import frame_progress
+    from drgs.evaluate.evaluate_asset import EvaluationSettings, evaluate_asset
 
     settings = EvaluationSettings(samples_per_pixel=spp, seed=seed)
     with frame_progress("Evaluating", None) as advance:
@@ -265,7 +286,7 @@ def eval_(
 @app.command()
 def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
     """Check a capture before time is spent on it."""
-    from drgs.build.doctor import doctor as examine
+    from drgs.evaluate.doctor import doctor as examine
 
     report = examine(dataset)
     if as_json:
@@ -276,7 +297,7 @@ def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
             print(line)
     else:
         raise ValueError(report["findings"][0]["sentence"])
-    raise typer.Exit(0 if report["ok"] else 2)
+    raise typer.Exit(0 if report["ok"] else INPUT_EXIT_CODE)
 
 
 @app.command()
@@ -290,13 +311,15 @@ def serve(
     ] = None,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the viewer in a browser.")] = False,
     device: Annotated[DeviceName | None, typer.Option(show_default="auto")] = None,
+    restore_backup: Annotated[bool, typer.Option("--restore-backup", help="Begin with the last good copy of a damaged database.")] = False,
 ) -> None:
     """Start the server and a worker for its jobs; prints the address to open. More settings: docs/operations.md."""
-    from server.run import serve as run_server
+    with _extra("drgs serve", "serve"):
+        from drgs_server.run import serve as run_server
 
     roots = tuple(path.resolve() for path in captures or ())
     on = device.value if device else None
-    raise typer.Exit(run_server(data, host, port, with_worker=worker, open_browser=open_browser, capture_roots=roots, device=on))
+    raise typer.Exit(run_server(data, host, port, worker, open_browser, capture_roots=roots, device=on, restore_backup=restore_backup))
 
 
 @app.command()
@@ -306,7 +329,8 @@ def worker(
     requeue: Annotated[str | None, typer.Option(metavar="WORKER", help="Give this dead worker's jobs to the others, and end.")] = None,
 ) -> None:
     """Run queued jobs without serving pages, for example on another machine."""
-    from worker.run import requeue_worker, run_worker
+    with _extra("drgs worker", "serve"):
+        from drgs_worker.run import requeue_worker, run_worker
 
     if requeue is not None:
         print(json.dumps(requeue_worker(data, requeue)))
@@ -325,14 +349,40 @@ def bench(context: typer.Context, name: Annotated[str, typer.Argument(metavar="N
     run_benchmark([name, *context.args])
 
 
+def _sentence(error: ValueError | OSError) -> str:
+    """What the error says, on one line; the system's own errors without their number."""
+    if isinstance(error, OSError) and error.strerror:
+        what = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        return f"{what}; free some space and try again" if error.errno == errno.ENOSPC else what
+    return " ".join(str(error).split())
+
+
 def _size(text: str | None) -> tuple[int, int] | None:
     """(width, height) of '400x300'."""
     if text is None:
         return None
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
-        raise ValueError(f"--size is {text!r}; expected WIDTHxHEIGHT in pixels, like 400x300")
+        raise UsageError(f"--size is {text!r}; expected WIDTHxHEIGHT in pixels, like 400x300")
     return int(width), int(height)
+
+
+@contextmanager
+def _extra(what: str, extra: str) -> Iterator[None]:
+    """Around the imports of a command that needs an extra.
+
+    Raises:
+        ValueError: one of its packages is missing; the sentence holds the command that installs it.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").split(".")[0]
+        if missing == "fcntl":
+            raise ValueError(f"{what} runs on Linux and macOS; on Windows, use it in the Windows Subsystem for Linux") from error
+        if missing.startswith("drgs"):
+            raise
+        raise ValueError(missing_package(what, missing, extra)) from error
 
 
 def _open_asset(path: Path, device: DeviceName) -> "Asset":
@@ -360,6 +410,8 @@ def _print_document(document: dict, as_json: bool) -> None:
 
 def main() -> None:
     """Entry point of the `drgs` command."""
+    if (sentence := unsupported_system()) and any(find_spec(name) is None for name in ("torch", "warp", "embreex")):
+        sys.exit(f"drgs cannot run here: {sentence}")
     app()
 
 

@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Event
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from drgs.build.report_progress import Progress
+from drgs.reconstruct.progress import Progress, plain_progress
 
 
 class StopOnInterrupt:
@@ -37,20 +36,19 @@ class StopOnInterrupt:
 
 
 @contextmanager
-def build_progress(as_json_lines: bool) -> Iterator[Callable[["Progress"], None]]:
+def build_progress(as_json_lines: bool) -> Iterator[Callable[[Progress], None]]:
     """Where a build's progress reports go: JSON lines on stdout (without the preview picture), or a bar on stderr."""
     if as_json_lines:
 
-        def report_line(progress: "Progress") -> None:
-            fields = ("stage", "iteration", "iterations", "fraction", "psnr", "message", "eta_seconds")
-            print(json.dumps({name: getattr(progress, name) for name in fields}), flush=True)
+        def report_line(progress: Progress) -> None:
+            print(json.dumps(plain_progress(progress)), flush=True)
 
         yield report_line
         return
     with _bar() as bar:
         task = bar.add_task("Starting", total=1.0, note="")
 
-        def report_bar(progress: "Progress") -> None:
+        def report_bar(progress: Progress) -> None:
             note = progress.message or ("" if progress.psnr is None else f"{progress.psnr:.2f} dB")
             bar.update(task, completed=progress.fraction, description=progress.stage, note=note)
 

@@ -2,7 +2,7 @@
 
     python examples/demo.py [--no-browser] [--keep] [--preset fast] [--data data] [--port 8000] [--rebuild]
 
-It uses the service as any program would, through drgs.client. The build is a durable job with a fixed key: stopped and started again,
+It uses the service as any program would, through drgs_server.client. The build is a durable job with a fixed key: stopped and started again,
 the demo goes on where it was; once built, the object opens at once. With --no-browser it ends when the object is built and a frame of
 it has been served, and leaves the service running only with --keep.
 """
@@ -24,8 +24,9 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from drgs.client import Client, ServerError
-from server.rest_records import JobInfo
+from drgs_server.api.rest_records import JobInfo
+from drgs_server.client import Client, ServerError
+from drgs_worker.jobs.requests import PresetName
 
 ROOT = Path(__file__).resolve().parent.parent
 START_SECONDS = 120
@@ -122,7 +123,7 @@ def wait_for_address(service: subprocess.Popen, log: Path) -> str:
     raise RuntimeError(f"the service did not answer within {START_SECONDS} s; its words are in {os.path.relpath(log)}")
 
 
-def build_sample(client: Client, preset: str, rebuild: bool) -> str:
+def build_sample(client: Client, preset: PresetName, rebuild: bool) -> str:
     """The asset of the sample capture: found, finished or built; a progress bar while that takes.
 
     Raises:
@@ -173,7 +174,7 @@ def check_frame(client: Client, asset_id: str) -> str:
     seconds = time.perf_counter() - started
     pixels = Image.open(io.BytesIO(picture)).convert("RGBA")
     covered = sum(pixels.getchannel("A").histogram()[128:]) / (pixels.width * pixels.height)
-    if not 0.01 < covered < 1 or pixels.convert("L").getextrema()[1] < 32:
+    if not 0.01 < covered < 1 or max(pixels.convert("L").tobytes()) < 32:
         raise RuntimeError(f"a frame of the sample shows nothing: {covered:.1%} of its pixels are covered")
     shape = f"{asset.surfel_count} Gaussians, {asset.face_count} triangles"
     return f"{shape}; a first 256x256 frame took {seconds:.1f} s, the object covers {covered:.0%} of it"

@@ -6,8 +6,8 @@ python examples/relight_folder.py "http://127.0.0.1:8000/#token=..." OUT [--sear
 import argparse
 from pathlib import Path
 
-from drgs.client import Client
-from worker.requests import RenderRequest
+from drgs_server.client import Client
+from drgs_worker.jobs.requests import RenderRequest
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -6,8 +6,8 @@ python examples/turntable.py "http://127.0.0.1:8000/#token=..." ASSET_ID OUT.mp4
 import argparse
 from pathlib import Path
 
-from drgs.client import Client
-from worker.requests import RenderRequest, Turntable
+from drgs_server.client import Client
+from drgs_worker.jobs.requests import RenderRequest, Turntable
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from drgs.client import Client
+from drgs_server.client import Client
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,14 +1,17 @@
-"""What all tests share: the device, fixed seeds, and shape checks on the records.
+"""What all tests share: the device, fixed seeds, and shape checks (tests/shape_checks.py).
 
 `device` is the CPU, and CUDA too where there is one; `--device cpu` or `--device cuda` asks for one of them, and cuda fails where
 there is none instead of passing by doing nothing.
 """
 
-import pytest
-from jaxtyping import install_import_hook
+from typing import Any
 
-# Before anything imports them: every tensor that enters a record must have the shape its annotation says.
-_hook = install_import_hook(["drgs.scene", "drgs.render.records"], "beartype.beartype")
+import pytest
+
+from tests.shape_checks import check_imports_of
+
+# Before anything imports them: what enters and leaves functions and records must be of the shape that the annotation says.
+check_imports_of(["drgs.scene", "drgs.deform", "drgs.render.records", "drgs.reconstruct", "drgs.convert", "drgs.evaluate"])
 
 import torch  # noqa: E402
 
@@ -24,6 +27,38 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if asked == "cuda" and not torch.cuda.is_available():
         raise pytest.UsageError("--device cuda was asked for, but torch finds no usable GPU")
     metafunc.parametrize("device", [asked] if asked else ["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
+
+
+HALF_WAY = "tests/web/test_par"
+"""Tests of the browser before and behind this name take about equally long."""
+
+
+def is_in_browser(nodeid: str) -> bool:
+    return nodeid.startswith("tests/web/")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the browser's tests as slow; where two processes share the tests, they come first."""
+    for item in items:
+        if is_in_browser(item.nodeid):
+            item.add_marker(pytest.mark.slow)
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: not is_in_browser(item.nodeid))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """How `./run test` shares the tests out among three processes: file by file, those that use the browser in two lots.
+
+    One server and one Chromium serve a lot; the lots wait more than they compute, and the third process takes what is left meanwhile.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Shares(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return f"browser, second lot: {nodeid > HALF_WAY}" if is_in_browser(nodeid) else nodeid.split("::")[0]
+
+    return Shares(config, log)
 
 
 @pytest.fixture(autouse=True)

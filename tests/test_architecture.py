@@ -1,17 +1,25 @@
-"""The tree keeps its shape: imports go one way, and names, devices and dangers stay where they belong."""
+"""The tree keeps its shape: imports go one way and in no circle, nothing public is dead, no function is large without a reason, and names,
+devices and dangers stay where they belong.
+"""
 
 import ast
 import re
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
-LAYERS = ("drgs.maths", "drgs.exchange", "drgs.scene", "drgs.deform", "drgs.render", "drgs.build", "worker", "server")
+LAYERS = (
+    "drgs.maths", "drgs.exchange", "drgs.scene", "drgs.deform", "drgs.render", "drgs.reconstruct", "drgs.convert", "drgs.evaluate",
+    "drgs_worker.store", "drgs_worker.jobs", "drgs_worker", "drgs_server",
+)  # fmt: skip
 """Each may import those before it."""
-TOP_FILES = {"drgs/__init__.py", "drgs/cli.py", "drgs/cli_progress.py", "drgs/metrics.py", "drgs/client.py", "drgs/warp_torch.py"}
+TOP_FILES = {"drgs/__init__.py", "drgs/cli.py", "drgs/cli_progress.py", "drgs/installation.py", "drgs/warp_torch.py"}
 """Files of drgs that belong to no layer."""
 
 
@@ -32,6 +40,7 @@ PYTHON = [name for name in FILES if name.endswith(".py")]
 PRODUCT = [name for name in PYTHON if name.startswith(("drgs/", "worker/", "server/"))]
 
 
+@cache
 def syntax(name: str) -> ast.Module:
     return ast.parse((ROOT / name).read_text(), name)
 
@@ -61,14 +70,76 @@ def module_level_imports(tree: ast.Module) -> set[str]:
     return set().union(*(imports(node) for node in statements)) if statements else set()
 
 
+def dotted_name(path: str) -> str:
+    """Of the module in a file: the services' folders hold their import packages."""
+    return path.removeprefix("server/").removeprefix("worker/").removesuffix(".py").replace("/", ".")
+
+
 def layer(dotted: str) -> int | None:
     """Place in LAYERS of a module."""
     return next((k for k, name in enumerate(LAYERS) if dotted == name or dotted.startswith(name + ".")), None)
 
 
-@pytest.mark.parametrize("name", [name for name in PRODUCT if layer(name.replace("/", ".")) is not None])
+def module_name(path: str) -> str:
+    """As it is imported: a package's name for its `__init__.py`."""
+    return dotted_name(path).removesuffix(".__init__")
+
+
+MODULES = {module_name(name): name for name in PRODUCT}
+
+
+def imported_modules(module: str) -> set[str]:
+    """Modules of the product that this one imports, inside functions and for type checkers too.
+
+    A module that names its neighbour runs their package's `__init__` as well; that is how packages work, and not counted.
+    """
+    found: set[str] = set()
+    package = module if MODULES[module].endswith("__init__.py") else module.rpartition(".")[0]
+    for node in ast.walk(syntax(MODULES[module])):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            source = ".".join([*above, *filter(None, [node.module])])
+            found |= {name if (name := f"{source}.{alias.name}") in MODULES else source for alias in node.names}
+    return (found & set(MODULES)) - {module}
+
+
+def cycles(graph: dict[str, set[str]]) -> set[frozenset[str]]:
+    """Sets of nodes that reach each other."""
+    reached: dict[str, set[str]] = {}
+    for start in graph:
+        reached[start], front = set(), [start]
+        while front:
+            further = graph[front.pop()] - reached[start]
+            reached[start] |= further
+            front += further
+    return {frozenset(b for b in reached[a] if a in reached[b]) for a in graph if a in reached[a]}
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    assert [sorted(cycle) for cycle in cycles({module: imported_modules(module) for module in MODULES})] == []
+
+
+def test_the_renderers_folders_import_each_other_in_no_circle():
+    def folder(module: str) -> str:
+        return ".".join(module.split(".")[:3])
+
+    inside = {module for module in MODULES if module.startswith("drgs.render.")}
+    graph: dict[str, set[str]] = {folder(module): set() for module in inside}
+    for module in inside:
+        graph[folder(module)] |= {folder(found) for found in imported_modules(module) & inside} - {folder(module)}
+    assert [sorted(cycle) for cycle in cycles(graph)] == []
+    assert "drgs.render.progressive" in graph["drgs.render.film"], "the film reads the frame, not the other way round"
+
+
+def test_cycles_are_found():
+    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set()}) == {frozenset("abc")}
+
+
+@pytest.mark.parametrize("name", [name for name in PRODUCT if layer(dotted_name(name)) is not None])
 def test_imports_go_one_way(name: str):
-    own = layer(name.removesuffix(".py").replace("/", "."))
+    own = layer(dotted_name(name))
     assert own is not None
     upwards = {found for found in imports(syntax(name)) if (layer(found) or 0) > own}
     assert not upwards, f"{name} lies in {LAYERS[own]} and imports {sorted(upwards)}"
@@ -82,9 +153,7 @@ def test_maths_imports_nothing_else_of_drgs():
 
 def test_every_file_of_drgs_belongs_to_a_layer():
     strays = [
-        name
-        for name in PRODUCT
-        if name.startswith("drgs/") and layer(name.replace("/", ".")) is None and not name.startswith("drgs/reference/")
+        name for name in PRODUCT if name.startswith("drgs/") and layer(dotted_name(name)) is None and not name.startswith("drgs/reference/")
     ]
     assert set(strays) <= TOP_FILES
 
@@ -105,11 +174,33 @@ def test_server_and_worker_import_no_torch_at_module_level():
         assert not found, f"{name} imports {sorted(found)} when it is imported"
 
 
-@pytest.mark.parametrize("module", ["server.app", "worker.run"])
+@pytest.mark.parametrize("module", ["drgs_server.app", "drgs_worker.run"])
 def test_importing_a_service_does_not_bring_torch_along(module: str):
     program = f"import sys, {module}; sys.exit(sorted({{'torch', 'warp'}} & set(sys.modules)) or None)"
     result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr
+
+
+def test_importing_the_client_brings_only_what_a_client_needs():
+    heavy = {"alembic", "av", "dbos", "fastapi", "numpy", "obstore", "sqlalchemy", "starlette", "torch", "uvicorn", "warp"}
+    program = f"import sys; from drgs import Client; sys.exit(sorted({heavy} & set(sys.modules)) or None)"
+    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+
+
+def test_the_library_knows_no_http_and_no_service():
+    network = {"aiohttp", "fastapi", "http", "httpx", "requests", "socket", "starlette", "urllib.request", "uvicorn", "websockets"}
+    services = {"drgs_server", "drgs_worker"}
+    late = {"drgs/cli.py", "drgs/__init__.py"}
+    for name in (name for name in PRODUCT if name.startswith("drgs/")):
+        dotted_names = imports(syntax(name))
+        roots = {dotted.split(".")[0] for dotted in dotted_names}
+        assert not (roots | dotted_names) & network, f"{name} imports {sorted((roots | dotted_names) & network)}"
+        # The command line starts the service when it is told to; `drgs.Client` is found when it is asked for.
+        if name not in late:
+            assert not roots & services, f"{name} imports {sorted(roots & services)}"
+    at_once = {dotted.split(".")[0] for name in late for dotted in module_level_imports(syntax(name))}
+    assert not at_once & services
 
 
 def test_names_say_something():
@@ -131,7 +222,7 @@ def test_devices_are_those_of_the_inputs():
 def test_pickle_is_met_only_by_the_restricted_reader():
     dangerous = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal"}
     users = [name for name in PRODUCT if dangerous & {dotted.split(".")[0] for dotted in imports(syntax(name))}]
-    assert set(users) <= {"drgs/build/load_views/unpickle_cameras.py"}
+    assert set(users) <= {"drgs/reconstruct/capture/load_views/unpickle_cameras.py"}
 
 
 @pytest.mark.parametrize("name", PRODUCT)
@@ -157,7 +248,103 @@ def test_no_path_of_one_machine_is_in_the_tree():
     ] == []
 
 
+@pytest.mark.slow
 def test_public_names_exist_and_are_imported_late():
     program = "import sys, drgs; bad = {'torch', 'numpy'} & set(sys.modules); [getattr(drgs, n) for n in drgs.__all__]; sys.exit(sorted(bad) or None)"
     result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr
+
+
+Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+PLAIN_DECORATORS = re.compile(r"(wp\.\w+|dataclass|cache|lru_cache|contextmanager|asynccontextmanager|torch\.no_grad)\b")
+"""Those that do not register what they decorate anywhere; others (`app.command`, `router.get`) use it."""
+A_NAME = re.compile(r"[\w.:]+((, | \| |\[)[\w.:]+\]*)*")
+"""A string that may name something: an annotation in quotes, `package.module:name`, the argument of `getattr`."""
+
+
+def uses(tree: ast.AST) -> Iterator[str]:
+    """Names that the code reads, and a little more. Neither imports, `__all__`, nor what a definition says of itself are uses."""
+
+    def visit(node: ast.AST, inside: frozenset[str]) -> Iterator[str]:
+        names: list[str] = []
+        if isinstance(node, Definition):
+            inside |= {node.name}
+        elif isinstance(node, ast.Assign) and any(isinstance(target, ast.Name) and target.id == "__all__" for target in node.targets):
+            return
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+            names = [node.id]
+        elif isinstance(node, ast.Attribute):
+            names = [node.attr]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and A_NAME.fullmatch(node.value):
+            names = re.findall(r"\w+", node.value)
+        yield from (name for name in names if name not in inside)
+        for child in ast.iter_child_nodes(node):
+            yield from visit(child, inside)
+
+    return visit(tree, frozenset())
+
+
+def defined_names(tree: ast.Module) -> Iterator[str]:
+    """Functions, classes and constants of a module that nothing registers."""
+    for node in tree.body:
+        if isinstance(node, Definition):
+            if not node.name.startswith("__") and all(PLAIN_DECORATORS.match(ast.unparse(decorator)) for decorator in node.decorator_list):
+                yield node.name
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (target.id for target in targets if isinstance(target, ast.Name) and not target.id.startswith("__"))
+
+
+def unused(definitions: list[str], users: list[str], public: set[str]) -> list[str]:
+    """`file: name` of what is defined in one list of files and read in none of the other."""
+    used = Counter(name for user in users for name in uses(syntax(user)))
+    return [
+        f"{name}: {defined}"
+        for name in definitions
+        for defined in defined_names(syntax(name))
+        if not used[defined] and defined not in public
+    ]
+
+
+def test_no_name_is_there_for_tests_only():
+    import drgs
+
+    definitions = [name for name in PRODUCT if not name.startswith("drgs/reference/") and "/migrations/" not in name]
+    users = [name for name in PYTHON if not name.startswith("tests/")]
+    assert unused(definitions, users, set(drgs.__all__)) == []
+
+
+def test_every_twin_is_compared_with():
+    twins = [name for name in PRODUCT if name.startswith("drgs/reference/")]
+    assert unused(twins, [*twins, *(name for name in PYTHON if name.startswith(("tests/", "benchmarks/")))], set()) == []
+
+
+MANY_LINES, MANY_ARGUMENTS = 80, 12
+
+
+def large_functions(name: str) -> Iterator[str]:
+    """Functions beyond the limits that do not say why, in a comment or docstring of theirs: "Long because …", "Many arguments because …"."""
+    lines = (ROOT / name).read_text().splitlines()
+    for node in ast.walk(syntax(name)):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        first = min(node.lineno, *(decorator.lineno for decorator in node.decorator_list)) if node.decorator_list else node.lineno
+        text = "\n".join(lines[max(first - 2, 0) : node.end_lineno])  # a comment right above belongs to it
+        length = (node.end_lineno or node.lineno) + 1 - node.lineno
+        taken = node.args
+        count = len(
+            [
+                a
+                for a in (*taken.posonlyargs, *taken.args, *taken.kwonlyargs, taken.vararg, taken.kwarg)
+                if a and a.arg not in ("self", "cls")
+            ]
+        )
+        if length > MANY_LINES and "Long because " not in text:
+            yield f"{name}: {node.name} has {length} lines"
+        if count > MANY_ARGUMENTS and "Many arguments because " not in text:
+            yield f"{name}: {node.name} takes {count} arguments"
+
+
+def test_large_functions_say_why():
+    large = [found for name in PYTHON if not name.startswith("tests/") for found in large_functions(name)]
+    assert large == []

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from drgs import __version__
+
 COMMANDS = ("build", "render", "import", "export", "simulate", "eval", "doctor", "serve", "worker", "bench")
 
 
@@ -14,8 +16,9 @@ def drgs(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "drgs.cli", *map(str, arguments)], capture_output=True, text=True, timeout=120)
 
 
-def assert_one_sentence(result: subprocess.CompletedProcess[str]) -> None:
-    assert result.returncode == 2, result.stderr
+def assert_one_sentence(result: subprocess.CompletedProcess[str], exit_code: int = 1) -> None:
+    """1: wrong input or a full disk. 2: the command was called wrongly."""
+    assert result.returncode == exit_code, result.stderr
     assert result.stdout == ""
     assert len(result.stderr.strip().splitlines()) == 1, result.stderr
     assert result.stderr.startswith("drgs: ")
@@ -49,6 +52,7 @@ def test_help_takes_less_than_half_a_second_of_processor_time():
     assert min(seconds() for _ in range(3)) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command: str):
     result = drgs(command, "--help")
@@ -56,29 +60,40 @@ def test_every_command_explains_itself(command: str):
     assert result.stdout.startswith("Usage: ")
 
 
+@pytest.mark.slow
 def test_a_dataset_that_does_not_exist_is_one_sentence(tmp_path: Path):
     result = drgs("doctor", tmp_path / "nothing_here")
     assert_one_sentence(result)
     assert "nothing_here" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_no_capture_is_one_sentence(tmp_path: Path):
     assert_one_sentence(drgs("build", tmp_path, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_an_asset_that_does_not_exist_is_one_sentence(tmp_path: Path):
-    assert_one_sentence(drgs("export", tmp_path / "asset", tmp_path / "x.glb", "--format", "glb"))
+    assert_one_sentence(drgs("export", tmp_path / "asset", tmp_path / "x.glb"))
 
 
+def test_a_file_whose_suffix_names_no_format_is_one_sentence(tmp_path: Path):
+    result = drgs("export", tmp_path / "asset", tmp_path / "x.fbx")
+    assert_one_sentence(result, exit_code=2)
+    assert ".glb" in result.stderr and "--format" in result.stderr
+
+
+@pytest.mark.slow
 def test_a_wrong_size_is_one_sentence_that_says_what_is_expected(tmp_path: Path):
     cameras = tmp_path / "transforms.json"
     cameras.write_text('{"camera_angle_x": 0.5, "frames": []}')
     result = drgs("render", tmp_path, tmp_path / "out", "--cameras", cameras, "--size", "400")
-    assert_one_sentence(result)
+    assert_one_sentence(result, exit_code=2)
     assert "400x300" in result.stderr
 
 
+@pytest.mark.slow
 def test_wrong_edits_are_one_sentence_that_names_the_field(tmp_path: Path):
     edits = tmp_path / "edits.json"
     edits.write_text('[{"op": "material", "select": {"all": true}, "set": {"roughness": 3}}]')
@@ -87,11 +102,76 @@ def test_wrong_edits_are_one_sentence_that_names_the_field(tmp_path: Path):
     assert "0..1" in result.stderr
 
 
+@pytest.mark.parametrize("arguments", [["nonsense"], ["build", "only_one"], ["export", "asset", "out.glb", "--format", "stl"]])
+def test_a_command_that_is_called_wrongly_ends_with_2(arguments: list[str]):
+    result = drgs(*arguments)
+    assert result.returncode == 2
+    assert result.stdout == "" and "Usage: " in result.stderr
+
+
+def test_the_version_is_the_one_of_the_library():
+    result = drgs("--version")
+    assert (result.returncode, result.stdout) == (0, f"drgs {__version__}\n")
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An asset without Gaussians."""
+    from drgs.convert.import_mesh import import_mesh
+    from drgs.scene.asset import save_asset
+    from tests.web.browser import write_ball
+
+    folder = tmp_path_factory.mktemp("ball")
+    write_ball(folder / "ball.ply")
+    save_asset(import_mesh(folder / "ball.ply"), folder / "asset")
+    return folder / "asset"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "start"), [("a.glb", b"glTF"), ("a.exr", b"v/1\x01"), ("A.GLB", b"glTF")])
+def test_export_takes_the_format_from_the_ending(ball: Path, name: str, start: bytes, tmp_path: Path):
+    result = drgs("export", ball, tmp_path / name)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / name).read_bytes().startswith(start)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
+@pytest.mark.parametrize("name", ["a.glb", "a.usda", "a.usdc"])
+def test_a_file_that_cannot_be_written_whole_is_one_sentence_and_leaves_nothing(ball: Path, name: str, tmp_path: Path):
+    import resource
+
+    if name.startswith("a.usd"):
+        pytest.importorskip("pxr", reason="the optional package usd-core is not installed")
+    result = subprocess.run(
+        [sys.executable, "-m", "drgs.cli", "export", str(ball), str(tmp_path / name)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)),
+    )
+    assert_one_sentence(result)
+    assert "File too large" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_one_sentence_that_says_what_to_do():
+    program = (
+        "import drgs.cli as c, drgs.scene.edits as e\n"
+        "def fail(path): raise OSError(28, 'No space left on device', path)\ne.load_edits = fail\nc.main()"
+    )
+    arguments = ["render", "asset", "out", "--cameras", "c.json", "--edits", "e.json"]
+    result = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=60)
+    assert_one_sentence(result)
+    assert result.stderr == "drgs: e.json: No space left on device; free some space and try again\n"
+
+
 def test_render_brings_light_to_the_picture_by_the_curve_that_is_asked_for(tmp_path: Path):
     from typer.testing import CliRunner
 
-    from drgs.build.import_mesh import import_mesh
     from drgs.cli import app
+    from drgs.convert.import_mesh import import_mesh
     from drgs.scene.asset import save_asset
     from tests.web.browser import write_ball
 
@@ -110,10 +190,12 @@ def test_render_brings_light_to_the_picture_by_the_curve_that_is_asked_for(tmp_p
     assert pictures["standard"][".exr"] == pictures["filmic"][".exr"], "the light itself is the same"
 
 
+@pytest.mark.slow
 def test_simulate_says_that_it_is_not_there_yet(tmp_path: Path):
     assert_one_sentence(drgs("simulate", tmp_path, tmp_path, "--scene", tmp_path / "sim.json"))
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_with_130_and_a_sentence():
     program = "import drgs.cli as c, drgs.scene.edits as e\ndef stop(path): raise KeyboardInterrupt\ne.load_edits = stop\nc.main()"
     arguments = ["render", "asset", "out", "--cameras", "c.json", "--edits", "e.json"]

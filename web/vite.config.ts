@@ -7,7 +7,7 @@ export default defineConfig({
   base: '/',
   oxc: { jsx: { runtime: 'automatic', importSource: 'preact' } },
   build: {
-    outDir: '../server/static',
+    outDir: '../server/drgs_server/static',
     emptyOutDir: true,
     target: 'es2022',
     assetsInlineLimit: 0, // the server's content policy allows no inline script or style

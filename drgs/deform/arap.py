@@ -13,6 +13,8 @@ import fast_simplification
 import igl
 import numpy as np
 import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -47,7 +49,14 @@ class ArapSettings:
 class ArapHandles:
     """A mesh held by some of its vertices. Final; drags leave no trace in it."""
 
-    def __init__(self, vertices: Tensor, faces: Tensor, handles: Tensor, points: Tensor, settings: ArapSettings | None = None) -> None:
+    def __init__(
+        self,
+        vertices: Float[Tensor, "vertex 3"],
+        faces: Int[Tensor, "face 3"],
+        handles: Int[Tensor, "handle"],
+        points: Float[Tensor, "point 3"],
+        settings: ArapSettings | None = None,
+    ) -> None:
         """Prepare the mesh (vertex, 3), (face, 3) for drags of the vertices that `handles` (handle,) names, and points (point, 3) to carry.
 
         Parts of the object without a handle stay where they are.
@@ -62,11 +71,12 @@ class ArapHandles:
         mesh, triangles = vertices.detach().cpu().numpy(), faces.cpu().numpy()
         self._handles = vertices[handles.long()].detach().cpu().double()
         self._control = _Level(mesh, triangles, settings.control_faces, self._handles)
-        self._coarse, self._refine = self._control, None
+        self._coarse = self._control
+        self._refine: Weights | None = None
         gmls = GmlsSettings(neighbours=settings.neighbours)
         if len(self._control.corners) > WORTH_TWO_MESHES * settings.coarse_faces:
             self._coarse = _Level(mesh, triangles, settings.coarse_faces, self._handles)
-            self._refine: Weights | None = build_weights(self._coarse.rest.float(), self._control.rest.float(), gmls)
+            self._refine = build_weights(self._coarse.rest.float(), self._control.rest.float(), gmls)
         self._device = points.device
         self._weights = build_weights(self._control.rest.float(), points.detach().cpu(), gmls)
 
@@ -75,7 +85,7 @@ class ArapHandles:
         """How many faces the control mesh has."""
         return len(self._control.corners)
 
-    def drag(self, targets: Tensor) -> tuple[Tensor, Tensor]:
+    def drag(self, targets: Float[Tensor, "handle 3"]) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3 3"]]:
         """Positions (point, 3) and gradients (point, 3, 3) of the points when the handles are at targets (handle, 3).
 
         Raises:
@@ -105,7 +115,9 @@ class ArapHandles:
 class _Level:
     """A control mesh, held where the handles are, and factorised. Final; nothing in it changes."""
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, most_faces: int, handles: Tensor) -> None:
+    def __init__(
+        self, vertices: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"], most_faces: int, handles: Float[Tensor, "handle 3"]
+    ) -> None:
         where, corners = _control_mesh(vertices, faces, most_faces)
         _, nearest = cKDTree(where).query(handles.numpy())
         held, group = np.unique(nearest, return_inverse=True)
@@ -125,7 +137,9 @@ class _Level:
         self._data, self._lock = igl.ARAPData(), threading.Lock()
         igl.arap_precomputation(where, corners.astype(np.int64), 3, np.concatenate([held, loose]).astype(np.int32), self._data)
 
-    def solve(self, targets: Tensor, turns: Tensor, start: Tensor, iterations: int) -> Tensor:
+    def solve(
+        self, targets: Float[Tensor, "handle 3"], turns: Float[Tensor, "held 3 3"], start: Float[Tensor, "vertex 3"], iterations: int
+    ) -> Float[Tensor, "vertex 3"]:
         """Pose (vertex, 3) from one nearby, with handles at targets (handle, 3) and what held vertices lie beside them turned (held, 3, 3)."""
         goal = self._mean(targets) + (turns @ self._beside[..., None])[..., 0]
         with self._lock:
@@ -136,18 +150,18 @@ class _Level:
             raise ValueError("these handles cannot be solved for: the mesh is degenerate")
         return moved
 
-    def gradients(self, pose: Tensor) -> Tensor:
+    def gradients(self, pose: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3 3"]:
         """(vertex, 3, 3) deformation gradients of a pose (vertex, 3): the means over their faces by area."""
         _, frames = _face_frames(pose.numpy(), self.corners.numpy())
         return torch.from_numpy((self._vertex_from_faces @ (frames @ self._inverse_frames).reshape(-1, 9)).reshape(-1, 3, 3))
 
-    def _mean(self, values: Tensor) -> Tensor:
+    def _mean(self, values: Float[Tensor, "handle 3"]) -> Float[Tensor, "held 3"]:
         """(held, 3) means of (handle, 3)."""
         count = torch.bincount(self._group, minlength=len(self.held)).double()
         return torch.zeros(len(self.held), 3, dtype=torch.float64).index_add_(0, self._group, values) / count[:, None]
 
 
-def _rigid_fit(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+def _rigid_fit(points: Float[Tensor, "n 3"], targets: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """Rotation (3, 3) and shift (3,) that take points (n, 3) nearest to targets; no turn beyond what they tell."""
     middle, goal = points.mean(0), targets.mean(0)
     spread = (targets - goal).T @ (points - middle)
@@ -156,7 +170,9 @@ def _rigid_fit(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
     return turn, goal - turn @ middle
 
 
-def _face_frames(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _face_frames(
+    points: Float[ndarray, "vertex 3"], corners: Int[ndarray, "face 3"]
+) -> tuple[Float[ndarray, "face"], Float[ndarray, "face 3 3"]]:
     """Twice the areas (face,), and (face, 3, 3) with columns e1, e2 and the unit normal times the square root of that."""
     a, b, c = (points[corners[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
@@ -164,7 +180,9 @@ def _face_frames(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, n
     return size, np.stack([b - a, c - a, normal / np.sqrt(np.maximum(size, 1e-300))[:, None]], -1)
 
 
-def _control_mesh(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
+def _control_mesh(
+    vertices: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"], most_faces: int
+) -> tuple[Float[ndarray, "control_vertex 3"], Int[ndarray, "control_face 3"]]:
     """At most about `most_faces` faces, none of them a sliver, and only the vertices that they use; float64."""
     points, corners = vertices.astype(np.float64), faces.astype(np.int64)
     if len(corners) > most_faces:
@@ -177,7 +195,7 @@ def _control_mesh(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
     return np.ascontiguousarray(points[used]), renumbered.reshape(-1, 3)
 
 
-def _without_handle(count: int, corners: np.ndarray, held: np.ndarray) -> np.ndarray:
+def _without_handle(count: int, corners: Int[ndarray, "face 3"], held: Int[ndarray, "held"]) -> Int[ndarray, "loose"]:
     """Vertices of connected parts that no handle holds."""
     pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]]])
     _, part = connected_components(

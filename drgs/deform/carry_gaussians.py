@@ -7,6 +7,7 @@ an area and a side. Source: docs/sources.md (huang2024 for B); the cofactor rule
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from drgs.maths.frames import quat_wxyz_from_rotation
@@ -16,13 +17,13 @@ LARGEST_STRETCH = 1e2
 """Bounds of the singular values of F that a surfel may feel."""
 
 
-def cofactor(matrix: Tensor) -> Tensor:
+def cofactor(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3 3"]:
     """(..., 3, 3) cofactor matrices, det(M) M^-T without the division."""
     a, b, c = matrix.unbind(-1)
     return torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1)
 
 
-def guard_gradient(gradient: Tensor) -> Tensor:
+def guard_gradient(gradient: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     """(n, 3, 3) F with det > 0 and singular values within the bounds; matrices that already are so are returned as they were.
 
     A matrix that is not finite becomes the identity: whoever made it refuses the positions that belong to it.
@@ -48,11 +49,11 @@ def guard_gradient(gradient: Tensor) -> Tensor:
 
 
 def carry_tangents(
-    tangents: Tensor,
-    gradient: Tensor,
+    tangents: Float[Tensor, "n 3 2"],
+    gradient: Float[Tensor, "n 3 3"],
     variant: Literal["exact", "paper"] = "exact",
     order: Literal["ascending", "descending"] = "ascending",
-) -> Tensor:
+) -> Float[Tensor, "n 3 2"]:
     """(n, 3, 2) moved tangents B' = F B of tangents (n, 3, 2); F (n, 3, 3) is guarded here.
 
     Args:
@@ -69,12 +70,12 @@ def carry_tangents(
     return ((u @ vt) @ tangents.double() * scale[:, None]).to(tangents.dtype)
 
 
-def carry_normals(normals: Tensor, gradient: Tensor) -> Tensor:
+def carry_normals(normals: Float[Tensor, "n 3"], gradient: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3"]:
     """(n, 3) unit normals cof(F) n / |cof(F) n| of normals (n, 3); F (n, 3, 3) is guarded here."""
     return torch.nn.functional.normalize((cofactor(guard_gradient(gradient)) @ normals[..., None]).squeeze(-1), dim=-1, eps=1e-30)
 
 
-def decompose_tangents(tangents: Tensor) -> tuple[Tensor, Tensor]:
+def decompose_tangents(tangents: Float[Tensor, "n 3 2"]) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 2"]]:
     """Quaternions wxyz (n, 4) and log scales (n, 2), longer first, of tangents (n, 3, 2): what files hold of a moved surfel.
 
     The second scale comes from the area, |B1 x B2| / s1, which keeps its digits where m - q would cancel.

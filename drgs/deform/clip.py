@@ -15,6 +15,7 @@ from pathlib import Path
 import safetensors
 import safetensors.torch
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 FORMAT, VERSION = "drgs clip", 1
@@ -25,14 +26,12 @@ MOST_FRAMES = 100_000
 class ClipFrame:
     """Where an asset's parts are at one time."""
 
-    vertices: Tensor
-    """(vertex, 3) world."""
-    normals: Tensor
-    """(vertex, 3), unit."""
-    centers: Tensor | None
-    """(surfel, 3)."""
-    tangents: Tensor | None
-    """(surfel, 3, 2)."""
+    vertices: Float[Tensor, "vertex 3"]
+    """World."""
+    normals: Float[Tensor, "vertex 3"]
+    """Unit."""
+    centers: Float[Tensor, "surfel 3"] | None
+    tangents: Float[Tensor, "surfel 3 2"] | None
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ def open_clip(folder: Path) -> Clip:
         if not (0 < fps < math.inf and 1 <= frames <= MOST_FRAMES):
             raise ValueError(f"it has {frames} frames at {fps} a second")
         return Clip(Path(folder), fps, frames, int(manifest["counts"]["vertices"]), int(manifest["counts"]["surfels"]))
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"{folder}: is not a readable clip ({error})") from error
 
 
@@ -135,7 +134,10 @@ def read_frame(clip: Clip, index: int, device: torch.device | str = "cpu") -> Cl
             raise ValueError(f"{path}: {name} is {found}; expected {shape} of float32")
         if not torch.isfinite(values).all():
             raise ValueError(f"{path}: {name} holds values that are not finite")
-    return ClipFrame(*(arrays[name].to(device) if name in shapes else None for name in ("vertices", "normals", "centers", "tangents")))
+    vertices, normals = arrays["vertices"].to(device), arrays["normals"].to(device)
+    if not clip.surfels:
+        return ClipFrame(vertices, normals, None, None)
+    return ClipFrame(vertices, normals, arrays["centers"].to(device), arrays["tangents"].to(device))
 
 
 def frame_at(clip: Clip, seconds: float, device: torch.device | str = "cpu") -> ClipFrame:

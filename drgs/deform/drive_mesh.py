@@ -8,6 +8,7 @@ p' = sum w v' + F (p - sum w v). That reproduces the rest pose, rigid motions an
 from typing import Literal
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_tangents, guard_gradient
@@ -17,7 +18,9 @@ DEGENERATE = 1e-12
 """Faces whose area at rest is below this part of the median say nothing about F."""
 
 
-def vertex_gradients(vertices: Tensor, moved: Tensor, faces: Tensor) -> Tensor:
+def vertex_gradients(
+    vertices: Float[Tensor, "vertex 3"], moved: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, "vertex 3 3"]:
     """(vertex, 3, 3) deformation gradients that take vertices (vertex, 3) to moved (vertex, 3); identity where no face tells."""
     rest, now = _face_frames(vertices.double(), faces), _face_frames(moved.double(), faces)
     area = torch.linalg.cross(rest[..., 0], rest[..., 1]).norm(dim=-1)
@@ -34,15 +37,15 @@ def vertex_gradients(vertices: Tensor, moved: Tensor, faces: Tensor) -> Tensor:
 
 
 def drive_surfels(
-    vertices: Tensor,
-    moved: Tensor,
-    faces: Tensor,
-    gradients: Tensor,
+    vertices: Float[Tensor, "vertex 3"],
+    moved: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    gradients: Float[Tensor, "vertex 3 3"],
     binding: Binding,
-    centers: Tensor,
-    tangents: Tensor,
+    centers: Float[Tensor, "surfel 3"],
+    tangents: Float[Tensor, "surfel 3 2"],
     variant: Literal["corrected", "paper"] = "corrected",
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Float[Tensor, "surfel 3"], Float[Tensor, "surfel 3 2"]]:
     """Moved centres (surfel, 3) and tangents (surfel, 3, 2), from the mesh at rest, moved, and `vertex_gradients`.
 
     Args:
@@ -62,14 +65,14 @@ def drive_surfels(
     return foot_moved + (gradient @ (centers - foot)[..., None]).squeeze(-1), carry_tangents(tangents, gradient)
 
 
-def _polar(gradients: Tensor) -> tuple[Tensor, Tensor]:
+def _polar(gradients: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
     """Rotation and symmetric stretch (n, 3, 3) of F = R S, guarded."""
     f = guard_gradient(gradients).double()
     u, s, vt = torch.linalg.svd(f)
     return (u @ vt).to(gradients.dtype), (vt.mT @ torch.diag_embed(s) @ vt).to(gradients.dtype)
 
 
-def _face_frames(vertices: Tensor, faces: Tensor) -> Tensor:
+def _face_frames(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> Float[Tensor, "face 3 3"]:
     """(face, 3, 3): columns e1, e2 and the unit normal times the square root of |e1 x e2|."""
     a, b, c = vertices[faces.long()].unbind(1)
     normal = torch.linalg.cross(b - a, c - a)

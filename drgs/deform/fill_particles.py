@@ -10,11 +10,13 @@ from typing import Literal
 import numpy as np
 import torch
 import warp as wp
+from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from drgs.deform.measure_thickness import ThinPart, measure_thickness, share_of_area, thin_parts, welded
+from drgs.maths.constants import UNBOUNDED
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -49,10 +51,10 @@ class FillSettings:
 class Particles:
     """Matter at rest; interior points first, then those of the surface."""
 
-    positions: Tensor
-    """(particle, 3) float32, world units."""
-    volumes: Tensor
-    """(particle,) float32, world units cubed."""
+    positions: Float[Tensor, "particle 3"]
+    """World units."""
+    volumes: Float[Tensor, "particle"]
+    """World units cubed."""
     spacing: float
     """Of the interior lattice [world units]."""
     interior: int
@@ -74,14 +76,14 @@ def measure_depth(
 ):
     i = first + wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
-    distance = wp.float32(-1.0e30)
+    distance = wp.float32(-UNBOUNDED)
     if query.result:
         nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
         distance = -query.sign * wp.length(nearest - points[i])
     depth[i] = distance
 
 
-def fill_particles(vertices: Tensor, faces: Tensor, settings: FillSettings | None = None) -> Particles:
+def fill_particles(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], settings: FillSettings | None = None) -> Particles:
     """Fill the mesh of vertices (vertex, 3) and faces (face, 3).
 
     Raises:
@@ -133,14 +135,16 @@ def fill_particles(vertices: Tensor, faces: Tensor, settings: FillSettings | Non
     return Particles(torch.cat(positions).contiguous(), torch.cat(volumes), spacing, len(interior), thin, parts)
 
 
-def depths(tree: wp.Mesh, points: Tensor) -> Tensor:
+def depths(tree: wp.Mesh, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """(n,) distance from points (n, 3) to the surface, positive inside; the mesh must have been built for winding numbers."""
     found = torch.empty(len(points), device=points.device)
-    launch(measure_depth, len(points), [tree.id, warp_array(points, wp.vec3), 1e30], [warp_array(found)], warp_device(points))
+    launch(measure_depth, len(points), [tree.id, warp_array(points, wp.vec3), UNBOUNDED], [warp_array(found)], warp_device(points))
     return found
 
 
-def _lattice(low: Tensor, high: Tensor, spacing: float, jitter: float, seed: int, device: torch.device) -> Tensor:
+def _lattice(
+    low: Float[Tensor, "3"], high: Float[Tensor, "3"], spacing: float, jitter: float, seed: int, device: torch.device
+) -> Float[Tensor, "n 3"]:
     """Centres of the cells that divide the box evenly, about `spacing` wide, each shifted at random by up to `jitter` cells."""
     axes, widths = [], []
     for axis in range(3):
@@ -153,7 +157,7 @@ def _lattice(low: Tensor, high: Tensor, spacing: float, jitter: float, seed: int
     return (points + (2 * random - 1) * jitter * torch.tensor(widths)).float().contiguous().to(device)
 
 
-def _without_floaters(vertices: Tensor, faces: Tensor, share: float) -> Tensor:
+def _without_floaters(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], share: float) -> Int[Tensor, "kept_face 3"]:
     """The faces of connected parts with enough area; vertices at one place count as one."""
     where = vertices.double().cpu().numpy()
     corners = faces.long().cpu().numpy()
@@ -168,14 +172,14 @@ def _without_floaters(vertices: Tensor, faces: Tensor, share: float) -> Tensor:
     return faces[torch.from_numpy(keep).to(faces.device)].to(torch.int32).contiguous()
 
 
-def _oriented(vertices: Tensor, faces: Tensor) -> Tensor:
+def _oriented(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> Int[Tensor, "face 3"]:
     """The faces, all turned over if together they enclose a negative volume."""
     a, b, c = (vertices - vertices.mean(0)).double()[faces.long()].unbind(1)
     signed = (a * torch.linalg.cross(b, c)).sum()
     return faces if float(signed) >= 0 else faces.flip(1).contiguous()
 
 
-def _one_a_voxel(points: Tensor, size: float) -> Tensor:
+def _one_a_voxel(points: Float[Tensor, "n 3"], size: float) -> Int[Tensor, "voxel"]:
     """Indices of the points that come first in each voxel."""
     voxel = torch.floor((points.double() - points.double().amin(0)) / size).long()
     key = (voxel[:, 0] * (int(voxel[:, 1].max()) + 1) + voxel[:, 1]) * (int(voxel[:, 2].max()) + 1) + voxel[:, 2]

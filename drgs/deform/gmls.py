@@ -12,9 +12,12 @@ from typing import Literal
 import numpy as np
 import torch
 import warp as wp
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from drgs.maths.constants import UNBOUNDED
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -47,22 +50,22 @@ class GmlsSettings:
 class Weights:
     """Everything about a set of points that does not change while they move."""
 
-    neighbours: Tensor
-    """(point, k) int32."""
-    psi: Tensor
-    """(point, k) float32; sums to 1 (not in the paper's variants)."""
-    shepard: Tensor
-    """(point, k) float32, not negative, sums to 1: what is used instead where psi would turn a point inside out."""
-    lever: Tensor
-    """(point, 3) float32: half of Y + r, from the origin."""
-    points: Tensor
-    """(point, 3) Y in float32, world units."""
-    rigid: Tensor
-    """(point,) bool: moves rigidly with its first neighbour."""
-    particles: Tensor
-    """(particle, 3) X in float32, world units."""
-    origin: Tensor
-    """(3,) float64: levers and particles count from here, so that distance from the world's origin costs no digits."""
+    neighbours: Int[Tensor, "point k"]
+    """int32"""
+    psi: Float[Tensor, "point k"]
+    """Sums to 1 (not in the paper's variants)."""
+    shepard: Float[Tensor, "point k"]
+    """Not negative, sums to 1: what is used instead where psi would turn a point inside out."""
+    lever: Float[Tensor, "point 3"]
+    """Half of Y + r, from the origin."""
+    points: Float[Tensor, "point 3"]
+    """Y in float32, world units."""
+    rigid: Bool[Tensor, "point"]
+    """Moves rigidly with its first neighbour."""
+    particles: Float[Tensor, "particle 3"]
+    """X in float32, world units."""
+    origin: Float[Tensor, "3"]
+    """float64: levers and particles count from here, so that distance from the world's origin costs no digits."""
     variant: str
 
 
@@ -130,7 +133,7 @@ def test_segments(
     """Whether the surface lies between a point, drawn `inset` into the solid, and each neighbour."""
     i = first + wp.tid()
     target = points[i]
-    query = wp.mesh_query_point_no_sign(mesh, target, 1.0e30)
+    query = wp.mesh_query_point_no_sign(mesh, target, UNBOUNDED)
     if query.result:
         inner = wp.mesh_eval_position(mesh, query.face, query.u, query.v) - inset * wp.mesh_eval_face_normal(mesh, query.face)
         if wp.length(inner - target) < 4.0 * inset:
@@ -146,7 +149,10 @@ def test_segments(
 
 
 def build_weights(
-    particles: Tensor, points: Tensor, settings: GmlsSettings | None = None, solid: tuple[Tensor, Tensor] | None = None
+    particles: Float[Tensor, "particle 3"],
+    points: Float[Tensor, "point 3"],
+    settings: GmlsSettings | None = None,
+    solid: tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]] | None = None,
 ) -> Weights:
     """Weights that carry points (point, 3) with particles (particle, 3), both at rest.
 
@@ -197,19 +203,22 @@ def build_weights(
     )  # fmt: skip
 
 
-def interpolate(weights: Weights, moved: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
+def interpolate(
+    weights: Weights, moved: Float[Tensor, "particle 3"], gradients: Float[Tensor, "particle 3 3"]
+) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3 3"]]:
     """Positions (point, 3) and deformation gradients (point, 3, 3) from those of the particles, (particle, 3) and (particle, 3, 3)."""
     if weights.variant != "taylor":
-        return _gather(weights, weights.psi, moved, gradients, torch.zeros_like(weights.points), 0.0)[:2]
+        return _gather(_Rows(weights.neighbours, weights.psi, weights.lever, torch.zeros_like(weights.points)), moved, gradients, 0.0)[:2]
     identity = torch.eye(3, device=moved.device)
     excess = gradients - identity
     local = (weights.particles.double() - weights.origin).float()
     shift = (moved - weights.particles) - 0.5 * (excess @ local[..., None])[..., 0]
-    position, gradient, volume = _gather(weights, weights.psi, shift, excess, weights.points, 1.0)
+    position, gradient, volume = _gather(_Rows(weights.neighbours, weights.psi, weights.lever, weights.points), shift, excess, 1.0)
     # Possibly the weights of both signs turned a point inside out; then use those of one sign, then the nearest particle's rotation.
     folded, rigid = volume <= 0, weights.rigid
     if bool(folded.any()):
-        again, matrix, volume = _gather(_subset(weights, folded), weights.shepard[folded], shift, excess, weights.points[folded], 1.0)
+        rows = _Rows(weights.neighbours[folded], weights.shepard[folded], weights.lever[folded].contiguous(), weights.points[folded])
+        again, matrix, volume = _gather(rows, shift, excess, 1.0)
         # Shepard's weights leave another residual, which `lever` does not know.
         base = _residual(weights, folded)
         position[folded] = again + 0.5 * ((matrix - identity) @ base[..., None])[..., 0]
@@ -225,7 +234,7 @@ def interpolate(weights: Weights, moved: Tensor, gradients: Tensor) -> tuple[Ten
     return position, gradient
 
 
-def polar_rotation(gradient: Tensor) -> Tensor:
+def polar_rotation(gradient: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     """(n, 3, 3) the rotations nearest to matrices (n, 3, 3), det +1 always."""
     u, _, vt = torch.linalg.svd(gradient.double())
     flip = torch.ones_like(u[:, 0])
@@ -233,15 +242,30 @@ def polar_rotation(gradient: Tensor) -> Tensor:
     return ((u * flip[:, None]) @ vt).to(gradient.dtype)
 
 
-def _gather(weights: Weights, psi: Tensor, shift: Tensor, matrix: Tensor, base: Tensor, diagonal: float) -> tuple[Tensor, Tensor, Tensor]:
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """What `_gather` reads of some points; see Weights."""
+
+    neighbours: Int[Tensor, "point k"]
+    psi: Float[Tensor, "point k"]
+    """psi, or Shepard's weights."""
+    lever: Float[Tensor, "point 3"]
+    base: Float[Tensor, "point 3"]
+    """Where displacements count from."""
+
+
+def _gather(
+    rows: _Rows, shift: Float[Tensor, "particle 3"], matrix: Float[Tensor, "particle 3 3"], diagonal: float
+) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3 3"], Float[Tensor, "point"]]:
     """Positions (point, 3), gradients (point, 3, 3) and their determinants (point,)."""
+    base = rows.base
     motion = torch.cat([shift, matrix.reshape(-1, 9)], 1).float().contiguous()
     still = torch.empty(len(motion), dtype=torch.bool, device=base.device)
     launch(mark_still, len(motion), [wp.from_torch(motion, dtype=Motion)], [warp_array(still)], warp_device(base), 1)
     position = torch.empty_like(base)
     gradient = torch.empty(len(base), 3, 3, device=base.device)
     inputs = [
-        wp.from_torch(motion, dtype=Motion), warp_array(still), warp_array(weights.neighbours), warp_array(psi), warp_array(weights.lever, wp.vec3),
+        wp.from_torch(motion, dtype=Motion), warp_array(still), warp_array(rows.neighbours), warp_array(rows.psi), warp_array(rows.lever, wp.vec3),
         warp_array(base, wp.vec3), diagonal,
     ]  # fmt: skip
     volume = torch.empty(len(base), device=base.device)
@@ -250,21 +274,19 @@ def _gather(weights: Weights, psi: Tensor, shift: Tensor, matrix: Tensor, base: 
     return position, gradient, volume
 
 
-def _subset(weights: Weights, chosen: Tensor) -> Weights:
-    """The same for some of the points; only what `_gather` reads."""
-    return Weights(
-        weights.neighbours[chosen].contiguous(), weights.psi, weights.shepard, weights.lever[chosen].contiguous(), weights.points,
-        weights.rigid, weights.particles, weights.origin, weights.variant,
-    )  # fmt: skip
-
-
-def _residual(weights: Weights, chosen: Tensor) -> Tensor:
+def _residual(weights: Weights, chosen: Bool[Tensor, "point"]) -> Float[Tensor, "chosen 3"]:
     """(chosen, 3): how much Shepard's sum of positions misses its point by more than psi's does."""
     near = weights.particles[weights.neighbours[chosen].long()]
     return ((weights.psi - weights.shepard)[chosen][..., None] * (near - weights.points[chosen][:, None])).sum(1)
 
 
-def _blocked(particles: Tensor, points: Tensor, index: np.ndarray, distance: np.ndarray, solid: tuple[Tensor, Tensor]) -> np.ndarray:
+def _blocked(
+    particles: Float[Tensor, "particle 3"],
+    points: Float[Tensor, "point 3"],
+    index: Int[ndarray, "point k"],
+    distance: Float[ndarray, "point k"],
+    solid: tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]],
+) -> Bool[ndarray, "point k"]:
     vertices, faces = solid
     tree = wp.Mesh(warp_array(vertices.float(), wp.vec3), warp_array(faces.to(torch.int32).reshape(-1)))
     neighbours = torch.from_numpy(index.astype(np.int32)).to(particles.device)
@@ -277,7 +299,9 @@ def _blocked(particles: Tensor, points: Tensor, index: np.ndarray, distance: np.
     return blocked.cpu().numpy().astype(bool)
 
 
-def _taylor_weights(offsets: np.ndarray, distance: np.ndarray, free: np.ndarray, settings: GmlsSettings) -> tuple[np.ndarray, np.ndarray]:
+def _taylor_weights(
+    offsets: Float[ndarray, "point k 3"], distance: Float[ndarray, "point k"], free: Bool[ndarray, "point k"], settings: GmlsSettings
+) -> tuple[Float[ndarray, "point k"], Float[ndarray, "point k"]]:
     """psi and Shepard's weights (point, k), in float64."""
     h = np.maximum(distance[:, -1], np.finfo(np.float64).tiny)
     w = np.clip(1 - (distance / (settings.reach * h)[:, None]) ** 2, 0, None) ** 4 * free
@@ -304,7 +328,7 @@ def _taylor_weights(offsets: np.ndarray, distance: np.ndarray, free: np.ndarray,
     return psi, w
 
 
-def _paper_weights(points: np.ndarray, distance: np.ndarray, order: int) -> np.ndarray:
+def _paper_weights(points: Float[ndarray, "point k 3"], distance: Float[ndarray, "point k"], order: int) -> Float[ndarray, "point k"]:
     """psi_k = W_k Phi_k A^-1 Phi(0) of Algorithm 3, (point, k), from X_k or X_k - Y (point, k, 3)."""
     sigma = np.maximum(distance.mean(1, keepdims=True), np.finfo(np.float64).tiny)
     w = np.exp(-((distance / sigma) ** 2))

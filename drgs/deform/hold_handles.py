@@ -5,6 +5,7 @@ gradients of any points that go along. What is held is prepared once (drgs/defor
 """
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.deform.arap import ArapHandles, ArapSettings
@@ -16,7 +17,13 @@ class HeldObject:
     """An object held by the grips of a deform edit, whatever their targets. Final; nothing in it changes after it is made."""
 
     def __init__(
-        self, rest: Tensor, vertices: Tensor, faces: Tensor, handles: Handles, points: Tensor, settings: ArapSettings | None = None
+        self,
+        rest: Float[Tensor, "vertex 3"],
+        vertices: Float[Tensor, "vertex 3"],
+        faces: Int[Tensor, "face 3"],
+        handles: Handles,
+        points: Float[Tensor, "point 3"],
+        settings: ArapSettings | None = None,
     ) -> None:
         """Find the vertices held and prepare the object.
 
@@ -41,7 +48,7 @@ class HeldObject:
         self._parts = [vertices[own].double() for own in held]
         self._handles = ArapHandles(vertices, faces, torch.cat(held), points, settings)
 
-    def pull(self, handles: Handles) -> tuple[Tensor, Tensor]:
+    def pull(self, handles: Handles) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3 3"]]:
         """Positions (point, 3) and gradients (point, 3, 3) of the points with these handles' targets; their grips are those given before.
 
         The same targets give the same result, whatever came before.
@@ -53,7 +60,7 @@ class HeldObject:
         return self._handles.drag(torch.cat([*goals, *self._parts[len(handles.drag) :]]))
 
 
-def _held_vertices(rest: Tensor, grip: Grip) -> Tensor:
+def _held_vertices(rest: Float[Tensor, "vertex 3"], grip: Grip) -> Int[Tensor, "held"]:
     """Numbers of the vertices that a grip holds, ascending; at least one."""
     if grip.vertices is not None:
         last = max(grip.vertices)
@@ -64,7 +71,7 @@ def _held_vertices(rest: Tensor, grip: Grip) -> Tensor:
     return torch.nonzero(distance <= max(grip.radius, float(distance.min()))).flatten()
 
 
-def _rotation(vector: Tensor) -> Tensor:
+def _rotation(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """(3, 3) of a rotation vector (3,) [radians]."""
     half = vector.norm() / 2
     return rotation_from_quat_wxyz(torch.cat([half.cos()[None], 0.5 * vector * torch.sinc(half / torch.pi)]))

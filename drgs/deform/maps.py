@@ -7,6 +7,7 @@ Source: Barr 1984 (twist, bend), Sederberg & Parry 1986 (lattice); docs/sources.
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from drgs.scene.edits import AnalyticMap, BendMap, LatticeMap, StretchMap, TwistMap
@@ -15,7 +16,7 @@ MAX_CONTROL_POINTS = 16
 """Along one axis of a lattice."""
 
 
-def evaluate_map(analytic: AnalyticMap, points_world: Tensor) -> tuple[Tensor, Tensor]:
+def evaluate_map(analytic: AnalyticMap, points_world: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Moved points (n, 3) and deformation gradients (n, 3, 3).
 
     Raises:
@@ -36,7 +37,7 @@ def evaluate_map(analytic: AnalyticMap, points_world: Tensor) -> tuple[Tensor, T
     return moved.to(points_world.dtype), gradient.to(points_world.dtype)
 
 
-def check_map(analytic: AnalyticMap, vertices_world: Tensor) -> None:
+def check_map(analytic: AnalyticMap, vertices_world: Float[Tensor, "vertex 3"]) -> None:
     """Refuse a bend so strong that the object would pass through its centre of curvature.
 
     Raises:
@@ -52,11 +53,11 @@ def check_map(analytic: AnalyticMap, vertices_world: Tensor) -> None:
             )
 
 
-def _matrix(rows: list[list[Tensor]]) -> Tensor:
+def _matrix(rows: list[list[Tensor]]) -> Float[Tensor, "n 3 3"]:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def _twist(points: Tensor, rate: float) -> tuple[Tensor, Tensor]:
+def _twist(points: Float[Tensor, "n 3"], rate: float) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     x, y, z = points.unbind(-1)
     cos, sin, zero, one = torch.cos(rate * z), torch.sin(rate * z), torch.zeros_like(x), torch.ones_like(x)
     turned_x, turned_y = cos * x - sin * y, sin * x + cos * y
@@ -64,7 +65,7 @@ def _twist(points: Tensor, rate: float) -> tuple[Tensor, Tensor]:
     return torch.stack([turned_x, turned_y, z], -1), gradient
 
 
-def _bend(points: Tensor, k: float) -> tuple[Tensor, Tensor]:
+def _bend(points: Float[Tensor, "n 3"], k: float) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """x' = 1/k - r cos phi and z' = r sin phi with r = 1/k - x, rewritten with sin(t)/t so that k = 0 is the identity."""
     x, y, z = points.unbind(-1)
     phi = k * z
@@ -75,7 +76,7 @@ def _bend(points: Tensor, k: float) -> tuple[Tensor, Tensor]:
     return moved, _matrix([[cos, zero, stretch * sin], [zero, one, zero], [-sin, zero, stretch * cos]])
 
 
-def _lattice(points: Tensor, lattice: LatticeMap) -> tuple[Tensor, Tensor]:
+def _lattice(points: Float[Tensor, "n 3"], lattice: LatticeMap) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Tensor-product Bernstein polynomials; outside the lattice's box they simply continue."""
     grid = lattice.control_points
     sizes = (len(grid), len(grid[0]) if grid else 0, len(grid[0][0]) if grid and grid[0] else 0)
@@ -99,7 +100,7 @@ def _lattice(points: Tensor, lattice: LatticeMap) -> tuple[Tensor, Tensor]:
     return blend(*weights), torch.stack(columns, -1)
 
 
-def _bernstein(t: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+def _bernstein(t: Float[Tensor, "n"], degree: int) -> tuple[Float[Tensor, "n {degree}+1"], Float[Tensor, "n {degree}+1"]]:
     """Values and derivatives (n, degree + 1) of the Bernstein polynomials of a degree."""
 
     def values(d: int) -> Tensor:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -24,7 +25,7 @@ MARGIN = 1.5
 """Cells around the mesh."""
 
 
-def measure_solid(vertices: Tensor, faces: Tensor, spacing: float) -> Solid:
+def measure_solid(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], spacing: float) -> Solid:
     """Distances from the mesh of vertices (vertex, 3) and faces (face, 3), on a lattice of this spacing, or a larger one if need be.
 
     Raises:
@@ -47,7 +48,7 @@ def measure_solid(vertices: Tensor, faces: Tensor, spacing: float) -> Solid:
     return Solid(tuple((low - MARGIN * spacing).tolist()), spacing, distances)
 
 
-def solid_around(points: Tensor, radius: float, spacing: float) -> Solid:
+def solid_around(points: Float[Tensor, "n 3"], radius: float, spacing: float) -> Solid:
     """What lies within a radius of some points (n, 3), at least one; on a lattice of this spacing, or a larger one if need be."""
     places = points.detach().double().cpu()
     low, high = places.amin(0) - radius, places.amax(0) + radius
@@ -56,7 +57,7 @@ def solid_around(points: Tensor, radius: float, spacing: float) -> Solid:
     return Solid(tuple((low - MARGIN * spacing).tolist()), spacing, torch.from_numpy(distances - radius).float().reshape(counts))
 
 
-def distances_from_solid(solid: Solid, points: Tensor) -> Tensor:
+def distances_from_solid(solid: Solid, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """(n,) trilinear distances of points (n, 3), negative inside; inf beyond the lattice."""
     grid = solid.distances.to(points)
     place = (points - points.new_tensor(solid.minimum)) / solid.spacing
@@ -72,7 +73,7 @@ def distances_from_solid(solid: Solid, points: Tensor) -> Tensor:
     return torch.where(outside, torch.full_like(found, torch.inf), found)
 
 
-def _lattice(low: Tensor, high: Tensor, spacing: float) -> tuple[Tensor, float, list[int]]:
+def _lattice(low: Float[Tensor, "3"], high: Float[Tensor, "3"], spacing: float) -> tuple[Float[Tensor, "n 3"], float, list[int]]:
     """Nodes (n, 3) float64 around a box, their spacing, and how many there are along each axis."""
     while float(((high - low) / spacing + 2 * MARGIN + 1).ceil().prod()) > MOST_NODES:
         spacing *= 1.1
@@ -82,7 +83,7 @@ def _lattice(low: Tensor, high: Tensor, spacing: float) -> tuple[Tensor, float, 
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), spacing, counts
 
 
-def read_collider(path: Path) -> tuple[Tensor, Tensor]:
+def read_collider(path: Path) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """Vertices (vertex, 3) and faces (face, 3) of an OBJ or PLY file [world units, z up], or of an asset's folder.
 
     Raises:

@@ -9,10 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import warp as wp
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from drgs.maths.constants import UNBOUNDED
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -46,20 +49,24 @@ def find_other_side(
 ):
     i = first + wp.tid()
     query = wp.mesh_query_ray(mesh, points[i] + lift * inward[i], inward[i], reach)
-    found = wp.float32(1.0e30)
+    found = wp.float32(UNBOUNDED)
     if query.result:
         found = query.t + lift
     thickness[i] = found
 
 
-def measure_thickness(tree: wp.Mesh, vertices: Tensor, faces: Tensor, reach: float) -> Tensor:
-    """(face,) length of the ray inwards from the middle of each face; 1e30 where it meets nothing within `reach`.
+def measure_thickness(
+    tree: wp.Mesh, vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], reach: float
+) -> Float[Tensor, "face"]:
+    """(face,) length of the ray inwards from the middle of each face; UNBOUNDED where it meets nothing within `reach`.
 
     Args:
         tree: of the same vertices (vertex, 3) and faces (face, 3).
     """
     corners = vertices[faces.long()]
-    inward = -torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
+    inward = -torch.nn.functional.normalize(
+        torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1, eps=1e-30
+    )
     centers, thickness = corners.mean(1).contiguous(), torch.empty(len(faces), device=vertices.device)
     lift = 1e-4 * reach  # off the face itself
     inputs = [tree.id, warp_array(centers, wp.vec3), warp_array(inward.contiguous(), wp.vec3), lift, reach]
@@ -67,13 +74,15 @@ def measure_thickness(tree: wp.Mesh, vertices: Tensor, faces: Tensor, reach: flo
     return thickness
 
 
-def share_of_area(vertices: Tensor, faces: Tensor, chosen: Tensor) -> float:
+def share_of_area(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, "face"]) -> float:
     """Area of the chosen (face,) faces as a part of that of all."""
     area = _areas(vertices, faces)
     return float(area[chosen].sum() / area.sum())
 
 
-def thin_parts(vertices: Tensor, faces: Tensor, thickness: Tensor, thinner_than: float) -> tuple[ThinPart, ...]:
+def thin_parts(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], thickness: Float[Tensor, "face"], thinner_than: float
+) -> tuple[ThinPart, ...]:
     """Connected parts of the surface where the object is thinner, the largest first; none below LEAST_SHARE."""
     thin = thickness < thinner_than
     if share_of_area(vertices, faces, thin) < LEAST_SHARE:
@@ -98,7 +107,7 @@ def thin_parts(vertices: Tensor, faces: Tensor, thickness: Tensor, thinner_than:
     return tuple(found)
 
 
-def welded(vertices: Tensor) -> np.ndarray:
+def welded(vertices: Float[Tensor, "vertex 3"]) -> Int[ndarray, "vertex"]:
     """(vertex,) a number for each place: vertices at one place have one number."""
     where = vertices.double().cpu().numpy()
     extent = float(np.ptp(where, axis=0).max()) or 1.0
@@ -106,7 +115,7 @@ def welded(vertices: Tensor) -> np.ndarray:
     return place.reshape(-1)
 
 
-def _areas(vertices: Tensor, faces: Tensor) -> Tensor:
+def _areas(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> Float[Tensor, "face"]:
     """(face,) float64"""
     a, b, c = vertices.double()[faces.long()].unbind(1)
     return torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2

@@ -5,15 +5,18 @@ edits, in their order, and remembered for the asset. A scene posed again with on
 same tensors for the rest, and a renderer sees by identity what it must rebuild.
 """
 
+import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
-from weakref import WeakKeyDictionary
+from weakref import ReferenceType, WeakKeyDictionary, ref
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
@@ -32,10 +35,14 @@ from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.load_environment import load_environment
 from drgs.scene.materials import Materials
 from drgs.scene.posed_scene import PosedScene, PosedSurfels
-from drgs.scene.select_vertices import select_surfels, select_vertices
+from drgs.scene.select_vertices import read_weights, select_surfels, select_vertices
 
 REMEMBERED = 4
 """Results kept of each kind for each asset."""
+CHECKPOINT = 64
+"""Edits after which what they have made so far is kept by itself, so that undoing many of a long list begins with the last of these."""
+CHECKPOINTS = " checkpoints"
+"""Behind a kind: those of it."""
 
 ShapeEdit = DeformEdit | PoseEdit | SimulateEdit
 """Edits that move things."""
@@ -51,6 +58,7 @@ def pose_scene(
     base_directory: Path | None = None,
     environments: Callable[[str], Environment] | None = None,
     confine: bool = False,
+    go_on: Callable[[], None] | None = None,
 ) -> PosedScene:
     """Apply edits in order.
 
@@ -58,6 +66,7 @@ def pose_scene(
         base_directory: what file names in edits are relative to; the working directory if None.
         environments: gives an environment by the name an edit calls it; without it, names are files.
         confine: refuse file names that lead out of base_directory. Set it where edits come from strangers.
+        go_on: called between two steps of what may take long, such as a simulation's; what it raises ends the work.
 
     Raises:
         ValueError: one sentence: an edit that does not fit this asset, or a missing or damaged file.
@@ -66,10 +75,8 @@ def pose_scene(
     material = [edit for edit in edits if isinstance(edit, MaterialEdit)]
     deform = [edit for edit in edits if isinstance(edit, ShapeEdit)]
 
-    material_key = ("material", *map(_text, material))
-    vertex_materials, surfel_materials = _remembered(asset, material_key, lambda: _apply_materials(asset, material, material_key))
-    shape_key = ("shape", *_shape_texts(deform, files))
-    shape = _remembered(asset, shape_key, lambda: _apply_deformations(asset, deform, files))
+    vertex_materials, surfel_materials = _materials_after(asset, material, files, go_on)
+    shape = _shape_after(asset, deform, files, go_on)
 
     mesh, surfels = asset.mesh, None
     if material:
@@ -87,22 +94,71 @@ def pose_scene(
     return PosedScene(surfels, mesh, environment, rotation, intensity, None if deform else asset.horizons)
 
 
+PoseParts = dict[str, Tensor]
+"""Results behind a posed scene by name: mesh.albedo, mesh.vertices, surfel.tangents, ..."""
+
+
+def pose_words(edits: Sequence[Edit], base_directory: Path | None = None) -> dict[str, tuple]:
+    """What stands for the edits of material and of shape: equal for equal edits of equal files.
+
+    Raises:
+        ValueError: a file that an edit names is missing.
+    """
+    files = _Files(base_directory, confine=False)
+    material = [edit for edit in edits if isinstance(edit, MaterialEdit)]
+    shape = [edit for edit in edits if isinstance(edit, ShapeEdit)]
+    return {"material": _material_words(material, files), "shape": _shape_words(shape, files)}
+
+
+def known_parts(asset: Asset, words: dict[str, tuple]) -> PoseParts | None:
+    """What these edits have made of the asset, where it is still remembered."""
+    with _lock:
+        kept = _memory.get(asset, OrderedDict())
+        materials, shape = (kept.get((kind, *words[kind])) for kind in ("material", "shape"))
+    if materials is None or shape is None:
+        return None
+    of_mesh, of_surfels = materials
+    parts = {f"mesh.{name}": values for name, values in vars(of_mesh).items()} | {
+        "mesh.vertices": shape.vertices,
+        "mesh.normals": shape.normals,
+    }
+    if of_surfels is not None:
+        parts |= {f"surfel.{name}": values for name, values in vars(of_surfels).items()}
+        parts |= {"surfel.centers": shape.centers, "surfel.tangents": shape.tangents}
+    return parts
+
+
+def remember_parts(asset: Asset, words: dict[str, tuple], parts: PoseParts) -> None:
+    """Go on from there when these edits, or more, are posed next."""
+
+    def materials(of: str) -> Materials:
+        return Materials(parts[f"{of}.albedo"], parts[f"{of}.roughness"], parts[f"{of}.metallic"])
+
+    shape = _Shape(parts["mesh.vertices"], parts["mesh.normals"], parts.get("surfel.centers"), parts.get("surfel.tangents"))
+    both = materials("mesh"), materials("surfel") if "surfel.albedo" in parts else None
+    # Of no edits it is the asset's own tensors, by which a renderer sees that nothing has changed.
+    if words["material"]:
+        _remembered(asset, ("material", *words["material"]), lambda: both)
+    if words["shape"]:
+        _remembered(asset, ("shape", *words["shape"]), lambda: shape)
+
+
 @dataclass(frozen=True, eq=False)
 class _Shape:
     """Where everything is."""
 
-    vertices: Tensor
-    normals: Tensor
-    centers: Tensor | None
-    tangents: Tensor | None
+    vertices: Float[Tensor, "vertex 3"]
+    normals: Float[Tensor, "vertex 3"]
+    centers: Float[Tensor, "surfel 3"] | None
+    tangents: Float[Tensor, "surfel 3 2"] | None
 
 
 @dataclass(frozen=True, eq=False)
 class _Rest:
     """Surfels as the posed scene wants them, before any edit."""
 
-    tangents: Tensor
-    opacities: Tensor
+    tangents: Float[Tensor, "surfel 3 2"]
+    opacities: Float[Tensor, "surfel"]
 
 
 @dataclass(frozen=True)
@@ -136,27 +192,26 @@ def _rest(asset: Asset) -> _Rest:
     return _remembered(asset, ("rest",), lambda: _Rest(surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)))
 
 
-def _apply_materials(asset: Asset, edits: list[MaterialEdit], key: tuple) -> tuple[Materials, Materials | None]:
-    """Materials of the mesh's vertices and of the surfels. One edit more on a long list costs one edit.
-
-    Args:
-        key: of these edits; results of the first few of them may be remembered.
-    """
+def _materials_after(
+    asset: Asset, edits: list[MaterialEdit], files: _Files, go_on: Callable[[], None] | None
+) -> tuple[Materials, Materials | None]:
+    """Materials of the mesh's vertices and of the surfels."""
     mesh, gaussians = asset.mesh, asset.gaussians
-    of_vertices = Materials(mesh.albedo, mesh.roughness, mesh.metallic)
-    of_surfels = None if gaussians is None else Materials(gaussians.albedo, gaussians.roughness, gaussians.metallic)
-    done, known = _longest_remembered(asset, key)
-    if known is not None:
-        of_vertices, of_surfels = known
-    for edit in edits[done:]:
-        weights = select_vertices(mesh, edit.select)
-        of_vertices = _edited(of_vertices, edit, weights)
+    of_mesh = Materials(mesh.albedo, mesh.roughness, mesh.metallic)
+    of_gaussians = None if gaussians is None else Materials(gaussians.albedo, gaussians.roughness, gaussians.metallic)
+
+    def apply(before: tuple[Materials, Materials | None], index: int) -> tuple[Materials, Materials | None]:
+        edit, (of_vertices, of_surfels) = edits[index], before
+        file = edit.select.weights_file
+        weights = select_vertices(mesh, edit.select) if file is None else read_weights(files.path(file), mesh)
         if gaussians is not None and of_surfels is not None:
             of_surfels = _edited(of_surfels, edit, select_surfels(gaussians.centers, mesh, asset.binding, edit.select, weights))
-    return of_vertices, of_surfels
+        return _edited(of_vertices, edit, weights), of_surfels
+
+    return _applied_in_turn(asset, "material", _material_words(edits, files), (of_mesh, of_gaussians), apply, go_on)
 
 
-def _edited(materials: Materials, edit: MaterialEdit, weights: Tensor) -> Materials:
+def _edited(materials: Materials, edit: MaterialEdit, weights: Float[Tensor, "n"]) -> Materials:
     """Values move by their weight from what they are towards the new value, or the multiplied one."""
 
     def changed(old: Tensor, value: tuple[float, ...] | float | None) -> Tensor:
@@ -175,50 +230,68 @@ def _edited(materials: Materials, edit: MaterialEdit, weights: Tensor) -> Materi
     )
 
 
-def _apply_deformations(asset: Asset, edits: list[ShapeEdit], files: _Files) -> _Shape:
+def _shape_after(asset: Asset, edits: list[ShapeEdit], files: _Files, go_on: Callable[[], None] | None) -> _Shape:
     mesh, gaussians = asset.mesh, asset.gaussians
-    vertices, normals = mesh.vertices, mesh.normals
     centers, tangents = (None, None) if gaussians is None else (gaussians.centers, _rest(asset).tangents)
-    for index, edit in enumerate(edits):
-        if isinstance(edit, PoseEdit | SimulateEdit):
-            # Like a file of vertices, it says where everything is, whatever came before.
-            frame = _moment(asset, edit, files)
-            vertices, normals, centers, tangents = frame.vertices, frame.normals, frame.centers, frame.tangents
-        elif edit.map is not None:
-            check_map(edit.map, vertices)
-            vertices, gradient = evaluate_map(edit.map, vertices)
-            normals = carry_normals(normals, gradient)
-            if centers is not None and tangents is not None:
-                centers, gradient = evaluate_map(edit.map, centers)
-                tangents = carry_tangents(tangents, gradient)
-        elif edit.vertices is not None:
-            # The file says where the vertices are, whatever came before: everything is carried from rest.
-            vertices = vertices_at(files.path(edit.vertices, or_folder=True), edit.time, edit.frames_per_second, mesh)
-            gradient = vertex_gradients(mesh.vertices, vertices, mesh.faces)
-            normals = carry_normals(mesh.normals, gradient)
-            if gaussians is not None:
-                if asset.binding is None:
-                    raise ValueError(f"{edit.vertices}: cannot deform this asset: its Gaussians are not bound to its mesh")
-                rest_tangents = _rest(asset).tangents
-                centers, tangents = drive_surfels(
-                    mesh.vertices, vertices, mesh.faces, gradient, asset.binding, gaussians.centers, rest_tangents
-                )
-        elif edit.handles is not None and edit.handles.drag:
-            handles, points = edit.handles, vertices if centers is None else torch.cat([vertices, centers])
-            # What is held is prepared once for all targets that a drag passes through.
-            grips = ("handles", *_shape_texts(edits[:index], files), _text_of_grips(edit))
-            held = _remembered(asset, grips, lambda h=handles, v=vertices, p=points: HeldObject(mesh.vertices, v, mesh.faces, h, p))
-            positions, gradient = held.pull(handles)
-            count = len(vertices)
-            vertices, normals = positions[:count].contiguous(), carry_normals(normals, gradient[:count])
-            if centers is not None and tangents is not None:
-                centers, tangents = positions[count:].contiguous(), carry_tangents(tangents, gradient[count:])
-        if not all(torch.isfinite(values).all() for values in (vertices, normals, centers, tangents) if values is not None):
+    words = _shape_words(edits, files)
+
+    def apply(before: _Shape, index: int) -> _Shape:
+        edit = edits[index]
+        after = _deformed(asset, before, edit, words[:index], files, go_on)
+        if not all(torch.isfinite(values).all() for values in vars(after).values() if values is not None):
             raise ValueError(f"the {edit.op} edit {_text(edit)[:120]} moves parts of this object to infinity")
+        return after
+
+    return _applied_in_turn(asset, "shape", words, _Shape(mesh.vertices, mesh.normals, centers, tangents), apply, go_on)
+
+
+def _deformed(
+    asset: Asset, before: _Shape, edit: ShapeEdit, words_before: tuple, files: _Files, go_on: Callable[[], None] | None
+) -> _Shape:
+    """
+    Args:
+        words_before: of the edits that made `before`.
+    """
+    mesh, gaussians = asset.mesh, asset.gaussians
+    vertices, normals, centers, tangents = before.vertices, before.normals, before.centers, before.tangents
+    if isinstance(edit, PoseEdit | SimulateEdit):
+        # Like a file of vertices, it says where everything is, whatever came before.
+        frame = _moment(asset, edit, files, go_on)
+        vertices, normals, centers, tangents = frame.vertices, frame.normals, frame.centers, frame.tangents
+    elif edit.map is not None:
+        check_map(edit.map, vertices)
+        vertices, gradient = evaluate_map(edit.map, vertices)
+        normals = carry_normals(normals, gradient)
+        if centers is not None and tangents is not None:
+            centers, gradient = evaluate_map(edit.map, centers)
+            tangents = carry_tangents(tangents, gradient)
+    elif edit.vertices is not None:
+        # The file says where the vertices are, whatever came before: everything is carried from rest.
+        vertices = vertices_at(files.path(edit.vertices, or_folder=True), edit.time, edit.frames_per_second, mesh)
+        gradient = vertex_gradients(mesh.vertices, vertices, mesh.faces)
+        normals = carry_normals(mesh.normals, gradient)
+        if gaussians is not None:
+            if asset.binding is None:
+                raise ValueError(f"{edit.vertices}: cannot deform this asset: its Gaussians are not bound to its mesh")
+            rest_tangents = _rest(asset).tangents
+            centers, tangents = drive_surfels(
+                mesh.vertices, vertices, mesh.faces, gradient, asset.binding, gaussians.centers, rest_tangents
+            )
+    elif edit.handles is not None and edit.handles.drag:
+        handles, points = edit.handles, vertices if centers is None else torch.cat([vertices, centers])
+        # What is held is prepared once for all targets that a drag passes through.
+        grips = ("handles", *words_before, _text_of_grips(edit))
+        hold = partial(HeldObject, mesh.vertices, vertices, mesh.faces, handles, points)
+        held: HeldObject = _remembered(asset, grips, hold)
+        positions, gradient = held.pull(handles)
+        count = len(vertices)
+        vertices, normals = positions[:count].contiguous(), carry_normals(normals, gradient[:count])
+        if centers is not None and tangents is not None:
+            centers, tangents = positions[count:].contiguous(), carry_tangents(tangents, gradient[count:])
     return _Shape(vertices, normals, centers, tangents)
 
 
-def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files) -> ClipFrame:
+def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files, go_on: Callable[[], None] | None) -> ClipFrame:
     """What a clip, a rig or a simulation shows at the edit's time; at rest, the asset's own tensors."""
     centers, tangents = (None, None) if asset.gaussians is None else (asset.gaussians.centers, _rest(asset).tangents)
     rest = ClipFrame(asset.mesh.vertices, asset.mesh.normals, centers, tangents)
@@ -226,11 +299,12 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files) -> ClipF
         scene = parse_simulation_scene(edit.scene)
         if edit.time == 0:
             return rest
-        key = ("simulation", scene.model_dump_json(), _stamps(edit, files))
-        frame = _remembered(asset, key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True))).at(edit.time)
+        scene_key = ("simulation", scene.model_dump_json(), _stamps(edit, files))
+        simulation = _remembered(asset, scene_key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True)))
+        frame = simulation.at(edit.time, go_on)
     elif (rig := split_rig_clip(edit.clip)) is not None:
-        key = ("rig", files.stamp(rig[0]), edit.model_dump_json(exclude={"time"}))
-        bound = _remembered(asset, key, lambda: bind_rig(files.path(rig[0]), rig[1], asset, rest, edit.rig))
+        rig_key = ("rig", files.stamp(rig[0]), edit.model_dump_json(exclude={"time"}))
+        bound = _remembered(asset, rig_key, lambda: bind_rig(files.path(rig[0]), rig[1], asset, rest, edit.rig))
         frame = bound.at(edit.time)
     else:
         clip = open_clip(files.path(f"{edit.clip}/clip.json").parent)
@@ -263,9 +337,16 @@ def _environment(asset: Asset, name: str, files: _Files, environments: Callable[
     return _remembered(asset, ("environment", files.stamp(name)), load)
 
 
-def _shape_texts(edits: list[ShapeEdit], files: _Files) -> tuple:
+def _material_words(edits: list[MaterialEdit], files: _Files) -> tuple:
+    """Differ where materials may."""
+    return tuple(
+        _word(edit) if edit.select.weights_file is None else (_word(edit), files.stamp(edit.select.weights_file)) for edit in edits
+    )
+
+
+def _shape_words(edits: list[ShapeEdit], files: _Files) -> tuple:
     """Differ where shapes may."""
-    return tuple((_text(edit), _stamps(edit, files)) for edit in edits)
+    return tuple((_word(edit), stamps) if any(stamps := _stamps(edit, files)) else _word(edit) for edit in edits)
 
 
 def _stamps(edit: ShapeEdit, files: _Files) -> tuple:
@@ -284,19 +365,64 @@ def _text(edit: Edit) -> str:
     return edit.model_dump_json()
 
 
+_words: dict[int, tuple[ReferenceType, bytes]] = {}
+"""Of edits that live, by their identity: they are frozen, and a long list of them is looked at for each edit more."""
+
+
+def _word(edit: Edit) -> bytes:
+    """Stands for an edit in keys; equal for equal edits."""
+    known = _words.get(id(edit))
+    if known is not None and known[0]() is edit:
+        return known[1]
+    word = hashlib.blake2b(_text(edit).encode(), digest_size=16).digest()
+    # Lists and dictionaries in an edit could be written to by whoever made it.
+    if not isinstance(edit, SimulateEdit) and (not isinstance(edit, MaterialEdit) or edit.select.vertex_weights is None):
+        number = id(edit)
+        _words[number] = ref(edit, lambda _: _words.pop(number, None)), word
+    return word
+
+
 def _is_optimised(asset: Asset) -> bool:
     return any(value.requires_grad for record in (asset.gaussians, asset.mesh) if record is not None for value in vars(record).values())
 
 
-def _longest_remembered(asset: Asset, key: tuple) -> tuple[int, Any]:
-    """How many words after the first of this key, fewer than all, are those of a key whose result is remembered, and that; or 0 and None."""
+def _applied_in_turn(
+    asset: Asset, kind: str, words: tuple, first: Result, apply: Callable[[Result, int], Result], go_on: Callable[[], None] | None
+) -> Result:
+    """What edits make of `first`, one after the other. One edit more on a long list costs one edit, and so do a few less.
+
+    Args:
+        words: of the edits.
+        apply: the result of edit number `index` on what those before it have made.
+    """
+
+    def make() -> Result:
+        done, result = _longest_remembered(asset, kind, words, first)
+        for index in range(done, len(words)):
+            if go_on is not None:
+                go_on()
+            result = apply(result, index)
+            if (index + 1) % CHECKPOINT == 0:
+                result = _remembered(asset, (kind + CHECKPOINTS, *words[: index + 1]), _constant(result))
+        return result
+
+    return _remembered(asset, (kind, *words), make)
+
+
+def _constant(value: Result) -> Callable[[], Result]:
+    return lambda: value
+
+
+def _longest_remembered(asset: Asset, kind: str, words: tuple, first: Result) -> tuple[int, Result]:
+    """How many of the first edits are those of a result that is remembered, and that; or 0 and `first`."""
     if _is_optimised(asset):
-        return 0, None
+        return 0, first
     with _lock:
         kept = _memory.get(asset, OrderedDict())
-        begun = [other for other in kept if len(other) < len(key) and other == key[: len(other)]]
+        alike = [key for key in kept if key[0] in (kind, kind + CHECKPOINTS) and 1 < len(key) <= len(words) + 1]
+        begun = [key for key in alike if key[-1] == words[len(key) - 2] and key[1:] == words[: len(key) - 1]]
         longest = max(begun, key=len, default=None)
-        return (0, None) if longest is None else (len(longest) - 1, kept[longest])
+        return (0, first) if longest is None else (len(longest) - 1, kept[longest])
 
 
 def _remembered(asset: Asset, key: tuple, make: Callable[[], Result]) -> Result:

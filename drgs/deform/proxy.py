@@ -15,6 +15,7 @@ from typing import Literal
 
 import torch
 import warp as wp
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.deform.drive_mesh import DEGENERATE
@@ -42,14 +43,14 @@ FACING_MARGIN = 0.05
 class PatchLevel:
     """Samples of a proxy gathered in patches of one width, and the points that follow these."""
 
-    patch: Tensor
-    """(sample,) int64"""
-    share: Tensor
-    """(sample,) float64 of its patch; the shares of a patch sum to 1."""
-    points: Tensor
-    """(n,) int64: the points that this level takes part in."""
-    part: Tensor
-    """(n, 1) float64: how much; the parts of a point's levels sum to 1."""
+    patch: Int[Tensor, "sample"]
+    """int64"""
+    share: Float[Tensor, "sample"]
+    """float64: how much of its patch; the shares of a patch sum to 1."""
+    points: Int[Tensor, "n"]
+    """int64: the points that this level takes part in."""
+    part: Float[Tensor, "n 1"]
+    """float64: how much; the parts of a point's levels sum to 1."""
     weights: Weights
     """From patches to points."""
 
@@ -58,18 +59,18 @@ class PatchLevel:
 class ProxyBinding:
     """What of a set of points does not change while their proxy moves."""
 
-    faces: Tensor
-    """(point, 3) int64 corners of the triangle closest to each point."""
-    barycentric: Tensor
-    """(point, 3) float64 of the closest point in it."""
-    offset: Tensor
-    """(point, 3) float64 from there to the point, at rest [world units]."""
-    near: Tensor
-    """(point, 1) float64: how much a point follows its closest triangle; its levels of patches have the rest."""
-    samples: Tensor
-    """(sample, 3) int64 corners of the triangles that hold the samples of the patches."""
-    sample_barycentric: Tensor
-    """(sample, 3) float64"""
+    faces: Int[Tensor, "point 3"]
+    """int64 corners of the triangle closest to each point."""
+    barycentric: Float[Tensor, "point 3"]
+    """float64, of the closest point in it."""
+    offset: Float[Tensor, "point 3"]
+    """float64, from there to the point, at rest [world units]."""
+    near: Float[Tensor, "point 1"]
+    """float64: how much a point follows its closest triangle; its levels of patches have the rest."""
+    samples: Int[Tensor, "sample 3"]
+    """int64 corners of the triangles that hold the samples of the patches."""
+    sample_barycentric: Float[Tensor, "sample 3"]
+    """float64"""
     levels: tuple[PatchLevel, ...]
 
 
@@ -147,7 +148,13 @@ def find_closest_faces(
     facing[i] = wp.dot(normals[i], wp.mesh_eval_face_normal(mesh, best))
 
 
-def bind_to_proxy(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tensor, method: ProxyMethod = "auto") -> ProxyBinding:
+def bind_to_proxy(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    points: Float[Tensor, "point 3"],
+    normals: Float[Tensor, "point 3"],
+    method: ProxyMethod = "auto",
+) -> ProxyBinding:
     """Bind points (point, 3) to a proxy's vertices (vertex, 3) and faces (face, 3) at rest.
 
     Args:
@@ -185,7 +192,9 @@ def bind_to_proxy(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tens
     return ProxyBinding(*feet, near, faces[chosen], barycentric, tuple(levels))
 
 
-def carry_points(binding: ProxyBinding, moved: Tensor, gradients: Tensor) -> Tensor:
+def carry_points(
+    binding: ProxyBinding, moved: Float[Tensor, "vertex 3"], gradients: Float[Tensor, "vertex 3 3"]
+) -> Float[Tensor, "point 3"]:
     """Positions (point, 3) float64 from the proxy's vertices, (vertex, 3) and (vertex, 3, 3)."""
     device = binding.faces.device
     moved, gradients = moved.double().to(device), gradients.double().to(device)
@@ -207,13 +216,15 @@ def carry_points(binding: ProxyBinding, moved: Tensor, gradients: Tensor) -> Ten
     return positions
 
 
-def _level_part(height: Tensor, level: int) -> Tensor:
+def _level_part(height: Float[Tensor, "point"], level: int) -> Float[Tensor, "point"]:
     """(point,) how much points at a height belong to a level: 1 at its own, falling smoothly to 0 at the next ones; sums to 1."""
     nearness = (1 - (height - level).abs()).clamp(min=0)
     return nearness * nearness * (3 - 2 * nearness)
 
 
-def _patches(sampled: Tensor, size: Tensor, low: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
+def _patches(
+    sampled: Float[Tensor, "sample 3"], size: Float[Tensor, "sample"], low: Float[Tensor, "3"], width: float
+) -> tuple[Int[Tensor, "sample"], Float[Tensor, "sample"], Float[Tensor, "patch 3"]]:
     """Patch (sample,), share in it (sample,) by size, and middles of the patches (patch, 3): the cells of a grid that hold samples."""
     # Half a cell lower: walls along the axes would lie on the cells' borders, where rounding decides.
     _, patch = torch.unique(torch.floor((sampled - low) / width + 0.5).long(), dim=0, return_inverse=True)
@@ -222,7 +233,9 @@ def _patches(sampled: Tensor, size: Tensor, low: Tensor, width: float) -> tuple[
     return patch, share, size.new_zeros(len(total), 3).index_add_(0, patch, sampled * share[:, None])
 
 
-def closest_faces(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+def closest_faces(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]
+) -> tuple[Int[Tensor, "point"], Float[Tensor, "point 3"]]:
     """Face (point,) and barycentrics (point, 3) float64 of the closest points, on faces that look the way of the normals (point, 3), or zero."""
     # About the proxy's middle: Warp's tree is in float32.
     middle = vertices.mean(0)
@@ -252,7 +265,9 @@ def closest_faces(vertices: Tensor, faces: Tensor, points: Tensor, normals: Tens
     return face.long(), inside / inside.sum(-1, keepdim=True)
 
 
-def _samples(vertices: Tensor, faces: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
+def _samples(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], spacing: float
+) -> tuple[Int[Tensor, "sample"], Float[Tensor, "sample 3"], Float[Tensor, "sample"]]:
     """Face (sample,), barycentrics (sample, 3) and area (sample,): middles of the n * n small triangles that each face is cut into."""
     corners = vertices[faces]
     longest = torch.stack([(corners[:, k] - corners[:, k - 1]).norm(dim=-1) for k in range(3)], -1).amax(-1)

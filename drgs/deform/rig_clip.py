@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals
@@ -37,9 +38,9 @@ LARGEST_STRETCH = 4.0
 class Alignment:
     """World from the rig file's axes and units: x -> matrix x + translation, float64."""
 
-    matrix: Tensor
-    """(3, 3) rotation times scale."""
-    translation: Tensor
+    matrix: Float[Tensor, "3 3"]
+    """Rotation times scale."""
+    translation: Float[Tensor, "3"]
 
     def place(self, pose: RigPose) -> RigPose:
         return replace(pose, vertices=pose.vertices @ self.matrix.T + self.translation)
@@ -140,7 +141,9 @@ def find_animation(rig: Rig, name: str) -> RigAnimation:
     )
 
 
-def align_rig(rig_vertices: Tensor, object_vertices: Tensor, meters_per_unit: float, options: RigBinding) -> Alignment:
+def align_rig(
+    rig_vertices: Float[Tensor, "rig_vertex 3"], object_vertices: Float[Tensor, "vertex 3"], meters_per_unit: float, options: RigBinding
+) -> Alignment:
     """World from a rig's file: axes and units, then `turn`, then `fit` if wanted, then `scale` about the centre so far and `translation`."""
     world_from_file = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / meters_per_unit
     turn = torch.deg2rad(torch.tensor(options.turn, dtype=torch.float64))

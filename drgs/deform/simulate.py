@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -39,11 +40,14 @@ from drgs.deform.mpm import (
     make_model,
     rest_state,
 )
+from drgs.deform.mpm.records import Triple
 from drgs.deform.simulation_progress import SimulationProgress
 from drgs.deform.simulation_scene import Files, SimulationScene, make_condition, make_material, make_shape, refuse_files
 from drgs.scene.asset import Asset
 from drgs.scene.gaussians import surfel_tangents
 
+LOOK_SECONDS = 0.1
+"""Between two questions whether to go on, of who waits for a frame that another thread computes."""
 LARGEST_STRETCH = 10.0
 """Of a surfel; and 1/10 the least. Matter may stretch further, its picture would only smear."""
 LARGEST_LOOSE_STRETCH = 3.0
@@ -56,8 +60,8 @@ MOST_PARTS_NAMED = 3
 """Of those that may tear, in a warning."""
 PINNED_CELLS = 1.5
 """How far from pinned vertices the grid stands still: as far as the matter there feels the grid [cells]."""
-ROOM_SIZES = 3.0
-"""How far the room reaches beyond the object on every side, in sizes of the object."""
+DOMAIN_MARGIN = 3.0
+"""How far the simulated domain reaches beyond the object on every side, in sizes of the object."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +100,8 @@ class Simulation:
         mesh = asset.mesh
         self._center = ((mesh.vertices.amin(0).double() + mesh.vertices.amax(0).double()) / 2).cpu()
         local = (mesh.vertices.double() - self._center.to(mesh.vertices.device)).float()
-        surface = "particles" if scene.variant == "paper" else "tracers"
-        filled = fill_particles(local, mesh.faces, FillSettings(scene.particles, surface=surface, seed=scene.seed))
+        fill = FillSettings(scene.particles, surface="particles" if scene.variant == "paper" else "tracers", seed=scene.seed)
+        filled = fill_particles(local, mesh.faces, fill)
         self.model = _make_model(asset, scene, filled, self._center, find)
         self._settings = MpmSettings(
             courant=scene.courant,
@@ -121,15 +125,15 @@ class Simulation:
         self._still = 0
         tangents = None if asset.gaussians is None else surfel_tangents(asset.gaussians)
         self._rest_tangents = tangents
-        centers = None if asset.gaussians is None else asset.gaussians.centers
-        self._frames = [ClipFrame(mesh.vertices, mesh.normals, centers, tangents)]
+        rest_centers = None if asset.gaussians is None else asset.gaussians.centers
+        self._frames = [ClipFrame(mesh.vertices, mesh.normals, rest_centers, tangents)]
 
     @property
     def report(self) -> SimulationReport:
         totals = self._totals
         return SimulationReport(
             len(self.model.rest), self.model.grid.dx, totals["substeps"], totals["retries"], totals["frozen"], len(self._frames),
-            totals["sleeping"], totals["wall"], self.warnings,
+            totals["sleeping"], bool(totals["wall"]), self.warnings,
         )  # fmt: skip
 
     @property
@@ -149,30 +153,43 @@ class Simulation:
             self._frames, self._state = list(progress.frames), progress.state
             self._totals, self._still = dict(progress.totals), progress.still
 
-    def frame(self, index: int) -> ClipFrame:
-        """Frame `index`, or the last of the scene if it has fewer; computed now if need be."""
-        index = min(index, self.frame_count - 1)
-        with self._lock:
-            while len(self._frames) <= index:
-                self._frames.append(self._next_frame())
-            return self._frames[index]
+    def frame(self, index: int, go_on: Callable[[], None] | None = None) -> ClipFrame:
+        """Frame `index`, or the last of the scene if it has fewer; computed now if need be.
 
-    def at(self, seconds: float) -> ClipFrame:
-        """What is seen at a time: between two frames, their mean by time."""
+        Args:
+            go_on: called between two steps; what it raises ends the work, of which whole frames stay.
+        """
+        index = min(index, self.frame_count - 1)
+        while True:
+            # One frame at a time, so that who waits for an earlier one gets it, and who waits at all can give up.
+            while not self._lock.acquire(timeout=-1 if go_on is None else LOOK_SECONDS):
+                assert go_on is not None
+                go_on()
+            try:
+                if len(self._frames) > index:
+                    return self._frames[index]
+                self._frames.append(self._next_frame(go_on))
+            finally:
+                self._lock.release()
+            if go_on is not None:
+                go_on()
+
+    def at(self, seconds: float, go_on: Callable[[], None] | None = None) -> ClipFrame:
+        """What is seen at a time: between two frames, their mean by time; `go_on` as of `frame`."""
         position = min(max(seconds, 0.0) * self.scene.fps, self.frame_count - 1)
         first = math.floor(position + 1e-6)
         share = position - first
         if share <= 1e-6:
-            return self.frame(first)
-        return blend_frames(self.frame(first), self.frame(first + 1), share)
+            return self.frame(first, go_on)
+        return blend_frames(self.frame(first, go_on), self.frame(first + 1, go_on), share)
 
-    def _next_frame(self) -> ClipFrame:
+    def _next_frame(self, go_on: Callable[[], None] | None) -> ClipFrame:
         before, seconds = self._state, 1 / self.scene.fps
         if self._still >= STILL_FRAMES and not _acts_later(self.model.conditions, before.time):
             self._totals["sleeping"] += 1
             self._state = replace(before, time=before.time + seconds)
             return self._frames[-1]
-        self._state, report = advance(self.model, before, seconds, self._settings)
+        self._state, report = advance(self.model, before, seconds, self._settings, go_on)
         self._totals["substeps"] += report.substeps
         self._totals["retries"] += report.retries
         self._totals["frozen"] = report.frozen
@@ -220,8 +237,9 @@ def simulate(
         ValueError: one sentence: the mesh encloses nothing, the scene does not fit, or `out` is taken.
     """
     simulation = Simulation(asset, scene, find)
-    for sentence in simulation.warnings if warn is not None else ():
-        warn(sentence)
+    if warn is not None:
+        for sentence in simulation.warnings:
+            warn(sentence)
     if checkpoint is not None:
         simulation.go_on_from(read_progress(checkpoint, simulation.progress, scene.model_dump_json()))
     found, kept = len(simulation.progress.frames), []
@@ -242,7 +260,7 @@ def simulate(
     return kept, simulation.report
 
 
-def limit_stretch(gradients: Tensor, largest: float = LARGEST_STRETCH) -> Tensor:
+def limit_stretch(gradients: Float[Tensor, "n 3 3"], largest: float = LARGEST_STRETCH) -> Float[Tensor, "n 3 3"]:
     """(n, 3, 3) with singular values from 1 / largest to largest; matrices that have such values are returned as they were."""
     # sigma_1 <= |F|, and sigma_3 >= J / sigma_1^2.
     size = gradients.flatten(1).norm(dim=1)
@@ -256,7 +274,7 @@ def limit_stretch(gradients: Tensor, largest: float = LARGEST_STRETCH) -> Tensor
     return limited
 
 
-def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center: Tensor, find: Files) -> Model:
+def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center: Float[Tensor, "3"], find: Files) -> Model:
     """Everything in world units, about the centre."""
     interior = filled.positions[: filled.interior]
     low, high = filled.positions.amin(0).double().cpu(), filled.positions.amax(0).double().cpu()
@@ -271,28 +289,35 @@ def _make_model(asset: Asset, scene: SimulationScene, filled: Particles, center:
             raise ValueError(f"the region {str(region.shape.model_dump(exclude_none=True))[:200]} holds no part of the object")
         material_of[held] = len(materials)
         materials.append(make_material(region.matter, size, asset.meters_per_unit))
-    gravity = [0.0, 0.0, 0.0]
-    gravity[axis] = -scene.gravity / asset.meters_per_unit
     if scene.room is not None:
-        room_low = torch.tensor(scene.room.minimum, dtype=torch.float64) - center
-        room_high = torch.tensor(scene.room.maximum, dtype=torch.float64) - center
+        domain_low = torch.tensor(scene.room.minimum, dtype=torch.float64) - center
+        domain_high = torch.tensor(scene.room.maximum, dtype=torch.float64) - center
     else:
-        room_low, room_high = low - ROOM_SIZES * size, high + ROOM_SIZES * size
+        domain_low, domain_high = low - DOMAIN_MARGIN * size, high + DOMAIN_MARGIN * size
     conditions = [replace(c, shape=_moved(c.shape, -center)) for c in (make_condition(act, dx, find) for act in scene.acts)]
     if scene.floor is not None:
         height = float(low[axis]) if scene.floor.height is None else scene.floor.height - float(center[axis])
-        point, normal = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-        point[axis], normal[axis] = height, 1.0
-        conditions.append(Condition(Plane(tuple(point), tuple(normal)), scene.floor.effect, scene.floor.friction))
-        room_low[axis] = min(float(room_low[axis]), height - 4 * dx)
+        conditions.append(Condition(Plane(_along(axis, height), _along(axis, 1.0)), scene.floor.effect, scene.floor.friction))
+        domain_low[axis] = min(float(domain_low[axis]), height - 4 * dx)
     if scene.pins:
         if max(scene.pins) >= len(asset.mesh.vertices):
             raise ValueError(f"pins name vertex {max(scene.pins)}; the mesh has {len(asset.mesh.vertices)}, counted from 0")
         held = asset.mesh.vertices[torch.tensor(sorted(set(scene.pins)), device=interior.device)].double().cpu() - center
         # Last, so that nothing moves what is held.
         conditions.append(Condition(solid_around(held, PINNED_CELLS * dx, dx), "sticky"))
-    grid = GridSettings(tuple(room_low.tolist()), tuple(room_high.tolist()), dx)
-    return make_model(filled.positions, filled.volumes, tuple(materials), material_of, grid, tuple(gravity), tuple(conditions))
+    gravity = _along(axis, -scene.gravity / asset.meters_per_unit)
+    grid = GridSettings(_triple(domain_low), _triple(domain_high), dx)
+    return make_model(filled.positions, filled.volumes, tuple(materials), material_of, grid, gravity, tuple(conditions))
+
+
+def _along(axis: int, length: float) -> Triple:
+    """A vector along a coordinate axis."""
+    return (length if axis == 0 else 0.0, length if axis == 1 else 0.0, length if axis == 2 else 0.0)
+
+
+def _triple(vector: Tensor) -> Triple:
+    x, y, z = vector.tolist()
+    return x, y, z
 
 
 def _first_state(model: Model, scene: SimulationScene) -> State:
@@ -306,8 +331,9 @@ def _first_state(model: Model, scene: SimulationScene) -> State:
 
 
 def _moved(shape: Plane | Sphere | Box | Solid, shift: Tensor) -> Plane | Sphere | Box | Solid:
-    def place(point: tuple[float, float, float]) -> tuple[float, float, float]:
-        return tuple(p + s for p, s in zip(point, shift.tolist(), strict=True))  # type: ignore[return-value]
+    def place(point: Triple) -> Triple:
+        x, y, z = shift.tolist()
+        return point[0] + x, point[1] + y, point[2] + z
 
     if isinstance(shape, Plane):
         return Plane(place(shape.point), shape.normal)
@@ -333,7 +359,7 @@ def _acts_later(conditions: tuple[Condition, ...], time: float) -> bool:
     return any(time < c.start or (math.isfinite(c.end) and time < c.end) or (any(c.velocity) and time < c.end) for c in conditions)
 
 
-def _warnings(filled: Particles, center: Tensor, particles: int, holds: bool) -> tuple[str, ...]:
+def _warnings(filled: Particles, center: Float[Tensor, "3"], particles: int, holds: bool) -> tuple[str, ...]:
     """
     Args:
         center: of the object, where the particles have their origin.

@@ -14,13 +14,19 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from drgs.deform.measure_solid import measure_solid, read_collider
 from drgs.deform.mpm.records import Box, Condition, Law, Material, Plane, Solid, Sphere
-from drgs.scene.edits import Triple
+from drgs.scene.edits import Coordinate, Index, Length, Triple
 
 EARTH = 9.81
 """m/s^2: what presets are made for, whatever gravity the scene has."""
 Preset = Literal["jelly", "rubber", "clay", "sand", "snow", "honey"]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+Density = Annotated[float, Field(ge=1e-3, le=1e6)]
+"""kg/m^3: from thin air to beyond any solid."""
+Modulus = Annotated[float, Field(ge=1e-3, le=1e13)]
+"""Pa: from foam to beyond diamond."""
+Pressure = Annotated[float, Field(ge=0, le=1e13)]
+Friction = Annotated[float, Field(ge=0, le=1e3)]
+Moment = Annotated[float, Field(ge=0, le=1e6)]
+"""Seconds."""
 
 
 class _Plain(BaseModel):
@@ -32,20 +38,20 @@ class Matter(_Plain):
 
     preset: Preset | None = None
     law: Law | None = None
-    density: Positive | None = None
+    density: Density | None = None
     """kg/m^3."""
-    young_modulus: Positive | None = None
+    young_modulus: Modulus | None = None
     """Pa."""
     poisson_ratio: Annotated[float, Field(ge=0, le=0.49)] | None = None
-    yield_stress: NotNegative | None = None
+    yield_stress: Pressure | None = None
     """Pa; von_mises."""
-    hardening: NotNegative | None = None
+    hardening: Annotated[float, Field(ge=0, le=1e3)] | None = None
     friction_angle: Annotated[float, Field(ge=0, lt=90)] | None = None
     """Degrees; drucker_prager."""
-    bulk_modulus: Positive | None = None
+    bulk_modulus: Modulus | None = None
     """Pa; fluid."""
-    exponent: Annotated[float, Field(gt=1)] | None = None
-    viscosity: NotNegative | None = None
+    exponent: Annotated[float, Field(gt=1, le=100)] | None = None
+    viscosity: Annotated[float, Field(ge=0, le=1e9)] | None = None
     """Pa s; fluid."""
 
     @model_validator(mode="after")
@@ -62,7 +68,7 @@ class PlaneShape(_Plain):
 
 class SphereShape(_Plain):
     center: Triple
-    radius: Positive
+    radius: Length
 
 
 class BoxShape(_Plain):
@@ -77,7 +83,7 @@ class MeshShape(_Plain):
     """OBJ or PLY (world units, z up), or an asset's folder. For those who simulate where the files are; not over a network."""
     vertices: Annotated[list[Triple], Field(min_length=4, max_length=20_000)] | None = None
     """World units."""
-    faces: Annotated[list[tuple[int, int, int]], Field(min_length=4, max_length=40_000)] | None = None
+    faces: Annotated[list[tuple[Index, Index, Index]], Field(min_length=4, max_length=40_000)] | None = None
     offset: Triple = (0.0, 0.0, 0.0)
     """Where the mesh's origin comes to lie [world units]."""
 
@@ -116,19 +122,19 @@ class Act(_Plain):
 
     shape: Shape
     effect: Literal["sticky", "slip", "separate", "push"] = "separate"
-    friction: NotNegative = 0.0
+    friction: Friction = 0.0
     velocity: Triple = (0.0, 0.0, 0.0)
     """World units/s; for push, an acceleration."""
-    start: NotNegative = 0.0
-    end: Annotated[float, Field(gt=0)] | None = None
+    start: Moment = 0.0
+    end: Annotated[float, Field(gt=0, le=1e6)] | None = None
     """Seconds."""
 
 
 class Floor(_Plain):
-    height: float | None = None
+    height: Coordinate | None = None
     """Along the up axis [world units]; None: where the object stands."""
     effect: Literal["sticky", "slip", "separate"] = "separate"
-    friction: NotNegative = 0.5
+    friction: Friction = 0.5
 
 
 class SimulationScene(_Plain):
@@ -140,7 +146,7 @@ class SimulationScene(_Plain):
     up: Literal["x", "y", "z"] = "z"
     floor: Floor | None = Floor()
     acts: list[Act] = Field(default_factory=list, max_length=64)
-    pins: list[Annotated[int, Field(ge=0)]] = Field(default_factory=list, max_length=200_000)
+    pins: list[Index] = Field(default_factory=list, max_length=200_000)
     """Vertices of the mesh that stay where they are, and the matter near them."""
     velocity: Triple = (0.0, 0.0, 0.0)
     """Of the whole object at the start [world units/s]."""
@@ -157,7 +163,7 @@ class SimulationScene(_Plain):
     courant: Annotated[float, Field(gt=0, le=0.9)] = 0.4
     variant: Literal["corrected", "paper"] = "corrected"
     """paper: PIC transfers, all vertices as massive particles, and Algorithm 3, centred, for the surfels."""
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
 
 
 def parse_simulation_scene(data: object) -> SimulationScene:

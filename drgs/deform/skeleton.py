@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
 from torch import Tensor
 
-from drgs.deform.carry_gaussians import carry_normals
 from drgs.deform.drive_mesh import vertex_gradients
 from drgs.exchange.rig import Rig, RigAnimation, RigChannel, RigMesh, RigNode
 
@@ -24,12 +25,11 @@ NEARLY_ALIKE = 1 - 1e-9
 class RigPose:
     """A rig's triangles at one time. float64, in the file's axes and units."""
 
-    vertices: Tensor
-    """(vertex, 3)"""
-    faces: Tensor
-    """(face, 3) int32, the same at all times."""
-    parts: Tensor
-    """(vertex,) int32: which of the shown meshes a vertex belongs to."""
+    vertices: Float[Tensor, "vertex 3"]
+    faces: Int[Tensor, "face 3"]
+    """int32, the same at all times."""
+    parts: Int[Tensor, "vertex"]
+    """int32: which of the shown meshes a vertex belongs to."""
 
 
 def pose_rig(rig: Rig, animation: RigAnimation | None = None, seconds: float = 0.0) -> RigPose:
@@ -62,7 +62,7 @@ def pose_rig(rig: Rig, animation: RigAnimation | None = None, seconds: float = 0
     return RigPose(*(torch.from_numpy(array) for array in (moved, np.concatenate(faces).astype(np.int32), np.concatenate(parts))))
 
 
-def rig_gradients(rest: RigPose, moved: RigPose) -> Tensor:
+def rig_gradients(rest: RigPose, moved: RigPose) -> Float[Tensor, "vertex 3 3"]:
     """(vertex, 3, 3) float64 deformation gradients; a part's vertices in one place at rest (seams of texture) share theirs."""
     gradient = vertex_gradients(rest.vertices, moved.vertices, rest.faces)
     a, b, c = rest.vertices[rest.faces.long()].unbind(1)
@@ -75,12 +75,7 @@ def rig_gradients(rest: RigPose, moved: RigPose) -> Tensor:
     return torch.where((total > 0)[place][:, None, None], shared[place], gradient)
 
 
-def rig_normals(normals: Tensor, rest: RigPose, moved: RigPose) -> Tensor:
-    """(vertex, 3) unit normals of the moved rig from those at rest."""
-    return carry_normals(normals, rig_gradients(rest, moved))
-
-
-def sample_channel(channel: RigChannel, seconds: float) -> np.ndarray:
+def sample_channel(channel: RigChannel, seconds: float) -> Float[ndarray, "width"]:
     """(width,) value at a time; rotations xyzw and of unit length."""
     times, values = channel.times, channel.values
     turns = channel.path == "rotation"
@@ -99,7 +94,7 @@ def sample_channel(channel: RigChannel, seconds: float) -> np.ndarray:
     return (1 - t) * values[key] + t * values[key + 1]
 
 
-def slerp(first_quat: np.ndarray, second_quat: np.ndarray, t: float) -> np.ndarray:
+def slerp(first_quat: Float[ndarray, "4"], second_quat: Float[ndarray, "4"], t: float) -> Float[ndarray, "4"]:
     """(4,) between unit quaternions (4,), the shorter way and at even speed."""
     cosine = float(first_quat @ second_quat)
     if cosine < 0:
@@ -110,13 +105,19 @@ def slerp(first_quat: np.ndarray, second_quat: np.ndarray, t: float) -> np.ndarr
     return _unit((np.sin((1 - t) * angle) * first_quat + np.sin(t * angle) * second_quat) / np.sin(angle))
 
 
-def _hermite(start: np.ndarray, start_slope: np.ndarray, end: np.ndarray, end_slope: np.ndarray, t: float) -> np.ndarray:
+def _hermite(
+    start: Float[ndarray, "width"],
+    start_slope: Float[ndarray, "width"],
+    end: Float[ndarray, "width"],
+    end_slope: Float[ndarray, "width"],
+    t: float,
+) -> Float[ndarray, "width"]:
     """The cubic with these values and slopes (a span, not a second) at t = 0 and 1."""
     bend = t * t * (3 - 2 * t)
     return (1 - bend) * start + bend * end + t * (1 - t) ** 2 * start_slope - t * t * (1 - t) * end_slope
 
 
-def _unit(quat: np.ndarray) -> np.ndarray:
+def _unit(quat: Float[ndarray, "4"]) -> Float[ndarray, "4"]:
     length = np.linalg.norm(quat)
     # Halfway between opposite keys a spline may pass through zero, which is no rotation.
     return quat / length if length > 1e-12 else np.array([0.0, 0, 0, 1])
@@ -135,7 +136,7 @@ def _node_states(rig: Rig, animation: RigAnimation | None, seconds: float) -> tu
     return world, {index: parts["weights"] for index, parts in moved.items() if "weights" in parts}
 
 
-def _local(node: RigNode, moved: dict[str, np.ndarray]) -> np.ndarray:
+def _local(node: RigNode, moved: dict[str, np.ndarray]) -> Float[ndarray, "4 4"]:
     """(4, 4) parent from node."""
     if node.matrix is not None:
         return node.matrix
@@ -151,7 +152,9 @@ def _local(node: RigNode, moved: dict[str, np.ndarray]) -> np.ndarray:
     return local
 
 
-def _skinned(rig: Rig, mesh: RigMesh, node: RigNode, index: int, shape: np.ndarray, world_from_node: np.ndarray) -> np.ndarray:
+def _skinned(
+    rig: Rig, mesh: RigMesh, node: RigNode, index: int, shape: Float[ndarray, "vertex 3"], world_from_node: Float[ndarray, "node 4 4"]
+) -> Float[ndarray, "vertex 3"]:
     """(vertex, 3) world. A skin's joints alone place its mesh: the node that shows it does not count."""
     if node.skin is None or mesh.joints is None or mesh.weights is None:
         return shape @ world_from_node[index, :3, :3].T + world_from_node[index, :3, 3]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.deform.drive_mesh import DEGENERATE
@@ -19,16 +20,16 @@ wp.set_module_options({"enable_backward": False})
 
 @dataclass(frozen=True, eq=False)
 class SurfaceAtRest:
-    faces: Tensor
-    """(face, 3) int32"""
-    face_from_edges: Tensor
-    """(face, 3, 3) float64: inverse of [e1, e2, n sqrt(2A)] at rest; zero where a face has no area."""
-    start: Tensor
-    """(vertex + 1,) int32: where a vertex's entries of `around` begin."""
-    around: Tensor
-    """(3 * face,) int32: the faces about each vertex."""
-    share: Tensor
-    """(3 * face,) float64 of a face in its vertex's mean."""
+    faces: Int[Tensor, "face 3"]
+    """int32"""
+    face_from_edges: Float[Tensor, "face 3 3"]
+    """float64: inverse of [e1, e2, n sqrt(2A)] at rest; zero where a face has no area."""
+    start: Int[Tensor, "vertex_plus_1"]
+    """int32: where a vertex's entries of `around` begin."""
+    around: Int[Tensor, "3*face"]
+    """int32: the faces about each vertex."""
+    share: Float[Tensor, "3*face"]
+    """float64, of a face in its vertex's mean."""
 
 
 @wp.kernel
@@ -61,7 +62,7 @@ def gather_gradients(
         gradient[i] = wp.identity(n=3, dtype=wp.float64)
 
 
-def prepare_surface(vertices: Tensor, faces: Tensor) -> SurfaceAtRest:
+def prepare_surface(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> SurfaceAtRest:
     """What of vertices (vertex, 3) at rest and faces (face, 3) the gradients need."""
     index = faces.long()
     a, b, c = vertices.double()[index].unbind(1)
@@ -81,7 +82,7 @@ def prepare_surface(vertices: Tensor, faces: Tensor) -> SurfaceAtRest:
     return SurfaceAtRest(faces.int().contiguous(), inverse.contiguous(), start.int(), (order // 3).int().contiguous(), share.contiguous())
 
 
-def surface_gradients(rest: SurfaceAtRest, moved: Tensor) -> Tensor:
+def surface_gradients(rest: SurfaceAtRest, moved: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3 3"]:
     """(vertex, 3, 3) float64 of vertices moved to (vertex, 3); identity where no face tells."""
     moved = moved.detach().double().contiguous()
     gradient = torch.empty(len(moved), 3, 3, dtype=torch.float64, device=moved.device)

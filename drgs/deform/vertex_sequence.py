@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
 from torch import Tensor
 
 from drgs.exchange.npz import read_npz_frames
@@ -23,7 +25,7 @@ from drgs.scene.mesh import TriangleMesh
 MAX_BYTES = 2 << 30
 
 
-def vertices_at(path: Path, seconds: float, frames_per_second: float, mesh: TriangleMesh) -> Tensor:
+def vertices_at(path: Path, seconds: float, frames_per_second: float, mesh: TriangleMesh) -> Float[Tensor, "vertex 3"]:
     """(vertex, 3) positions at a time, linear between frames; the last frame after the end.
 
     Args:
@@ -62,7 +64,7 @@ def _frames_of_folder(folder: Path) -> list[Path]:
     return sorted(files, key=lambda path: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)])
 
 
-def _read_pose(path: Path, mesh: TriangleMesh) -> np.ndarray:
+def _read_pose(path: Path, mesh: TriangleMesh) -> Float[ndarray, "vertex 3"]:
     """(vertex, 3) float32 of one OBJ or PLY file that has the mesh's vertices and faces."""
     if path.stat().st_size > MAX_BYTES:
         raise ValueError(f"{path}: has {path.stat().st_size} bytes; the limit is {MAX_BYTES}")
@@ -89,7 +91,7 @@ def _read_pose(path: Path, mesh: TriangleMesh) -> np.ndarray:
     return vertices
 
 
-def _canonical(faces: np.ndarray) -> np.ndarray:
+def _canonical(faces: Int[ndarray, "face 3"]) -> Int[ndarray, "face 3"]:
     """The same oriented triangles, each from its smallest vertex on, in one order."""
     start = faces.argmin(1)
     turned = np.take_along_axis(faces, (start[:, None] + np.arange(3)) % 3, 1)

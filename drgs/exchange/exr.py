@@ -7,6 +7,8 @@ Source: OpenEXR 3; Ward 1991, "Real Pixels" and the Radiance file format notes f
 
 import contextlib
 import io
+import re
+import struct
 import sys
 import warnings
 
@@ -15,6 +17,15 @@ import OpenEXR
 
 MAX_WIDTH = 16384
 MAX_HEIGHT = 8192
+MOST_TIMES_ITS_SIZE = 1100
+"""That a picture's pixels may take in memory beyond FREE_BYTES: what zlib, the best packer of both formats, can do (1032) and a little."""
+FREE_BYTES = 64 << 20
+"""Small pictures may be packed as well as they like."""
+MOST_BYTES = 2 << 30
+"""Of all channels of a picture, as float32: 16384 x 8192 in three colours takes 1.5 GiB."""
+_ROWS_AT_ONCE = 64
+MAX_RADIANCE = 1e12
+"""Of a texel: hundreds of times the sun's disc in any unit that is in use, and with room for sums and squares of it in float32."""
 
 
 def decode_environment(data: bytes, name: str = "environment", clamp_negative: bool = True) -> np.ndarray:
@@ -24,7 +35,7 @@ def decode_environment(data: bytes, name: str = "environment", clamp_negative: b
         clamp_negative: set negative values (a resampling filter's ringing) to 0, with a warning.
 
     Raises:
-        ValueError: damaged, not 2:1, too large, without R, G and B, or a value is not finite.
+        ValueError: damaged, not 2:1, too large, without R, G and B, or a value is not finite or beyond MAX_RADIANCE.
     """
     if data[:4] == b"\x76\x2f\x31\x01":
         radiance = _decode_exr_rgb(data, name)
@@ -37,11 +48,29 @@ def decode_environment(data: bytes, name: str = "environment", clamp_negative: b
         raise ValueError(f"{name}: is {width}x{height}; expected a lat-long environment twice as wide as high")
     if not np.isfinite(radiance).all():
         raise ValueError(f"{name}: holds {int((~np.isfinite(radiance)).sum())} values that are not finite")
+    most = max(float(radiance.max()), -float(radiance.min()))
+    if most > MAX_RADIANCE:
+        beyond = int((np.abs(radiance) > MAX_RADIANCE).sum())
+        raise ValueError(
+            f"{name}: holds {beyond} values up to {most:.3g}; expected at most {MAX_RADIANCE:g}, "
+            "so scale the picture down and raise the intensity of the edit that names it"
+        )
     negative = int((radiance < 0).sum())
     if negative and clamp_negative:
         warnings.warn(f"{name}: {negative} negative values were set to 0", stacklevel=2)
         radiance = np.maximum(radiance, 0)
     return radiance
+
+
+def picture_size(head: bytes) -> tuple[int, int] | None:
+    """Width and height that the first 64 kB of an OpenEXR or Radiance HDR file claim; None where they say nothing of it."""
+    window = b"dataWindow\0box2i\0"
+    at = head.find(window)
+    if head[:4] == b"\x76\x2f\x31\x01" and at >= 0 and len(head) >= at + len(window) + 20:
+        left, top, right, bottom = struct.unpack_from("<4i", head, at + len(window) + 4)
+        return right - left + 1, bottom - top + 1
+    said = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", head) if head[:2] == b"#?" else None
+    return None if said is None else (int(said[2]), int(said[1]))
 
 
 def encode_environment(radiance: np.ndarray) -> bytes:
@@ -94,6 +123,7 @@ def decode_exr(data: bytes, name: str = "EXR") -> dict[str, np.ndarray]:
         width, height = (int(window[1][k]) - int(window[0][k]) + 1 for k in (0, 1))
         if not (0 < width <= MAX_WIDTH and 0 < height <= MAX_HEIGHT):
             raise ValueError(f"{name}: is {width}x{height}; the limit is {MAX_WIDTH}x{MAX_HEIGHT}")
+        _check_claim(width * height * len(channels) * 4, len(data), f"{name}: {width}x{height} with {len(channels)} channels")
         if (
             parts != 1
             or kind not in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
@@ -140,15 +170,37 @@ def decode_hdr(data: bytes, name: str = "HDR") -> np.ndarray:
             raise ValueError(f"{name}: has the resolution line {' '.join(resolution)!r}; expected '-Y height +X width'")
     if not (0 < width <= MAX_WIDTH and 0 < height <= MAX_HEIGHT):
         raise ValueError(f"{name}: is {width}x{height}; the limit is {MAX_WIDTH}x{MAX_HEIGHT}")
-    rgbe = np.empty((height, width, 4), np.uint8)
+    _check_claim(width * height * 12, len(data), f"{name}: {width}x{height}")
+    radiance = np.empty((height, width, 3), np.float32)
     position = line_end + 1
-    try:
-        for row in range(height):
-            position = _decode_hdr_row(data, position, rgbe[row])
-    except (IndexError, ValueError) as error:
-        raise ValueError(f"{name}: is a damaged Radiance HDR file (row {row} of {height})") from error
-    scale = np.ldexp(np.float32(1), rgbe[..., 3].astype(np.int32) - 136)
-    return np.where(rgbe[..., 3:] > 0, rgbe[..., :3].astype(np.float32) * scale[..., None], np.float32(0))
+    for first in range(0, height, _ROWS_AT_ONCE):  # never all of them as bytes, exponents and floats at a time
+        rgbe = np.empty((min(_ROWS_AT_ONCE, height - first), width, 4), np.uint8)
+        for row in range(len(rgbe)):
+            try:
+                position = _decode_hdr_row(data, position, rgbe[row])
+            except (IndexError, ValueError) as error:
+                raise ValueError(f"{name}: is a damaged Radiance HDR file (row {first + row} of {height})") from error
+        scale = np.ldexp(np.float32(1), rgbe[..., 3].astype(np.int32) - 136)
+        radiance[first : first + len(rgbe)] = np.where(
+            rgbe[..., 3:] > 0, rgbe[..., :3].astype(np.float32) * scale[..., None], np.float32(0)
+        )
+    return radiance
+
+
+def _check_claim(claimed_bytes: int, file_bytes: int, what: str) -> None:
+    """
+    Args:
+        claimed_bytes: that the picture would take in memory by what its header says.
+
+    Raises:
+        ValueError: they are more than is read, or than a file of this size can hold.
+    """
+    if claimed_bytes > MOST_BYTES:
+        raise ValueError(f"{what} take {claimed_bytes} bytes in memory; the limit is {MOST_BYTES}")
+    if claimed_bytes > FREE_BYTES and claimed_bytes > MOST_TIMES_ITS_SIZE * file_bytes:
+        raise ValueError(
+            f"{what} take {claimed_bytes} bytes in memory, more than {MOST_TIMES_ITS_SIZE} times the file's {file_bytes}; it is damaged"
+        )
 
 
 def _decode_hdr_row(data: bytes, position: int, row: np.ndarray) -> int:

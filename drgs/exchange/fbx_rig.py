@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.exchange.rig import MAX_NODES, MAX_VERTICES, Rig, RigAnimation, RigChannel, RigMesh, RigNode, RigSkin
+from drgs.installation import missing_package
 
 MAX_BYTES = 1 << 30
 SECONDS = 600
@@ -37,7 +38,7 @@ def read_fbx_rig(path: Path | str) -> Rig:
     if path.stat().st_size > MAX_BYTES:
         raise ValueError(f"{path}: has {path.stat().st_size} bytes; at most {MAX_BYTES} are read")
     if find_spec("ufbx") is None:
-        raise ValueError(f"{path}: reading FBX needs the package ufbx; install it with: pip install 'drgs[fbx]'")
+        raise ValueError(missing_package(f"{path}: reading FBX", "ufbx", "fbx"))
     with tempfile.TemporaryDirectory() as folder:
         arrays = _arrays(path, Path(folder) / "rig.npz")
     try:

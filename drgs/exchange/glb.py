@@ -2,7 +2,7 @@
 
 In and out: float32 vertex attributes by glTF name (POSITION, NORMAL, TEXCOORD_0, and _NAME for what glTF has no word for) and faces.
 glTF is y up and in metres, we are z up and in world units: a matrix on the node turns and scales, the buffers stay as they are.
-Other programs' files, with their scenes, textures and sparse accessors, are read by build.import_mesh through trimesh.
+Other programs' files, with their scenes, textures and sparse accessors, are read by convert.import_mesh.
 Source: glTF 2.0 specification, Khronos.
 """
 
@@ -102,7 +102,7 @@ def decode_glb(data: bytes, name: str = "GLB") -> GlbMesh:
         material = document["materials"][primitive["material"]]["pbrMetallicRoughness"]
         if indices.dtype != np.uint32 or indices.ndim != 1 or indices.size % 3:
             raise ValueError("indices are not triangles")
-    except (KeyError, IndexError, TypeError, ValueError, struct.error) as error:
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError, struct.error) as error:
         raise ValueError(f"{name}: is not a mesh that drgs wrote, or is damaged ({error})") from error
     return GlbMesh(read, indices.astype(np.int32).reshape(-1, 3), material)
 

@@ -10,6 +10,7 @@ import base64
 import binascii
 import json
 import struct
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -59,6 +60,35 @@ class GltfFile:
         if accessor.get("type") not in kinds:
             raise ValueError(f"its {what} have the type {str(accessor.get('type'))[:20]!r}; expected {' or '.join(kinds)}")
         return self._decode(accessor, what)
+
+    def written_out(self, chosen: Collection[int]) -> tuple[dict, bytes]:
+        """The same file with one buffer, in which the chosen accessors are plain arrays: not sparse, and floats where they were normalised.
+
+        For readers that know neither. Returns the JSON, and the content of that buffer.
+        """
+        accessors, views = [dict(item) for item in self.items("accessors")], [dict(item) for item in self.items("bufferViews")]
+        chunks: list[bytes] = []
+        starts = []
+        for content in self._buffers:
+            starts.append(sum(map(len, chunks)))
+            chunks.append(content + b"\0" * (-len(content) % 4))
+        end = sum(map(len, chunks))
+        for view in views:
+            start = starts[whole(view.get("buffer"), len(starts) - 1, "a buffer view's buffer")]
+            view |= {"buffer": 0, "byteOffset": start + whole(view.get("byteOffset", 0), end, "a buffer view's offset")}
+        for index in sorted(chosen):
+            found = self.item("accessors", index)
+            if found.get("type") not in _WIDTHS:
+                raise ValueError(f"its accessor {index} has the type {str(found.get('type'))[:20]!r}; expected one of {', '.join(_WIDTHS)}")
+            values = self._decode(found, f"accessor {index}")
+            code = next(code for code, name in _DTYPES.items() if np.dtype(name) == values.dtype)
+            data = values.tobytes()
+            views.append({"buffer": 0, "byteOffset": end, "byteLength": len(data)})
+            accessors[index] = {"type": found["type"], "count": len(values), "componentType": code, "bufferView": len(views) - 1}
+            chunks.append(data + b"\0" * (-len(data) % 4))
+            end += len(chunks[-1])
+        buffers = [{"byteLength": end}]
+        return self.document | {"accessors": accessors, "bufferViews": views, "buffers": buffers}, b"".join(chunks)
 
     def charge(self, count: int) -> None:
         """Count numbers that are about to be unpacked; ValueError where all together are more than MAX_VALUES."""

@@ -1,8 +1,8 @@
 """The project's one BRDF: f = (1 - m) a / pi + D V F.
 
 GGX with alpha = r^2 (r clamped at MIN_ROUGHNESS), height-correlated Smith V = G / (4 n.l n.v), Schlick F with
-F0 = 0.04 (1 - m) + a m.  Source: Walter et al. 2007, Heitz 2014, Burley 2012 (docs/sources.md). Warp kernels
-restate these lines once, in drgs/render/brdf_warp.py, and are tested against this file.
+F0 (1 - m) + a m.  Source: Walter et al. 2007, Heitz 2014, Burley 2012 (docs/sources.md). Warp kernels
+restate these lines once, in drgs/render/integrate/brdf_warp.py, and are tested against this file.
 """
 
 import math
@@ -10,14 +10,13 @@ import math
 import torch
 from torch import Tensor
 
-MIN_ROUGHNESS = 0.03
-"""Below this the lobe is narrower than a texel of a 2k environment, and float32 loses D's peak."""
+from drgs.maths.constants import F0, MIN_ROUGHNESS
 
 
 def f0_from_base(albedo: Tensor, metallic: Tensor) -> Tensor:
     """(..., 3) reflectance at normal incidence of albedo (..., 3), metallic (...)."""
     m = metallic[..., None]
-    return 0.04 * (1 - m) + albedo * m
+    return F0 * (1 - m) + albedo * m
 
 
 def ggx_d(n_dot_h: Tensor, alpha: Tensor, sin2_nh: Tensor | None = None) -> Tensor:

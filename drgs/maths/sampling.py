@@ -4,7 +4,7 @@ Numbers: the first two Sobol dimensions under hash-based Owen scrambling, addres
 depends neither on batching nor on threads. Every aligned run of 2^k indices is a (0, 2)-net.
 Directions: cosine hemisphere and GGX visible normals in the bounded spherical-cap form. Densities are per solid angle
 and hold for every direction above the horizon; a sample that lands below it is void and is not redrawn.
-The Warp kernels restate these lines (drgs/render/random_warp.py, brdf_warp.py) and are tested against this file.
+The Warp kernels restate these lines (drgs/render/integrate/random_warp.py, brdf_warp.py) and are tested against this file.
 
 Source: Burley 2020 "Practical hash-based Owen scrambling"; constants of the scrambling hash by N. Vegdahl, of hash32 by
 C. Wellons; Dupuy and Benyoub 2023 (spherical caps), Eto and Tokuyoshi 2023 (the bound).

@@ -1,11 +1,12 @@
-"""Slow torch twin of drgs/render/denoise.py on whole maps; the specification of its kernels."""
+"""Slow torch twin of drgs/render/film/denoise/svgf.py on whole maps; the specification of its kernels."""
 
 import torch
 from torch import Tensor
 
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.color import luminance
-from drgs.render.denoise import MIN_REFLECTANCE, NEIGHBOUR_VARIANCE, NORMAL_POWER, SIGMA_LUMINANCE, SIGMA_PLANE
+from drgs.render.film.denoise.svgf import NEIGHBOUR_VARIANCE, NORMAL_POWER, SIGMA_LUMINANCE, SIGMA_PLANE
+from drgs.render.progressive.demodulate_albedo import MIN_REFLECTANCE
 from drgs.render.records import GBuffer
 
 

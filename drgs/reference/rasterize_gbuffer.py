@@ -1,4 +1,4 @@
-"""Specification of drgs/render/rasterize_gbuffer: the same maps by dense linear algebra, any float type, torch's own gradients.
+"""Specification of drgs/render/visible/rasterize: the same maps by dense linear algebra, any float type, torch's own gradients.
 
 For each pixel and each surfel, in order of centre depth: solve for (u, v) on the surfel's plane, take the wider of surfel and
 screen-space filter, blend. Cost is pixels x surfels; `block` bounds the memory.
@@ -9,8 +9,9 @@ import math
 import torch
 from torch import Tensor
 
-from drgs.render.rasterize_gbuffer.project import DEPTH_CUTOFF, FILTER_CUTOFF_SQUARED, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from drgs.render.rasterize_gbuffer.rasterize import RasterMaps, RasterSettings
+from drgs.maths.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from drgs.render.visible.rasterize.project import DEPTH_CUTOFF, FILTER_CUTOFF_SQUARED
+from drgs.render.visible.rasterize.rasterize import RasterMaps, RasterSettings
 from drgs.scene.camera import Camera
 
 
@@ -24,7 +25,7 @@ def rasterize(
     depth_origin: float | None = None,
     block: int = 1024,
 ) -> RasterMaps:
-    """As drgs.render.rasterize_gbuffer.rasterize, in the precision of `centers`."""
+    """As drgs.render.visible.rasterize.rasterize, in the precision of `centers`."""
     settings = settings or RasterSettings()
     dtype = centers.dtype
     pixel_from_world = camera.intrinsics.to(dtype) @ camera.camera_from_world[:3].to(dtype)
@@ -72,7 +73,7 @@ def rasterize(
         huge = torch.full_like(hz, 1e30)
         rho_plane = torch.where(front, radius2 / (safe_hz * safe_hz), huge)
         difference = pixel[:, None, :] - filter_center
-        rho_screen = torch.where(filtered, 2 * (difference * difference).sum(-1), huge)
+        rho_screen = torch.where(filtered, settings.filter_sigma**-2 * (difference * difference).sum(-1), huge)
         rho = torch.minimum(rho_plane, rho_screen)
         alpha = (opacity * torch.exp(-0.5 * rho)).clamp(max=MAX_ALPHA)
         alpha = torch.where(rho <= 2 * torch.log(opacity / MIN_ALPHA).detach(), alpha, torch.zeros_like(alpha))

@@ -1,11 +1,12 @@
-"""Slow torch twin of drgs/render/reproject.py's kernel: one pixel after another, float64; the specification."""
+"""Slow torch twin of drgs/render/progressive/reproject.py's kernel: one pixel after another, float64; the specification."""
 
 import math
 
 import torch
 
-from drgs.render.records import GBuffer
-from drgs.render.reproject import FACING, GRAZING, LOBE, MOST_SAMPLES, PLANE, SPREAD, History, Reprojected
+from drgs.maths.constants import MIN_ROUGHNESS
+from drgs.render.progressive.reproject import FACING, GRAZING, LOBE, MOST_SAMPLES, PLANE, SPREAD
+from drgs.render.records import DemodulatedLight, GBuffer, History, Reprojected
 from drgs.scene.camera import Camera
 
 
@@ -43,9 +44,9 @@ def reproject(history: History, gbuffer: GBuffer, camera: Camera) -> Reprojected
                     if abs(float(n @ apart)) > reach or float(torch.linalg.norm(apart)) > spread:
                         continue
                     w = (1 - abs(u - qx)) * (1 - abs(v - qy))
-                    diffuse[row, column] += w * history.diffuse[qy, qx]
-                    specular[row, column] += w * history.specular[qy, qx]
-                    variance[row, column] += w * history.variance[qy, qx]
+                    diffuse[row, column] += w * history.light.diffuse[qy, qx]
+                    specular[row, column] += w * history.light.specular[qy, qx]
+                    variance[row, column] += w * history.light.variance[qy, qx]
                     samples[row, column] += w * history.samples[qy, qx]
                     weights += w
             if weights < 0.05:
@@ -54,8 +55,8 @@ def reproject(history: History, gbuffer: GBuffer, camera: Camera) -> Reprojected
                 continue
             for values in (diffuse, specular, variance, samples):
                 values[row, column] /= weights
-            alpha = max(float(gbuffer.roughness[row, column]) ** 2, 1e-4)
+            alpha = max(float(gbuffer.roughness[row, column]), MIN_ROUGHNESS) ** 2
             turned = float(torch.linalg.norm(gbuffer.wo_world[row, column].double() - torch.nn.functional.normalize(center - x, dim=0)))
             samples[row, column] = samples[row, column].clamp(max=MOST_SAMPLES)
             samples[row, column, 1] *= math.exp(-min((float(LOBE) * turned / alpha) ** 2, 80.0))
-    return Reprojected(diffuse, specular, variance, samples)
+    return Reprojected(DemodulatedLight(diffuse, specular, variance), samples)

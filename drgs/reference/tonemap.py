@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from drgs.render.tonemap import (
+from drgs.render.film.tonemap import (
     ACES_FROM_LINEAR,
     AGX_CONTRAST,
     AGX_FROM_REC2020,

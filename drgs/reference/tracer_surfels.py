@@ -5,7 +5,7 @@ from torch import Tensor
 
 from drgs.maths.spherical_harmonics import radiance_from_sh
 
-MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, GRAZING_COSINE = 1 / 255, 0.99, 1e-3, 1e-4
+MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, GRAZING_COSINE = 1 / 255, 0.99, 1e-4, 1e-4
 
 
 def meet_surfels(
@@ -23,14 +23,6 @@ def meet_surfels(
     uv = torch.linalg.solve(gram, torch.einsum("nxk,rnx->rnk", tangents, in_plane)[..., None])[..., 0]
     alpha = (opacities * torch.exp(-0.5 * uv.square().sum(-1))).clamp(max=MAX_ALPHA)
     return torch.where(met & (alpha >= min_alpha), alpha, torch.zeros_like(alpha)), t
-
-
-def trace_surfel_visibility(
-    origins: Tensor, directions: Tensor, centers: Tensor, tangents: Tensor, opacities: Tensor, t_min: float
-) -> Tensor:
-    """(R,) transmittance; never cut short."""
-    alpha, t = meet_surfels(origins, directions, centers, tangents, opacities)
-    return torch.where(t > t_min, 1 - alpha, torch.ones_like(alpha)).prod(-1)
 
 
 def trace_surfel_radiance(

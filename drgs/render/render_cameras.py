@@ -7,10 +7,10 @@ import torch
 from PIL import Image
 
 from drgs.exchange.exr import encode_maps
-from drgs.render.denoise_oidn import oidn_filter
-from drgs.render.records import Frame
-from drgs.render.render_frame import RenderSettings, render_frame
-from drgs.render.trace_rays import build_tracer
+from drgs.render.film.denoise.oidn import oidn_filter
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.records import Frame, RenderSettings
+from drgs.render.render_frame import render_frame
 from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedScene
 

@@ -1,8 +1,11 @@
 """One frame, from the posed scene to the picture."""
 
-from drgs.render.accumulate import RenderSettings, passes_needed, refine_frame, resolve_frame, start_frame
-from drgs.render.records import Frame
-from drgs.render.tracer import AbstractTracer
+from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.render.progressive.frame_state import passes_needed
+from drgs.render.progressive.refine import refine_frame
+from drgs.render.progressive.start_frame import start_frame
+from drgs.render.records import Frame, RenderSettings
 from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedScene
 
@@ -13,5 +16,6 @@ def render_frame(scene: PosedScene, camera: Camera, settings: RenderSettings | N
     Args:
         tracer: of scene.mesh (trace_rays.build_tracer), to reuse one over several frames.
     """
-    state = start_frame(scene, camera, settings or RenderSettings(), tracer)
-    return resolve_frame(refine_frame(state, passes_needed(state)))
+    state = start_frame(scene, camera, settings or RenderSettings(), tracer)  # what the camera sees, and a plan of the rays
+    state = refine_frame(state, passes_needed(state))  # rays from there: what they meet, and what light they bring
+    return resolve_frame(state)  # sums to a picture: mean, denoiser, background, tone curve

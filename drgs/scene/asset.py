@@ -18,6 +18,7 @@ from drgs.exchange.photographs import PHOTOGRAPHS
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, opengl_from_camera
+from drgs.scene.edits import LARGEST, SMALLEST
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
@@ -55,7 +56,7 @@ class Asset:
     provenance: dict = field(default_factory=dict)
     """Plain JSON: source, preset, seed, versions, seconds per stage, quality."""
     horizons: UInt8[Tensor, "face 8"] | None = None
-    """How high the mesh rises around each of its faces (drgs.render.horizon.stored_horizons); None: found out while rendering."""
+    """How high the mesh rises around each of its faces (drgs.render.intersect.horizon.stored_horizons); None: found out while rendering."""
 
 
 def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = None, photographs_zip: bytes | None = None) -> None:
@@ -128,8 +129,8 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     radiance = decode_environment(files["environment.exr"], f"{path}: environment.exr", clamp_negative=False)
     cameras = _read_cameras(files["cameras.json"], path, device)
     meters, provenance = manifest.get("meters_per_unit"), manifest.get("provenance", {})
-    if not isinstance(meters, float | int) or not 0 < meters < float("inf") or not isinstance(provenance, dict):
-        raise ValueError(f"{path}: asset.json has meters_per_unit {meters!r}; expected a positive number")
+    if not isinstance(meters, float | int) or not SMALLEST <= meters <= LARGEST or not isinstance(provenance, dict):
+        raise ValueError(f"{path}: asset.json has meters_per_unit {str(meters)[:40]}; expected {SMALLEST:g} to {LARGEST:g}")
     environment = Environment(torch.from_numpy(radiance).to(device))
     asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons)
     _check(asset, str(path))
@@ -208,7 +209,7 @@ def _read_cameras(data: bytes, path: Path, device: torch.device | str) -> tuple[
             if pose.shape != (4, 4) or k.shape != (3, 3):
                 raise ValueError("a matrix has the wrong shape")
             cameras.append(Camera(pose, k, int(frame["w"]), int(frame["h"]), str(frame["file_path"])))
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f"{path}: cameras.json is damaged ({error!r})") from error
     return tuple(cameras)
 

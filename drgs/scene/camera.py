@@ -43,6 +43,13 @@ def opengl_from_camera(camera: Camera) -> Tensor:
     return torch.linalg.inv(camera.camera_from_world.double()) @ opencv_from_opengl
 
 
+def scaled_camera(camera: Camera, factor: float) -> Camera:
+    """The same view at `factor` times the size (exact: pixel centres stay at +0.5)."""
+    width, height = round(camera.width * factor), round(camera.height * factor)
+    scale = torch.diag(torch.tensor([width / camera.width, height / camera.height, 1.0], device=camera.intrinsics.device))
+    return Camera(camera.camera_from_world, scale @ camera.intrinsics, width, height, camera.name)
+
+
 def world_from_pixel(camera: Camera) -> Tensor:
     """(3, 3): takes (x, y, 1) of a place on the image [pixels; centres at + 0.5] to its viewing direction, not of unit length."""
     return camera.camera_from_world[:3, :3].T @ torch.linalg.inv(camera.intrinsics)

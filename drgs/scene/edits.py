@@ -6,32 +6,45 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
+LARGEST = 1e9
+"""Of coordinates, lengths and factors: float32 holds their squares and products."""
+SMALLEST = 1e-12
+"""Of what is divided by."""
+MAX_INTENSITY = 1e6
+MAX_SECONDS = 1e6
+
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
-Triple = tuple[float, float, float]
+Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
+Distance = Annotated[float, Field(ge=0.0, le=LARGEST)]
+"""A length that may be zero."""
+Seconds = Annotated[float, Field(ge=0.0, le=MAX_SECONDS)]
+Index = Annotated[int, Field(ge=0, le=2**31 - 1)]
+Triple = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class _Plain(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
 class Sphere(_Plain):
     center: Triple
     """World units."""
-    radius: Annotated[float, Field(gt=0)]
-    falloff: Annotated[float, Field(ge=0)] = 0.0
+    radius: Length
+    falloff: Distance = 0.0
     """Width of the smooth rim outside the radius [world units]."""
 
 
 class Box(_Plain):
     minimum: Triple
     maximum: Triple
-    falloff: Annotated[float, Field(ge=0)] = 0.0
+    falloff: Distance = 0.0
 
 
 class Similar(_Plain):
     point: Triple
     """World position picked on the surface; the flood starts at its nearest vertex."""
-    tolerance: Annotated[float, Field(gt=0, le=1)] = 0.1
+    tolerance: Annotated[float, Field(ge=SMALLEST, le=1)] = 0.1
     """Largest material difference (Euclidean over albedo, roughness, metallic) that the flood crosses."""
 
 
@@ -41,16 +54,20 @@ class Selection(_Plain):
     all: bool | None = None
     sphere: Sphere | None = None
     box: Box | None = None
-    region: int | None = None
+    region: Index | None = None
     similar: Similar | None = None
     vertex_weights: list[Unit] | None = None
     """Painted weight of each mesh vertex."""
+    weights_file: Annotated[str, Field(max_length=400)] | None = None
+    """The same as a file: a little-endian float32 for each vertex."""
 
     @model_validator(mode="after")
     def _exactly_one(self) -> "Selection":
         given = [name for name in type(self).model_fields if (value := getattr(self, name)) is not None and value is not False]
         if len(given) != 1:
-            raise ValueError(f"a selection names exactly one of all, sphere, box, region, similar, vertex_weights; found {given or 'none'}")
+            raise ValueError(
+                f"a selection names exactly one of all, sphere, box, region, similar, vertex_weights, weights_file; found {given or 'none'}"
+            )
         return self
 
 
@@ -84,20 +101,20 @@ class EnvironmentEdit(_Plain):
     op: Literal["environment"]
     file: str | None = None
     """EXR or HDR file (or the name of a stored environment); None keeps the present one."""
-    rotation: float = 0.0
+    rotation: Coordinate = 0.0
     """Degrees, counter-clockwise seen from above."""
-    intensity: Annotated[float, Field(ge=0)] = 1.0
+    intensity: Annotated[float, Field(ge=0, le=MAX_INTENSITY)] = 1.0
 
 
 class TwistMap(_Plain):
     type: Literal["twist"]
-    rate: float
+    rate: Coordinate
     """Radians per world unit of z."""
 
 
 class BendMap(_Plain):
     type: Literal["bend"]
-    curvature: float
+    curvature: Coordinate
     """1 / world unit."""
 
 
@@ -111,7 +128,7 @@ class LatticeMap(_Plain):
     minimum: Triple
     maximum: Triple
     control_points: list[list[list[Triple]]]
-    """[i][j][k] -> moved position of the control point, x fastest varying last index z."""
+    """`control_points[i][j][k]`: where the point is moved to; i counts along x, j along y, k along z."""
 
 
 AnalyticMap = Annotated[TwistMap | BendMap | StretchMap | LatticeMap, Field(discriminator="type")]
@@ -120,10 +137,10 @@ AnalyticMap = Annotated[TwistMap | BendMap | StretchMap | LatticeMap, Field(disc
 class Grip(_Plain):
     """A part of the surface that is held: some vertices by number, or those around a picked point."""
 
-    vertices: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1, max_length=200_000)] | None = None
+    vertices: Annotated[list[Index], Field(min_length=1, max_length=200_000)] | None = None
     point: Triple | None = None
     """World position on the object at rest."""
-    radius: Annotated[float, Field(ge=0)] = 0.0
+    radius: Distance = 0.0
     """Around the point [world units]; its nearest vertex is held in any case."""
 
     @model_validator(mode="after")
@@ -163,9 +180,9 @@ class DeformEdit(_Plain):
     map: AnalyticMap | None = None
     vertices: str | None = None
     """The mesh's new vertex positions: NPZ with `vertices` (vertex, 3) or (frame, vertex, 3), an OBJ or PLY, or a folder of those."""
-    time: Annotated[float, Field(ge=0)] = 0.0
+    time: Seconds = 0.0
     """Seconds into a sequence of `vertices`; frames are blended linearly, the last one holds."""
-    frames_per_second: Annotated[float, Field(gt=0)] = 24.0
+    frames_per_second: Annotated[float, Field(ge=1e-3, le=1e4)] = 24.0
 
     handles: Handles | None = None
 
@@ -184,14 +201,14 @@ class RigBinding(_Plain):
     """Rotation vector about the origin [degrees]; first of all."""
     fit: bool = False
     """Then scale and move the rig until its box has the diagonal and the centre of the object's."""
-    scale: Annotated[float, Field(gt=0)] = 1.0
+    scale: Length = 1.0
     """Then scale, about the fitted centre, or the origin without `fit`."""
     translation: Triple = (0.0, 0.0, 0.0)
     """Then move [world units]."""
     method: Literal["auto", "closest", "mls"] = "auto"
     """closest: with the closest triangle that faces alike. mls: moving least squares over patches as wide as the rig is away; smoother, blind
     to narrow gaps. auto: closest where the rig hugs the object, mls where it stands off."""
-    rest: Annotated[float, Field(ge=0)] | None = None
+    rest: Seconds | None = None
     """Seconds into the animation where the rig stands as the object does at rest; None: where the file's nodes stand."""
     loop: bool = False
     """Start again after the animation's end; else its last pose holds."""
@@ -201,8 +218,8 @@ class PoseEdit(_Plain):
     op: Literal["pose"]
     clip: str
     """A clip folder, or a glTF or FBX file and one of its animations: robot.glb#Walk."""
-    time: Annotated[float, Field(ge=0)]
-    """Seconds."""
+    time: Seconds
+
     rig: RigBinding | None = None
     """For glTF and FBX files only."""
 
@@ -222,7 +239,7 @@ def split_rig_clip(clip: str) -> tuple[str, str] | None:
 class SimulateEdit(_Plain):
     op: Literal["simulate"]
     scene: dict
-    time: Annotated[float, Field(ge=0)]
+    time: Seconds
 
 
 Edit = Annotated[MaterialEdit | EnvironmentEdit | DeformEdit | PoseEdit | SimulateEdit, Field(discriminator="op")]
@@ -240,6 +257,11 @@ def parse_edits(data: list | str | bytes) -> list[Edit]:
     except ValidationError as error:
         first = error.errors()[0]
         raise ValueError(f"edits: {'.'.join(map(str, first['loc'])) or 'document'}: {first['msg']}") from error
+
+
+def plain_edit(edit: Edit) -> dict:
+    """An edit as parse_edits reads it, without what it leaves out."""
+    return edit.model_dump(mode="json", exclude_none=True)
 
 
 def load_edits(path: Path) -> list[Edit]:

@@ -6,6 +6,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from drgs.scene.edits import LARGEST
+
+MOST_BOXES_MET = 5000
+"""Of a scan it is a few, of a lattice of long struts some hundreds."""
+
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
@@ -29,4 +34,39 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     normals = torch.zeros_like(vertices)
     for corner in range(3):
         normals.index_add_(0, faces[:, corner].long(), area_normals)
-    return torch.nn.functional.normalize(normals, dim=-1)
+    return torch.nn.functional.normalize(normals, dim=-1, eps=1e-30)  # areas of a small object's faces are tiny numbers
+
+
+def refuse_unusable(mesh: TriangleMesh, name: str) -> None:
+    """The door for meshes of strangers.
+
+    Raises:
+        ValueError: `name` lies too far away for float32, or its triangles in such a heap that rays could not be traced.
+    """
+    farthest = float(mesh.vertices.abs().max()) if len(mesh.vertices) else 0.0
+    if farthest > LARGEST:
+        raise ValueError(f"{name}: has a vertex at {farthest:.3g}; expected coordinates up to {LARGEST:g}")
+    met = mean_boxes_met(mesh)
+    if met > MOST_BOXES_MET:
+        raise ValueError(
+            f"{name}: its {len(mesh.faces)} triangles lie on one another, so that a ray would have to be tried against {met:.0f} of them "
+            f"on the mean; expected at most {MOST_BOXES_MET}, so join those that coincide"
+        )
+
+
+def mean_boxes_met(mesh: TriangleMesh) -> float:
+    """How many triangles' bounding boxes a random line through the whole mesh's box meets on the mean.
+
+    By Cauchy and Crofton that is the sum of their areas over its own; no hierarchy of boxes can spare a ray these.
+    """
+    if not len(mesh.faces):
+        return 0.0
+    corners = mesh.vertices[mesh.faces.long()]
+    sides = (corners.amax(1) - corners.amin(1)).double()
+    whole = (corners.amax((0, 1)) - corners.amin((0, 1))).double()
+    area = _half_area(whole)
+    return float(_half_area(sides).sum() / area) if area > 0 else 0.0
+
+
+def _half_area(sides: Tensor) -> Tensor:
+    return sides[..., 0] * sides[..., 1] + sides[..., 1] * sides[..., 2] + sides[..., 2] * sides[..., 0]

@@ -4,6 +4,8 @@ Sphere and box are evaluated where a vertex or surfel lies. Region, similar and 
 from the face it is bound to (barycentric), or from the nearest vertex where there is no binding.
 """
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from scipy.sparse import coo_matrix
@@ -12,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.scene.binding import Binding
-from drgs.scene.edits import Box, Selection, Similar, Sphere
+from drgs.scene.edits import SMALLEST, Box, Selection, Similar, Sphere
 from drgs.scene.mesh import TriangleMesh
 
 REGION_STEP = 0.1
@@ -20,7 +22,7 @@ REGION_STEP = 0.1
 
 
 def select_vertices(mesh: TriangleMesh, selection: Selection) -> Tensor:
-    """(vertex,) weights 0..1.
+    """(vertex,) weights 0..1; those of a file are read_weights'.
 
     Raises:
         ValueError: a region that does not exist, or painted weights for another mesh.
@@ -41,6 +43,21 @@ def select_vertices(mesh: TriangleMesh, selection: Selection) -> Tensor:
     if selection.region is None or not 0 <= selection.region < count:
         raise ValueError(f"region {selection.region} does not exist; the object has regions 0 to {count - 1}")
     return (regions == selection.region).to(mesh.roughness.dtype)
+
+
+def read_weights(path: Path, mesh: TriangleMesh) -> Tensor:
+    """(vertex,) painted weights of a selection's `weights_file`.
+
+    Raises:
+        ValueError: they are another mesh's, or not in 0..1.
+    """
+    count = len(mesh.vertices)
+    if (size := path.stat().st_size) != 4 * count:
+        raise ValueError(f"{path}: has {size} bytes; expected {4 * count}, a float32 for each of the mesh's {count} vertices")
+    weights = np.fromfile(path, "<f4")
+    if not ((weights >= 0) & (weights <= 1)).all():
+        raise ValueError(f"{path}: expected weights in 0..1; found others")
+    return torch.from_numpy(weights.astype(np.float32)).to(mesh.roughness)
 
 
 def select_surfels(centers: Tensor, mesh: TriangleMesh, binding: Binding | None, selection: Selection, vertex_weights: Tensor) -> Tensor:
@@ -77,7 +94,7 @@ def _weights_at_points(points: Tensor, shape: Sphere | Box) -> Tensor:
     else:
         low, high = points.new_tensor(shape.minimum), points.new_tensor(shape.maximum)
         outside = torch.maximum(low - points, points - high).clamp(min=0).norm(dim=-1)
-    if shape.falloff == 0:
+    if shape.falloff < SMALLEST:
         return (outside <= 0).to(points.dtype)
     t = (1 - outside / shape.falloff).clamp(0, 1)
     return t * t * (3 - 2 * t)

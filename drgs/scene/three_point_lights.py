@@ -1,6 +1,6 @@
 """A photographer's studio as an environment, computed: key, fill and rim light in a dark room with a floor and a backdrop.
 
-Out: a lat-long table of linear Rec.709 radiance. Sides are those of a camera at the start view of a new viewer (worker/start_view.py).
+Out: a lat-long table of linear Rec.709 radiance. Sides are those of a camera at the start view of a new viewer (worker/drgs_worker/jobs/start_view.py).
 """
 
 from dataclasses import dataclass

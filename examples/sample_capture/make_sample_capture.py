@@ -22,6 +22,8 @@ import numpy as np
 from PIL import Image
 from skimage.measure import marching_cubes
 
+from drgs.maths.color_numpy import srgb_from_linear
+
 mi.set_variant("llvm_ad_rgb" if os.environ.get("DRJIT_LIBLLVM_PATH") else "scalar_rgb")
 
 HERE = Path(__file__).parent
@@ -199,8 +201,7 @@ def render(scene: mi.Scene, matrix: np.ndarray, spp: int, seed: int) -> np.ndarr
     premultiplied = np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed), dtype=np.float64)
     alpha = np.clip(premultiplied[..., 3:], 0, 1)
     linear = np.clip(premultiplied[..., :3] / np.maximum(alpha, 1e-6), 0, 1)
-    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.round(np.concatenate([np.where(alpha > 0, srgb, 0), alpha], -1) * 255).astype(np.uint8)
+    return np.round(np.concatenate([np.where(alpha > 0, srgb_from_linear(linear), 0), alpha], -1) * 255).astype(np.uint8)
 
 
 def write_split(scene: mi.Scene, out: Path, split: str, positions: np.ndarray, spp: int, seed: int) -> None:

@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from benchmarks import binding
-from drgs.build.build_asset import PRESETS
-from tests.build.test_build_asset import TINY
-from tests.build.tiny_capture import sphere_views, write_nerf_synthetic
+from drgs.reconstruct.build_asset import PRESETS
 from tests.deform.test_pose_scene import plate_asset
+from tests.reconstruct.test_build_asset import TINY
+from tests.reconstruct.tiny_capture import sphere_views, write_nerf_synthetic
 
 
+@pytest.mark.slow
 def test_the_static_table_has_a_row_for_the_fit_the_rebuilding_and_each_ablation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):

@@ -10,6 +10,7 @@ from drgs.scene.posed_scene import PosedScene
 from tests.render.closed_form_scenes import front_camera, sunny_sky, two_spheres
 
 
+@pytest.mark.slow
 def test_an_edit_leaves_no_trail_and_a_small_move_keeps_what_was_seen() -> None:
     scene = PosedScene(None, two_spheres(roughness=0.6), sunny_sky(sun=30.0))
     rows = {row["edit"]: row for row in one_frame_after(scene, front_camera(24, 8.0), bounces=0, before=64, truth_samples=256)}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.integrator import ours, time_to_error
-from drgs.render.accumulate import RenderSettings
-from drgs.render.trace_rays import build_tracer
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.records import RenderSettings
 from drgs.scene.posed_scene import PosedScene
 from tests.render.closed_form_scenes import front_camera, sunny_sky, two_spheres
 
@@ -17,6 +17,7 @@ def test_time_to_an_error_follows_the_curve_between_and_beyond_its_points(target
     assert time_to_error(ROWS, target, "seconds") == pytest.approx(0.01 * 0.8 / target, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_every_variant_shows_the_same_picture_and_low_discrepancy_lowers_the_error() -> None:
     scene = PosedScene(None, two_spheres(roughness=0.8), sunny_sky(sun=5.0))
     camera, tracer = front_camera(16, 6.0), build_tracer(scene.mesh)

@@ -1,7 +1,7 @@
 """The plan's benchmark on a small scene: every skip has a switch, and exact ones change no pixel."""
 
 from benchmarks.plan import measure_saving, measure_skips, measure_taken_over
-from drgs.render.accumulate import RenderSettings
+from drgs.render.records import RenderSettings
 from drgs.scene.posed_scene import PosedScene
 from tests.render.closed_form_scenes import front_camera, sunny_sky, two_spheres
 

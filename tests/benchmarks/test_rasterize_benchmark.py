@@ -28,6 +28,7 @@ def workload(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_it_prints_one_document_and_dumps_the_image(workload: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     main(["rasterize", "--scene", str(workload), "--json", "--dump", str(tmp_path / "image.npy"), "--repeats", "7"])
     result = json.loads(capsys.readouterr().out)

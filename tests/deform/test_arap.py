@@ -56,6 +56,7 @@ def test_a_dragged_end_goes_there_the_other_stays_and_the_bar_keeps_its_thicknes
         assert torch.allclose(back, vertices, atol=1e-5) and torch.allclose(gradient, torch.eye(3).expand_as(gradient), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_drag_depends_on_its_targets_and_not_on_those_before_it():
     vertices, faces, ends = bar()
     settings = ArapSettings(coarse_faces=600)

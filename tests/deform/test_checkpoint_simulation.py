@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from drgs.build.import_mesh import import_mesh
+from drgs.convert.import_mesh import import_mesh
 from drgs.deform.simulate import simulate
 from drgs.deform.simulation_scene import parse_simulation_scene
 from drgs.scene.asset import Asset, load_asset, save_asset
@@ -56,6 +56,7 @@ def frames_reported(asset: Asset, out: Path, checkpoint: Path) -> list[int]:
     return told
 
 
+@pytest.mark.slow
 def test_kill_9_costs_one_frame_and_no_bit(folder: Path, asset: Asset, tmp_path: Path) -> None:
     checkpoint = tmp_path / "frames"
     arguments = [str(folder / "asset"), str(tmp_path / "clip"), str(checkpoint), SCENE.model_dump_json(), "4"]
@@ -79,6 +80,7 @@ def stop_at(asset: Asset, frame: int, checkpoint: Path) -> None:
         simulate(asset, SCENE, None, stop, checkpoint=checkpoint)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["state.safetensors", "frame_00002.safetensors"])
 def test_a_damaged_checkpoint_is_left_aside(damage: str, folder: Path, asset: Asset, tmp_path: Path) -> None:
     stop_at(asset, 4, tmp_path / "frames")
@@ -87,6 +89,7 @@ def test_a_damaged_checkpoint_is_left_aside(damage: str, folder: Path, asset: As
     assert contents(tmp_path / "clip") == contents(folder / "undisturbed")
 
 
+@pytest.mark.slow
 def test_the_checkpoint_of_another_scene_is_left_aside(asset: Asset, tmp_path: Path) -> None:
     stop_at(asset, 3, tmp_path / "frames")
     told: list[int] = []
@@ -95,6 +98,7 @@ def test_the_checkpoint_of_another_scene_is_left_aside(asset: Asset, tmp_path: P
     assert told == [1, 2, 3]
 
 
+@pytest.mark.slow
 def test_frames_at_rest_are_kept_too(asset: Asset, tmp_path: Path) -> None:
     still = SCENE.model_copy(update={"gravity": 0.0, "spin": (0.0, 0.0, 0.0), "floor": None})
     whole, report = simulate(asset, still)

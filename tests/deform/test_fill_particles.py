@@ -39,6 +39,7 @@ def broken(kind):
     return vertices, faces, inside
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["closed", "holed", "capless", "flipped", "inside out", "overlapping", "floaters"])
 def test_the_filled_volume_agrees_with_the_true_solid(kind):
     vertices, faces, inside = broken(kind)
@@ -63,6 +64,7 @@ def test_the_mass_of_a_cube_is_right_within_one_percent_and_the_filling_is_repea
     assert not torch.equal(filled.positions, other.positions)
 
 
+@pytest.mark.slow
 def test_tracers_lie_on_the_surface_one_a_voxel_and_weigh_next_to_nothing():
     vertices, faces, _ = broken("closed")
     filled = fill_particles(vertices, faces, FillSettings(particles=3000))
@@ -82,6 +84,13 @@ def test_thin_parts_are_reported():
     assert plate.thin_share == pytest.approx(8 / (8 + 8 * 0.02))  # all but the rim
     ball = fill_particles(*sphere(), FillSettings(particles=2000))
     assert ball.thin_share < 0.01 and ball.torn_parts == ()
+
+
+def test_thin_parts_of_a_tiny_object_are_found():
+    plate = trimesh.creation.box((2.0, 2.0, 0.02)).subdivide_loop(3)
+    vertices, faces = torch.tensor(plate.vertices, dtype=torch.float32), torch.tensor(plate.faces, dtype=torch.int32)
+    large, tiny = (fill_particles(size * vertices, faces, FillSettings(particles=2000)) for size in (1.0, 2.0**-20))
+    assert tiny.thin_share == pytest.approx(large.thin_share, abs=0.01) and large.thin_share > 0.9
 
 
 def test_a_handle_thinner_than_a_cell_is_found_until_there_are_particles_enough():

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from drgs.maths.frames import rotation_from_quat_wxyz
-from drgs.render.render_frame import RenderSettings, render_frame
+from drgs.render.records import RenderSettings
+from drgs.render.render_frame import render_frame
 from drgs.scene.camera import camera_from_opengl
 from drgs.scene.environment import Environment
 from tests.deform.test_hold_handles import handles
@@ -39,6 +40,7 @@ def by_handles(asset, folder):
     return handles({"vertices": everywhere, "target": target.tolist(), "turn": [0, 0, DEGREES]})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("driver", [by_vertices, by_handles])
 @pytest.mark.parametrize("primary", ["gaussians", "mesh"])
 def test_a_rigid_motion_of_object_light_and_camera_changes_no_picture(driver, primary, tmp_path):
@@ -66,6 +68,7 @@ def test_a_rigid_motion_of_object_light_and_camera_changes_no_picture(driver, pr
     assert float(difference.mean()) < 1e-3, f"mean {float(difference.mean()):.1e}, largest {float(difference.max()):.1e}"
 
 
+@pytest.mark.slow
 def test_a_free_fall_before_a_camera_that_falls_along_changes_no_picture():
     """Particles carry the surfels: how far they fell is the scheme's, that nothing else happened is asked here."""
     asset = replace(ball_asset(), environment=soft_sky())

@@ -1,10 +1,12 @@
 import math
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from drgs.deform import pose_scene as pose_module
 from drgs.deform.maps import evaluate_map
 from drgs.deform.pose_scene import pose_scene
 from drgs.exchange.exr import encode_environment
@@ -56,7 +58,11 @@ def material(select, mode="absolute", **values):
     return {"op": "material", "select": select, "set": values, "mode": mode}
 
 
-TWIST = {"op": "deform", "map": {"type": "twist", "rate": 0.6}}
+def twist(rate: float) -> dict:
+    return {"op": "deform", "map": {"type": "twist", "rate": rate}}
+
+
+TWIST = twist(0.6)
 
 
 def test_without_edits_the_scene_is_the_asset_bit_for_bit():
@@ -302,3 +308,46 @@ def test_posing_leaves_the_asset_as_it_was():
     copies = {entry.name: getattr(asset.mesh, entry.name).clone() for entry in fields(asset.mesh)}
     pose(asset, TWIST, material({"all": True}, albedo=[0, 0, 0]))
     assert all(torch.equal(getattr(asset.mesh, name), values) for name, values in copies.items())
+
+
+@pytest.mark.slow
+def test_one_edit_more_or_a_few_less_cost_one_edit_however_long_the_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    asset, applied = plate_asset(), []
+    evaluate, select = pose_module.evaluate_map, pose_module.select_vertices
+    monkeypatch.setattr(pose_module, "evaluate_map", lambda *given: applied.append("map") or evaluate(*given))
+    monkeypatch.setattr(pose_module, "select_vertices", lambda *given: applied.append("material") or select(*given))
+    plain = [(twist(1e-4 * k), material({"all": True}, roughness=k / 150)) for k in range(150)]
+    edits = parse_edits([edit for pair in plain for edit in pair])
+    whole = pose_scene(asset, edits)
+    applied.clear()
+    pose_scene(asset, [*edits, *parse_edits([twist(0.1), material({"all": True}, roughness=0.5)])])
+    assert sorted(applied) == ["map", "map", "material"], "vertices and surfels are mapped"
+    for less in (1, 40, 100):
+        applied.clear()
+        shorter = pose_scene(asset, edits[: len(edits) - 2 * less])
+        assert applied.count("material") <= pose_module.CHECKPOINT and applied.count("map") <= 2 * pose_module.CHECKPOINT
+    anew = pose_scene(plate_asset(), edits[: len(edits) - 2 * less])
+    assert torch.equal(shorter.mesh.vertices, anew.mesh.vertices) and torch.equal(shorter.mesh.roughness, anew.mesh.roughness)
+    assert torch.equal(pose_scene(asset, edits).mesh.vertices, whole.mesh.vertices)
+
+
+def test_painted_weights_of_a_file_are_those_in_the_edit(tmp_path: Path) -> None:
+    weights = np.random.default_rng(0).random(GRID * GRID, np.float32)
+    weights.astype("<f4").tofile(tmp_path / "painted.f32")
+    asset = plate_asset()
+    inside = pose(asset, material({"vertex_weights": weights.astype(float).tolist()}, roughness=0.1))
+    beside = pose(asset, material({"weights_file": "painted.f32"}, roughness=0.1), base_directory=tmp_path)
+    assert torch.equal(inside.mesh.roughness, beside.mesh.roughness)
+    weights[:] = 0
+    weights[:5].tofile(tmp_path / "few.f32")
+    np.full_like(weights, 2).tofile(tmp_path / "many.f32")
+    for name, sentence in (
+        ("few.f32", "has 20 bytes; expected 324"),
+        ("many.f32", r"expected weights in 0\.\.1"),
+        ("none.f32", "does not exist"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            pose(asset, material({"weights_file": name}, roughness=0.1), base_directory=tmp_path)
+    weights.tofile(tmp_path / "painted.f32")
+    painted_over = pose(asset, material({"weights_file": "painted.f32"}, roughness=0.1), base_directory=tmp_path)
+    assert torch.equal(painted_over.mesh.roughness, asset.mesh.roughness), "a file that was changed is read again"

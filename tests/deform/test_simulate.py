@@ -60,6 +60,7 @@ def test_an_object_in_free_fall_moves_rigidly_and_as_far_as_gravity_says():
     assert torch.allclose(frame.centers, frame.vertices[asset.mesh.faces.long()].mean(1), atol=2e-2)
 
 
+@pytest.mark.slow
 def test_jelly_on_the_floor_sags_under_its_weight_and_rubber_less():
     sag = {}
     for preset in ("jelly", "rubber"):
@@ -130,6 +131,7 @@ def test_an_object_that_nothing_moves_keeps_its_tensors():
     assert report.substeps == 0 and all(frame.vertices is asset.mesh.vertices for frame in frames)
 
 
+@pytest.mark.slow
 def test_regions_hold_another_matter_and_acts_hold_parts_in_place():
     hold = {"shape": {"box": {"minimum": [1, -2, 5.2], "maximum": [3, 0, 6]}}, "effect": "sticky"}
     hanging = Simulation(ball_asset(), scene(floor=None, acts=[hold], matter={"preset": "rubber"})).at(0.3)
@@ -141,6 +143,7 @@ def test_regions_hold_another_matter_and_acts_hold_parts_in_place():
         Simulation(ball_asset(), scene(regions=[region | {"shape": {"sphere": {"center": [9, 9, 9], "radius": 1}}}]))
 
 
+@pytest.mark.slow
 def test_pinned_vertices_stay_and_the_rest_hangs_from_them():
     asset = ball_asset()
     rest = asset.mesh.vertices
@@ -197,6 +200,7 @@ def step_mesh():
     return {"vertices": block.vertices.tolist(), "faces": block.faces.tolist()}
 
 
+@pytest.mark.slow
 def test_a_ball_lands_on_a_mesh_as_on_the_floor(tmp_path):
     act = {"shape": {"mesh": step_mesh()}, "effect": "separate", "friction": 0.5}
     floor = Simulation(ball_asset(surfels=False), scene()).at(0.3)
@@ -211,6 +215,7 @@ def test_a_ball_lands_on_a_mesh_as_on_the_floor(tmp_path):
     assert float((of_file.mesh.vertices - on_mesh.vertices).abs().max()) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_changed_collider_is_read_again_and_strangers_name_none(tmp_path):
     asset = ball_asset(surfels=False)
     act = {"shape": {"mesh": {"file": "block.obj"}}, "effect": "sticky"}
@@ -238,6 +243,7 @@ def test_a_region_may_be_a_mesh():
     assert torch.equal(models[0].laws, models[1].laws) and int((models[0].laws == 1).sum()) > 0
 
 
+@pytest.mark.slow
 def test_a_body_that_came_to_rest_sleeps_until_something_acts():
     drifting = scene(floor=None, gravity=0.0, velocity=[0.05, 0, 0], damping=60.0, duration=1.0)
     frames, report = simulate(ball_asset(), drifting)
@@ -249,6 +255,7 @@ def test_a_body_that_came_to_rest_sleeps_until_something_acts():
     assert float((awake[-1].vertices - frames[-1].vertices)[:, 2].mean()) > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["sand", "honey"])
 def test_normals_of_matter_that_flows_are_those_of_the_surface_that_it_has_become(preset):
     frame = Simulation(ball_asset(), scene(matter={"preset": preset}, particles=800)).at(0.4)

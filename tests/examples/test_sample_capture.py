@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from drgs.build.load_views import load_cameras, load_views
+from drgs.reconstruct.capture.load_views import load_cameras, load_views
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CAPTURE = EXAMPLES / "sample_capture"

@@ -9,7 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from drgs.build.import_mesh import import_mesh
+from drgs.convert.import_mesh import import_mesh
 from drgs.exchange.exr import decode_environment
 from drgs.exchange.glb import GlbMesh, decode_glb, encode_glb
 from drgs.exchange.npz import read_npz_frames

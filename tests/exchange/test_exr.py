@@ -1,8 +1,10 @@
+import tracemalloc
+
 import numpy as np
 import OpenEXR
 import pytest
 
-from drgs.exchange.exr import decode_environment, decode_exr, decode_hdr, encode_environment, encode_exr, encode_maps
+from drgs.exchange.exr import decode_environment, decode_exr, decode_hdr, encode_environment, encode_exr, encode_maps, picture_size
 
 
 def sky(height: int = 4) -> np.ndarray:
@@ -110,3 +112,49 @@ def test_a_damaged_file_prints_nothing_on_stdout(capsys):
     with pytest.raises(ValueError, match="OpenEXR"):
         decode_environment(encode_environment(sky(32))[:-200])
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("value", [1.1e12, -1e13, 3e38])
+def test_texels_beyond_any_light_are_refused_with_how_bright_they_are(value):
+    picture = sky()
+    picture[1, 2, 0] = value
+    with pytest.raises(ValueError, match=r"sun\.exr: holds 1 values up to .*; expected at most 1e\+12"):
+        decode_environment(encode_environment(picture), "sun.exr")
+
+
+def test_the_brightest_light_is_taken():
+    picture = np.full((2, 4, 3), 1e12, np.float32)
+    np.testing.assert_array_equal(decode_environment(encode_environment(picture)), picture)
+
+
+def old_runs(width: int, height: int) -> bytes:
+    """A Radiance file of one colour in the oldest run lengths: twelve bytes a row, however long."""
+    row = bytes([10, 20, 30, 128, 1, 1, 1, (width - 1) & 255, 1, 1, 1, (width - 1) >> 8])
+    return b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (height, width) + row * height
+
+
+def test_a_picture_that_claims_more_than_its_file_can_hold_is_refused_before_it_is_read() -> None:
+    data = old_runs(16384, 8192)
+    assert len(data) < 110_000
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"16384x8192 take 1610612736 bytes in memory, more than 1100 times the file's"):
+        decode_environment(data, "sky.hdr")
+    assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    tracemalloc.stop()
+    small = decode_environment(old_runs(512, 256), "sky.hdr")
+    assert small.shape == (256, 512, 3) and np.ptp(small, axis=(0, 1)).max() == 0, "small ones may be packed as well as they like"
+
+
+def test_rows_that_are_turned_into_floats_a_few_at_a_time_are_the_same() -> None:
+    random = np.random.default_rng(0)
+    pixels = random.integers(0, 256, (150, 20, 4), np.uint8)
+    pixels[..., 0] = 9  # no run, and no new run length
+    found = decode_hdr(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 150 +X 20\n" + pixels.tobytes())
+    exact = np.where(pixels[..., 3:] > 0, pixels[..., :3] * np.ldexp(np.float32(1), pixels[..., 3:].astype(np.int32) - 136), 0)
+    np.testing.assert_array_equal(found, exact.astype(np.float32))
+
+
+def test_a_size_is_read_from_the_head_of_either_format() -> None:
+    assert picture_size(old_runs(512, 32)) == (512, 32)
+    assert picture_size(encode_environment(np.ones((8, 16, 3), np.float32))) == (16, 8)
+    assert picture_size(b"nonsense") is None and picture_size(b"#?RADIANCE\n\n") is None

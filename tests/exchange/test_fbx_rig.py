@@ -65,6 +65,7 @@ def test_a_bent_bone_turns_what_follows_it_alone_about_the_joint(ufbx, tmp_path)
         assert np.allclose(moved[rest[:, 1] < 0.5], rest[rest[:, 1] < 0.5], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clip", ["rig.fbx#Bend", "rig.FBX"])
 def test_a_pose_edit_moves_an_object_by_fbx_as_by_gltf(ufbx, tmp_path, clip):
     two_bones_in_fbx().save(tmp_path / clip.split("#")[0])
@@ -80,6 +81,7 @@ def test_a_pose_edit_moves_an_object_by_fbx_as_by_gltf(ufbx, tmp_path, clip):
     assert torch.equal(scene(clip, 0.0).mesh.vertices, asset.mesh.vertices)
 
 
+@pytest.mark.slow
 def test_any_up_axis_and_unit_become_y_up_and_metres(ufbx, tmp_path):
     for name, writer, expected in (
         ("y up, metres", FbxWriter("y", 100.0), SQUARE),
@@ -144,6 +146,7 @@ def test_the_part_that_is_played_begins_at_zero_and_ends_with_the_take(ufbx, tmp
     assert found == pytest.approx([1, 2, 2.5, 2.5])
 
 
+@pytest.mark.slow
 def test_morph_targets_add_up_and_what_no_curve_moves_keeps_its_place(ufbx, tmp_path):
     writer = FbxWriter(unit_centimeters=100.0)
     node, shape = square(writer, GeometricRotation=(0, 0, 90))
@@ -172,6 +175,7 @@ def test_vertices_that_no_bone_holds_follow_their_node(ufbx, tmp_path):
     assert np.allclose(posed(writer, tmp_path, 1.0), expected)
 
 
+@pytest.mark.slow
 def test_what_is_not_read_is_refused_by_name(ufbx, tmp_path):
     def refusal(writer: FbxWriter) -> str:
         with pytest.raises(ValueError, match=r"rig\.fbx: ") as found:
@@ -189,6 +193,7 @@ def test_what_is_not_read_is_refused_by_name(ufbx, tmp_path):
     assert "shapes in between" in refusal(writer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "content", [b"", b"hello", b"; FBX 7.4.0 project file\n", b"Kaydara FBX Binary  \0\x1a\0\xe8\x1c\0\0" + b"\xff" * 64]
 )
@@ -211,5 +216,5 @@ def test_a_reader_that_crashes_harms_nobody(ufbx, tmp_path, monkeypatch):
 
 def test_without_the_package_the_refusal_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setattr(fbx_rig, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"rig\.fbx: reading FBX needs the package ufbx; install it with: pip install 'drgs\[fbx\]'"):
+    with pytest.raises(ValueError, match=r"rig\.fbx: reading FBX needs the package ufbx; install it with: .*\[fbx\]'"):
         read_fbx_rig(two_bones_in_fbx().save(tmp_path / "rig.fbx"))

@@ -5,7 +5,7 @@ import warp as wp
 from torch import Tensor
 
 from drgs.maths.brdf import evaluate_brdf
-from drgs.render.brdf_warp import alpha_of, specular_brdf
+from drgs.render.integrate.brdf_warp import alpha_of, specular_brdf
 from drgs.warp_torch import warp_array
 
 COUNT = 4000

@@ -53,6 +53,7 @@ def test_cosine_samples_follow_their_density() -> None:
     assert_samples_follow(sample_cosine(torch.rand(200_000, 2, dtype=torch.float64)), mass)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [0.5, 0.7, 1.0])
 @pytest.mark.parametrize("polar_degrees", [0.0, 40.0, 75.0, 88.0])
 def test_ggx_samples_follow_their_density(roughness: float, polar_degrees: float) -> None:

@@ -50,6 +50,18 @@ def mesh_of(shape: trimesh.Trimesh, albedo: float, roughness: float, metallic: f
     )
 
 
+def crumpled_mesh() -> TriangleMesh:
+    """A ball with bumps, its materials all different; bare dielectrics below."""
+    shape = trimesh.creation.icosphere(2)
+    numbers = torch.Generator().manual_seed(3)
+    shape.vertices *= (1 + 0.2 * torch.rand(len(shape.vertices), 1, generator=numbers)).numpy()
+    mesh = mesh_of(shape, 0.7, 0.5, 0.0)
+    count = len(mesh.vertices)
+    albedo, roughness = torch.rand(count, 3, generator=numbers), torch.rand(count, generator=numbers)
+    metallic = torch.where(mesh.vertices[:, 2] < 0, 0.0, torch.rand(count, generator=numbers))
+    return TriangleMesh(mesh.vertices, mesh.faces, mesh.normals, albedo, roughness, metallic)
+
+
 def on_device(mesh: TriangleMesh, device: str) -> TriangleMesh:
     return TriangleMesh(*(getattr(mesh, name).to(device) for name in ("vertices", "faces", "normals", "albedo", "roughness", "metallic")))
 

@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from drgs.maths.color import srgb_from_linear
-from drgs.render.accumulate import RenderSettings, refine_frame, resolve_frame, start_frame
-from drgs.render.records import GBuffer
+from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.progressive.refine import refine_frame
+from drgs.render.progressive.start_frame import start_frame
+from drgs.render.records import GBuffer, RenderSettings, SampleCounts
 from drgs.render.render_frame import render_frame
-from drgs.render.sample_rays import SampleCounts
-from drgs.render.trace_primary import trace_primary
+from drgs.render.visible.trace_primary import trace_primary
 from drgs.scene.camera import Camera, pixel_rays_world
 from drgs.scene.environment import Environment, environment_radiance, rotate_environment
 from drgs.scene.posed_scene import PosedScene
@@ -51,7 +52,7 @@ def test_refining_twice_is_refining_by_two_passes() -> None:
     start = start_frame(scene, front_camera(distance=8), RenderSettings(seed=3))
     apart, at_once = refine_frame(refine_frame(start)), refine_frame(start, 2)
     assert torch.equal(resolve_frame(apart).radiance_linear, resolve_frame(at_once).radiance_linear)
-    assert start.passes == 0 and float(start.weight.max()) == 0  # the given state is left alone
+    assert start.passes == 0 and float(start.sums.weight.max()) == 0  # the given state is left alone
 
 
 @pytest.mark.parametrize("bounces", [0, 1])
@@ -64,7 +65,7 @@ def test_passes_side_by_side_are_those_one_after_another(bounces: int) -> None:
     at_once = refine_frame(at_once, 5)
     assert at_once.passes == 6
     for name in ("diffuse", "specular", "weight", "luminance_squared", "scatter", "visibility", "surface"):
-        assert torch.equal(getattr(apart, name), getattr(at_once, name))
+        assert torch.equal(getattr(apart.sums, name), getattr(at_once.sums, name))
 
 
 def test_same_seed_same_bits_on_the_cpu() -> None:
@@ -74,6 +75,7 @@ def test_same_seed_same_bits_on_the_cpu() -> None:
     assert not torch.equal(a.rgba_srgb, other.rgba_srgb)
 
 
+@pytest.mark.slow
 def test_error_falls_as_samples_grow_and_the_variance_says_so() -> None:
     scene = PosedScene(None, sphere_mesh(4), sunny_sky(sun=20.0))
     exact = render_frame(scene, front_camera(), RenderSettings(samples_per_pixel=4096, bounces=0, seed=99))

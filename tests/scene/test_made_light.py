@@ -10,7 +10,7 @@ from drgs.scene.environment import Environment, direction_from_uv, environment_r
 from drgs.scene.lat_long import direction_of_degrees, texel_directions, texel_means, texel_solid_angles
 from drgs.scene.sun_and_sky import AZIMUTH_DEGREES, RADIUS_DEGREES, UNIT, paint_sun_and_sky, sky_radiance, sun_irradiance, sun_share
 from drgs.scene.three_point_lights import FILL, KEY, RIM, paint_three_point_lights
-from worker.start_view import start_view
+from drgs_worker.jobs.start_view import start_view
 
 HALF_FLOAT_MAX = 65504
 

@@ -9,11 +9,11 @@ from painter import Painter
 from sqlalchemy.orm import Session
 from starlette.testclient import TestClient
 
-from server.app import create_app
-from server.context import ServerContext
-from server.settings import ServerSettings
-from worker.data_directory import read_token
-from worker.database import AssetRow, now
+from drgs_server.api.context import ServerContext
+from drgs_server.app import create_app
+from drgs_server.settings import ServerSettings
+from drgs_worker.store.data_directory import read_token
+from drgs_worker.store.database import AssetRow, now
 
 
 class Service:

@@ -2,18 +2,19 @@
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from drgs.scene.edits import DeformEdit, Edit
-from server.messages import CameraMessage, Settings
-from server.render_session import (
+from drgs.scene.edits import DeformEdit, Edit, SimulateEdit
+from drgs_server.live.messages import CameraMessage, Settings
+from drgs_server.render.interface import (
     AbstractLoadedAsset,
     AbstractPicture,
     AbstractPose,
     AbstractRenderer,
+    AbstractStill,
     Bounds,
     Explanation,
     LinearPixels,
@@ -29,14 +30,27 @@ class Painter(AbstractRenderer):
     def __init__(self, pass_seconds: float = 0.0) -> None:
         self.pass_seconds = pass_seconds
         self.pose_seconds = 0.0
+        self.simulation_seconds = 0.0
         self.loads = 0
+        self.recalled: list[int] = []
+        """How many edits of a long log were known from a file, each time that one was opened."""
+        self.light_bytes = 0
         self.prepared = 0
+        self.stills = 0
+        self.slices = 0
+        """Of work on stills."""
         self.begun: list[tuple[int, int]] = []
         self.threads: set[str] = set()
 
     def load(self, folder: Path, environments: Path) -> "PaintedAsset":
         self.loads += 1
         return PaintedAsset(self)
+
+    def environment_bytes(self) -> int:
+        return self.light_bytes
+
+    def forget_environments(self) -> None:
+        self.light_bytes = 0
 
     def prepare(self) -> None:
         self.prepared += 1
@@ -48,11 +62,24 @@ class PaintedAsset(AbstractLoadedAsset):
         self.bounds = BOUNDS
         self.start_view = view_of_bounds(BOUNDS)
 
-    def pose(self, edits: Sequence[Edit], previous: AbstractPose | None) -> "PaintedPose":
+    def pose(self, edits: Sequence[Edit], previous: AbstractPose | None, go_on: Callable[[], None] | None = None) -> "PaintedPose":
         if any(isinstance(edit, DeformEdit) for edit in edits):
             raise ValueError("This asset is made of stone.")
         time.sleep(self.painter.pose_seconds)
+        if go_on is not None and any(isinstance(edit, SimulateEdit) for edit in edits):
+            began = time.monotonic()
+            while time.monotonic() - began < self.painter.simulation_seconds:
+                go_on()
+                time.sleep(0.01)
         return PaintedPose(self.painter, len(edits))
+
+    def keep(self, edits: Sequence[Edit], path: Path) -> None:
+        path.write_text(str(len(edits)))
+
+    def recall(self, edits: Sequence[Edit], path: Path) -> bool:
+        known = path.is_file() and int(path.read_text()) <= len(edits)
+        self.painter.recalled.append(int(path.read_text()) if known else 0)
+        return known
 
 
 class PaintedPose(AbstractPose):
@@ -63,6 +90,25 @@ class PaintedPose(AbstractPose):
     def begin(self, camera: CameraMessage, settings: Settings, width: int, height: int, previous: AbstractPicture | None) -> "Painting":
         self.painter.begun.append((width, height))
         return Painting(self, settings, width, height)
+
+    def still(self, camera: CameraMessage, settings: Settings, width: int, height: int, linear: bool) -> "PaintedStill":
+        self.painter.stills += 1
+        return PaintedStill(Painting(self, settings, width, height), linear)
+
+
+class PaintedStill(AbstractStill):
+    def __init__(self, painting: "Painting", linear: bool) -> None:
+        self.painting, self.linear = painting, linear
+
+    def work(self) -> bool:
+        if self.painting.samples >= self.painting.samples_target:
+            return False
+        self.painting.refine()
+        self.painting.pose.painter.slices += 1
+        return True
+
+    def picture(self) -> Pixels | LinearPixels:
+        return self.painting.linear() if self.linear else self.painting.resolve()
 
 
 class Painting(AbstractPicture):

@@ -9,16 +9,16 @@ import torch
 import trimesh
 
 from drgs.maths.color import srgb_from_linear
+from drgs.render.film.resolve_frame import resolve_frame
 from drgs.scene.asset import Asset
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh
-from server.channels import HEAT_SRGB, heat
-from server.drgs_renderer import LoadedAsset, Picture, Pose
-from server.indirect_picture import IndirectPicture
-from server.messages import LEAST_SHOWN_ERROR, CameraMessage, Channel, Settings
-from server.render_session import AbstractPicture
-from server.surfel_picture import NO_SURFELS
-from tests.build.surfel_spheres import surfel_sphere
+from drgs_server.live.messages import LEAST_SHOWN_ERROR, CameraMessage, Channel, Settings
+from drgs_server.render.channels import HEAT_SRGB, heat
+from drgs_server.render.drgs_renderer import LoadedAsset, Picture, Pose
+from drgs_server.render.interface import AbstractPicture
+from drgs_server.render.surfel_picture import NO_SURFELS
+from tests.reconstruct.surfel_spheres import surfel_sphere
 from tests.render.closed_form_scenes import constant_sky, mesh_of, sphere_mesh, sunny_sky, two_spheres
 
 SIDE = 32
@@ -68,8 +68,8 @@ def test_a_ball_alone_has_no_indirect_light_and_between_two_it_is_what_bounces_a
     assert seen(picture_of(posed(sphere_mesh(), sunny_sky()), "indirect", spp_target=16, bounces=2, denoise=False)).max() == 0
     pose, light = posed(two_spheres(), sunny_sky()), {"denoise": False, "spp_target": 32}
     indirect = picture_of(pose, "indirect", **light)
-    assert isinstance(indirect, IndirectPicture) and indirect.whole.samples == indirect.direct.samples == 32
-    whole, direct = (picture_of(pose, "final", bounces=bounces, **light).frame().radiance_linear for bounces in (1, 0))
+    assert isinstance(indirect, Picture) and indirect.samples == 32
+    whole, direct = (resolve_frame(picture_of(pose, "final", bounces=bounces, **light).state).radiance_linear for bounces in (1, 0))
     added = srgb_from_linear((whole - direct).clamp(0, 1)).numpy()
     shown = indirect.resolve()
     covered = shown[..., 3] == 255
@@ -117,3 +117,25 @@ def test_surfels_are_shown_in_many_colours_and_the_next_picture_goes_on_with_the
 def test_a_mesh_has_no_surfels_and_says_so() -> None:
     picture = picture_of(posed(sphere_mesh()), "surfels")
     assert picture.resolve().max() == 0 and picture.notes == (NO_SURFELS,)
+
+
+@pytest.mark.parametrize(
+    ("change", "computed"),
+    [
+        ({"exposure_stops": 1.0, "tone_curve": "agx", "background": "transparent"}, ()),
+        ({"spp_target": 64, "denoise": False}, ()),
+        ({"channel": "variance"}, ()),
+        ({"channel": "indirect"}, ("sums",)),
+        ({"bounces": 2}, ("view", "materials", "plan", "first_rays", "sums")),
+        ({"channel": "albedo"}, ("view", "materials", "plan", "first_rays", "sums")),
+        ({"channel": "visibility"}, ("view", "materials", "environment_table", "light", "plan", "first_rays", "sums")),
+    ],
+    ids=lambda value: "+".join(value) if isinstance(value, dict) else "",
+)
+def test_a_change_of_settings_computes_what_the_renderers_table_says_and_nothing_else(change: dict, computed: tuple[str, ...]) -> None:
+    pose = posed(two_spheres(), sunny_sky())
+    final = picture_of(pose, "final", spp_target=16)
+    message = CameraMessage(type="camera", number=7, world_from_camera=FRONT, fov_y_degrees=40, width=SIDE, height=SIDE)
+    after = pose.begin(message, Settings(**{"channel": "final", "spp_target": 16, **change}), SIDE, SIDE, final)
+    assert isinstance(after, Picture) and after.state.computed_parts == computed
+    assert after.samples == (0 if "sums" in computed else final.samples)

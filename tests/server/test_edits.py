@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drgs.scene.edits import parse_edits
-from server.edit_log import EditLog, NothingToDo, Splice
+from drgs_server.live import sessions
+from drgs_server.live.edit_log import ChangeQueue, ChangeRequest, EditLog, NothingToDo, Splice
 
 
 def material(roughness: float) -> dict:
@@ -61,6 +62,7 @@ def test_the_log_behaves_like_two_stacks(kinds: list[str]) -> None:
         assert (log.done, log.undone, log.revision) == (tuple(done), tuple(undone), count)
 
 
+@pytest.mark.slow
 def test_edits_over_rest_are_numbered_and_undone(service: Service) -> None:
     url = f"/api/sessions/{service.open_session()}"
     for k in (1, 2, 3):
@@ -106,12 +108,12 @@ def test_edits_of_one_drag_are_one_step(service: Service) -> None:
     async def drag() -> None:
         session = await sessions.get(session_id)
         for edit in EDITS[:5]:
-            await sessions.apply(session, "edit", edit, coalesce="roughness")
+            await sessions.apply(session, ChangeRequest("edit", edit, gesture="roughness"))
         assert session.log.done == (EDITS[4],) and session.log.revision == 5
-        await sessions.apply(session, "edit", EDITS[5], coalesce="metallic")
+        await sessions.apply(session, ChangeRequest("edit", EDITS[5], gesture="metallic"))
         assert session.log.done == (EDITS[4], EDITS[5])
-        await sessions.apply(session, "undo")
-        await sessions.apply(session, "edit", EDITS[6], coalesce="metallic")
+        await sessions.apply(session, ChangeRequest("undo"))
+        await sessions.apply(session, ChangeRequest("edit", EDITS[6], gesture="metallic"))
         assert session.log.done == (EDITS[4], EDITS[6])
 
     service.client.portal.call(drag)
@@ -123,7 +125,7 @@ def test_concurrent_edits_get_one_order(service: Service) -> None:
 
     async def crowd() -> list[int]:
         session = await sessions.get(session_id)
-        answers = await asyncio.gather(*(sessions.apply(session, "edit", edit) for edit in EDITS))
+        answers = await asyncio.gather(*(sessions.apply(session, ChangeRequest("edit", edit)) for edit in EDITS))
         assert [len(answer.log.edits) for answer in answers] == [answer.revision for answer in answers]
         return [answer.revision for answer in answers]
 
@@ -173,6 +175,7 @@ def test_a_snapshot_is_restored_as_one_step_of_undo_and_survives_a_crash(service
     assert missing.status_code == 404 and "no snapshot" in missing.json()["detail"]
 
 
+@pytest.mark.slow
 def test_many_edits_undone_and_redone_end_as_their_replay_does(service: Service) -> None:
     session_id, sessions, chooser = service.open_session(), service.context.sessions, random.Random(7)
 
@@ -181,7 +184,9 @@ def test_many_edits_undone_and_redone_end_as_their_replay_does(service: Service)
         for _ in range(600):
             kind = chooser.choices(["edit", "undo", "redo"], [6, 3, 1])[0]
             usable = {"undo": session.log.entries, "redo": session.log.undone}.get(kind, True)
-            await sessions.apply(session, kind if usable else "edit", None if usable and kind != "edit" else chooser.choice(EDITS))  # type: ignore[arg-type]
+            takes_edit = kind == "edit" or not usable
+            request = ChangeRequest("edit", chooser.choice(EDITS)) if takes_edit else ChangeRequest(kind)  # type: ignore[arg-type]
+            await sessions.apply(session, request)
         assert session.log.revision == 600
         assert sessions._replay(session_id).log == session.log
 
@@ -198,6 +203,7 @@ def test_a_server_whose_sessions_wait_prepares_its_renderer(tmp_path: Path) -> N
     assert (first.painter.prepared, again.painter.prepared) == (0, 1)
 
 
+@pytest.mark.slow
 def test_a_long_pose_of_one_session_does_not_hold_up_the_pictures_of_another(service: Service) -> None:
     slow = service.open_session()
     quick = service.client.post("/api/sessions", json={"asset": "a" * 32}).json()["id"]
@@ -223,6 +229,24 @@ def test_a_session_that_another_server_changed_is_not_overwritten(tmp_path: Path
         assert stale.status_code == 409 and "open it again" in stale.json()["detail"]
         again = one.client.post(f"{url}/edits", json={"edit": material(0.4)}).json()
         assert again["revision"] == 3 and roughnesses(again) == [0.1, 0.2, 0.4]
+
+
+def test_what_another_server_deleted_is_neither_edited_nor_shown_here(tmp_path: Path) -> None:
+    one, two = Service(tmp_path), Service(tmp_path)
+    with one.client, two.client:
+        session = one.open_session()
+        url = f"/api/sessions/{session}"
+        assert one.client.post(f"{url}/edits", json={"edit": material(0.1)}).status_code == 200
+        assert two.client.delete(f"/api/assets/{'a' * 32}").status_code == 204
+        refused = one.client.post(f"{url}/edits", json={"edit": material(0.2)})
+        assert refused.status_code == 404 and "was deleted" in refused.json()["detail"]
+        assert one.client.get(url).status_code == 404
+        two.client.post(f"/api/assets/{'a' * 32}/undelete")
+        assert roughnesses(one.client.get(url).json()) == [0.1]
+        two.client.delete(f"/api/assets/{'a' * 32}")
+        live = one.context.sessions._live[session]
+        one.client.portal.call(one.context.sessions.forget_deleted)
+        assert live.gone.is_set() and one.client.get(f"{url}/frame.png?width=16&height=16&spp=4").status_code == 404
 
 
 def test_a_splice_is_one_step_of_undo_and_says_what_undo_and_redo_take_one_by_one() -> None:
@@ -255,3 +279,57 @@ def test_edits_put_in_place_of_others_come_back_after_a_crash_and_not_over_newer
     service.context.sessions._live.clear()  # as after a crash: only the database is left
     replayed = service.client.get(f"/api/sessions/{session}").json()
     assert roughnesses(replayed) == [0.2, 0.3] and replayed["revision"] == 2
+
+
+def test_a_change_replaces_the_newest_of_its_gesture_in_the_log_and_no_other() -> None:
+    drag = [ChangeRequest("edit", edit, gesture="drag") for edit in EDITS[:3]]
+    log = EditLog().with_request(drag[0]).with_request(drag[1])
+    assert (log.done, log.revision, log.event_of(drag[2])) == ((EDITS[1],), 2, "replace")
+    for between in (ChangeRequest("edit", EDITS[5]), ChangeRequest("edit", EDITS[5], gesture="other"), ChangeRequest("undo")):
+        assert log.with_request(between).event_of(drag[2]) == "edit"
+    splice = ChangeRequest("splice", Splice(0, 1, (EDITS[4],)), gesture="drag")
+    assert log.event_of(splice) == "splice", "a splice is a step of its own beside an edit"
+    assert log.with_request(splice).event_of(splice) == "replace"
+    assert EditLog().after("edit", EDITS[0]).event_of(drag[1]) == "edit", "a gesture ends with the process"
+
+
+def test_a_change_that_waits_gives_its_place_to_the_next_of_its_gesture_and_both_are_answered() -> None:
+    def edit(number: int, gesture: str | None = None, key: str | None = None) -> ChangeRequest:
+        return ChangeRequest("edit", EDITS[number], gesture, key)
+
+    async def walk() -> None:
+        queue = ChangeQueue(room=6)
+        splices = [ChangeRequest("splice", Splice(0, 0, ()), "film", revision=revision) for revision in (3, 4)]
+        requests = [edit(0, "a"), edit(1, "a"), edit(2, "b", "kept"), edit(3, "b"), edit(4), ChangeRequest("undo"), *splices[:1]]
+        for number, request in enumerate(requests):
+            await queue.put(request, number)
+        late = asyncio.create_task(queue.put(splices[1], 7))
+        await asyncio.sleep(0)
+        assert not late.done(), "there is room for six"
+        taken = [await queue.take() for _ in range(6)]
+        await late
+        taken.append(await queue.take())
+        await queue.close()
+        assert [(waiting.message_ids, waiting.request) for waiting in taken if waiting] == [
+            ((0, 1), requests[1]), ((2,), requests[2]), ((3,), requests[3]), ((4,), requests[4]), ((5,), requests[5]), ((6,), splices[0]),
+            ((7,), splices[1]),
+        ]  # fmt: skip
+        assert await queue.take() is None
+
+    asyncio.run(walk())
+
+
+def test_a_long_log_is_opened_from_what_was_kept_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "LONG_LOG", 8)
+    monkeypatch.setattr(sessions, "KEEP_EVERY", 4)
+    service = Service(tmp_path)
+    with service.client:
+        session = service.open_session()
+        for _ in range(10):
+            assert service.client.post(f"/api/sessions/{session}/edits", json={"edit": material(0.5)}).status_code == 200
+    again = Service(tmp_path)
+    with again.client:
+        assert again.client.get(f"/api/sessions/{session}/frame.png?width=16&height=16&spp=4").status_code == 200
+        assert again.painter.recalled == [8], "the newest multiple of four"
+        assert again.client.delete(f"/api/sessions/{session}").status_code == 204
+        assert not list(again.context.directory.poses.iterdir())

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from starlette.websockets import WebSocketDisconnect
 from test_stream import Talk, camera, material
 
-from server.messages import ClientMessage
+from drgs_server.live.messages import ClientMessage
 
 schemathesis = pytest.importorskip("schemathesis", reason="needs the package schemathesis: pip install -e '.[dev]'")
 
@@ -46,6 +46,7 @@ def send(service: Service, case: Any) -> Any:
     return service.client.request(given["method"], given["url"], **wanted)
 
 
+@pytest.mark.slow
 def test_no_request_that_the_openapi_document_allows_ends_in_a_server_error(service: Service) -> None:
     document = json.loads(json.dumps(service.app.openapi()))
     schema = schemathesis.openapi.from_dict(document)
@@ -113,6 +114,7 @@ def messages(draw: st.DrawFn) -> str | bytes:
     return json.dumps(message)
 
 
+@pytest.mark.slow
 def test_a_server_that_was_sent_nonsense_still_answers(service: Service) -> None:
     session = service.open_session()
 
@@ -132,6 +134,7 @@ def test_a_server_that_was_sent_nonsense_still_answers(service: Service) -> None
     assert service.client.get(f"/api/sessions/{session}").status_code == 200
 
 
+@pytest.mark.slow
 @settings(QUIET, max_examples=15)
 @given(said=st.lists(messages(), min_size=1, max_size=1))
 def test_a_first_message_that_is_no_hello_is_refused_with_a_sentence(said: list[str | bytes]) -> None:

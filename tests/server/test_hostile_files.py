@@ -19,7 +19,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from worker import file_tool
+from drgs_worker.jobs import file_tool
 
 MOST_BYTES = 1 << 30
 """Resident memory that refusing one file may add."""
@@ -122,6 +122,8 @@ ENVIRONMENTS: dict[str, bytes] = {
     "no size.hdr": hdr(b"\n"),
     "negative size.hdr": hdr(b"-Y -2 +X 4\n"),
     "truncated.hdr": hdr(body=b"\1\1"),
+    "sixteen thousand in twelve bytes a row.hdr": hdr(b"-Y 8192 +X 16384\n", b"\12\24\36\200\1\1\1\377\1\1\1\77" * 8192),
+    "larger than a service takes.hdr": hdr(b"-Y 5000 +X 10000\n", bytes(1 << 20)),
     "a run longer than its row.hdr": hdr(b"-Y 8 +X 16\n", b"\2\2\0\x10" + b"\xff\1" * 400),
 }
 MESHES: dict[str, bytes] = {
@@ -198,7 +200,14 @@ def test_a_hostile_asset_or_mesh_is_refused(refuse: Callable[[str, str, bytes], 
     refuse("asset", name, MESHES[name])
 
 
+def test_the_memory_of_an_environment_is_estimated_by_what_its_header_claims(tmp_path: Path) -> None:
+    (tmp_path / "small.hdr").write_bytes(hdr())
+    (tmp_path / "large.hdr").write_bytes(hdr(b"-Y 4096 +X 8192\n", b""))
+    small, large = (file_tool.file_tool_bytes(tmp_path / f"{name}.hdr") for name in ("small", "large"))
+    assert small < 128 << 20 < 1 << 30 < large < 2 << 30
+
+
 def test_the_tool_cannot_take_more_memory_than_its_limit() -> None:
-    code = "import resource\nfrom worker import file_tool\nfile_tool.make_asset = lambda *_: bytearray(1 << 36)\nimport sys\nsys.exit(file_tool.main(['asset', 'a', 'b']))"
+    code = "import resource\nfrom drgs_worker.jobs import file_tool\nfile_tool.make_asset = lambda *_: bytearray(1 << 36)\nimport sys\nsys.exit(file_tool.main(['asset', 'a', 'b']))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and "more memory than the 16 GiB" in done.stderr

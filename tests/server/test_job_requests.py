@@ -7,8 +7,8 @@ import pytest
 from conftest import Service
 from test_rest import is_problem
 
-from worker import jobs
-from worker.builders import build_with_drgs
+from drgs_worker.jobs import workflows as jobs
+from drgs_worker.jobs.builders import build_with_drgs
 
 ASSET = "a" * 32
 RENDER = {"kind": "render", "asset": ASSET}
@@ -52,6 +52,7 @@ CAMERA = {"name": "a", "world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 
 VIEW = {"eye": [0, -3, 1], "target": [0, 0, 0]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("request_", "status", "words"),
     [
@@ -101,3 +102,22 @@ def test_results_are_listed_downloaded_in_ranges_and_deleted_with_their_job(serv
     service.client.post(f"{url}/cancel")
     assert service.client.delete(url).status_code == 204
     assert not folder.exists() and service.client.get(url).status_code == 404
+
+
+TILTED = [[1, 0, 0, 0], [0, 1, 0.2, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+TWICE = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 3], [0, 0, 0, 1]]
+FLAT = [[0] * 4] * 4
+PROJECTIVE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0.5, 1]]
+FAR = [[1, 0, 0, 1e30], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize("matrix", [TILTED, MIRRORED, TWICE, FLAT, PROJECTIVE, FAR])
+def test_a_render_refuses_cameras_that_are_not_rigid(matrix: list, service: Service) -> None:
+    service.add_asset(ASSET)
+    response = service.client.post("/api/jobs", json=RENDER | {"cameras": [{"name": "a", "world_from_camera": matrix}]})
+    assert response.status_code == 422, response.text
+    assert "world_from_camera" in response.json()["detail"] or "cameras" in response.json()["detail"]
+    query = ",".join(str(number) for row in matrix for number in row)
+    session = service.client.post("/api/sessions", json={"asset": ASSET}).json()["id"]
+    assert service.client.get(f"/api/sessions/{session}/frame.jpg", params={"world_from_camera": query}).status_code == 422

@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from server.pace import Pace
+from drgs_server.live.pace import Pace
 
 WIDTH, HEIGHT = 960, 720
 

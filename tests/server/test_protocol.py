@@ -4,12 +4,13 @@ import struct
 
 import pytest
 
-from server.generate_types import OUTPUT, typescript_from_schema, typescript_text
-from server.messages import FRAME_HEADER, FrameHeader, pack_frame, unpack_frame
+from drgs_server.generate_types import CONSTANTS_OUTPUT, OUTPUT, constants_text, typescript_from_schema, typescript_text
+from drgs_server.live.messages import FRAME_HEADER, FrameHeader, pack_frame, unpack_frame
 
 
 def test_the_generated_types_are_up_to_date() -> None:
-    assert OUTPUT.read_text() == typescript_text(), "run: python -m server.generate_types"
+    assert OUTPUT.read_text() == typescript_text(), "run: python -m drgs_server.generate_types"
+    assert CONSTANTS_OUTPUT.read_text() == constants_text(), "run: python -m drgs_server.generate_types"
 
 
 def test_the_frame_header_has_the_documented_layout() -> None:

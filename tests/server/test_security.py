@@ -7,12 +7,13 @@ import pytest
 from conftest import Service
 from starlette.websockets import WebSocketDisconnect
 
-from worker.settings import read_settings
+from drgs_worker.store.settings import read_settings
 
 OURS = "http://127.0.0.1:8000"
 PATHS = ["/api/jobs", "/api/assets", "/api/environments", "/api/sessions", "/api/openapi.json", "/api/docs", "/api/no-such-call"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PATHS)
 def test_nothing_below_api_answers_without_the_token(service: Service, path: str) -> None:
     response = service.anonymous.get(path)
@@ -31,14 +32,39 @@ def test_a_token_in_the_address_is_not_looked_at(service: Service) -> None:
     assert service.anonymous.get(f"/api/jobs?token={service.token}").status_code == 401
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "localhost.evil.example", "0.0.0.0:8000", ""]
+    "host",
+    [
+        *("evil.example", "evil.example:8000", "127.0.0.1.evil.example", "localhost.evil.example", "0.0.0.0:8000", ""),
+        *(
+            "localhost:",
+            "localhost:evil",
+            "localhost:8000:evil",
+            "localhost:80 evil",
+            "localhost:99999",
+            "localhost:-1",
+            "[::1]evil",
+            "evil@localhost",
+        ),
+    ],
 )
 def test_other_host_names_are_refused(service: Service, host: str) -> None:
     for path in ("/", "/healthz", "/api/jobs"):
         assert service.client.get(path, headers={"Host": host}).status_code == 400
 
 
+@pytest.mark.parametrize("name", ["Host", "Origin", "Authorization"])
+def test_what_decides_who_may_ask_is_said_once(service: Service, name: str) -> None:
+    said = {"Host": "127.0.0.1:8000", "Origin": OURS, "Authorization": f"Bearer {service.token}"}
+    request = service.anonymous.build_request("GET", "/api/jobs", headers=said)
+    assert service.anonymous.send(request).status_code == 200
+    for other in (said[name], "evil.example"):
+        request.headers = type(request.headers)([*said.items(), (name, other)])
+        assert service.anonymous.send(request).status_code == 400
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("host", ["localhost", "localhost:8000", "127.0.0.1:9", "[::1]:8000", "[::1]"])
 def test_our_host_names_are_answered(service: Service, host: str) -> None:
     assert service.client.get("/api/jobs", headers={"Host": host}).status_code == 200
@@ -99,12 +125,14 @@ def test_large_bodies_are_refused(service: Service) -> None:
     assert response.status_code == 413
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asset", ["../../token", "..%2f..%2ftoken", "%2e%2e", "a/../../token", "/etc/passwd"])
 def test_ids_are_no_paths(service: Service, asset: str) -> None:
     for name in ("", "/mesh.glb", "/thumb.jpg", "/export?format=zip"):
         assert service.client.get(f"/api/assets/{asset}{name}").status_code in (404, 405)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["../token", "..%2Ftoken", "token", ".hidden.exr", "a b.exr", "x" * 200 + ".exr"])
 def test_environment_names_are_no_paths(service: Service, name: str) -> None:
     assert service.client.get(f"/api/environments/{name}").status_code == 404
@@ -149,3 +177,19 @@ def test_a_token_from_the_settings_takes_the_place_of_the_folders_own(tmp_path: 
     assert answers == [200, 401] and "s3cret" not in repr(service.settings)
     with pytest.raises(ValueError, match="expected 32 characters or more"):
         read_settings(token="short")
+
+
+@pytest.mark.parametrize(
+    ("kept", "words"),
+    [("", "found 0"), ("\n", "found 0"), ("abc\n", "found 3"), ("a b" * 20, "without blanks"), ("\xe9" * 40, "without blanks")],
+)
+def test_a_token_file_that_is_easy_to_guess_ends_the_start(tmp_path: Path, kept: str, words: str) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "token").write_text(kept)
+    with pytest.raises(ValueError, match=f"the token in .*{words}.*; delete the file"):
+        Service(tmp_path)
+    (tmp_path / "data" / "token").write_bytes(b"\xff\xfe" * 40)
+    with pytest.raises(ValueError, match="it is not text"):
+        Service(tmp_path)
+    (tmp_path / "data" / "token").unlink()
+    assert len(Service(tmp_path).token) == 64

@@ -14,14 +14,14 @@ from pathlib import Path
 import psutil
 import pytest
 
-from drgs.client import Client, ServerError
+from drgs_server.client import Client, ServerError
+from drgs_server.run import serve
+from drgs_worker.jobs.builders import BUILDER_VARIABLE
 from examples import turntable, variants_sheet
-from server.run import serve
-from worker.builders import BUILDER_VARIABLE
 
 REPOSITORY = Path(__file__).parents[2]
 PATIENCE_SECONDS = 60.0
-PROGRAM = "import sys; from pathlib import Path; from server.run import serve; sys.exit(serve(Path(sys.argv[1]), port=0, ready=lambda a: print(a, flush=True)))"
+PROGRAM = "import sys; from pathlib import Path; from drgs_server.run import serve; sys.exit(serve(Path(sys.argv[1]), port=0, ready=lambda a: print(a, flush=True)))"
 
 
 class ServeProcess:
@@ -32,7 +32,7 @@ class ServeProcess:
         self.process: subprocess.Popen | None = None
 
     def start(self) -> Client:
-        paths = os.pathsep.join([str(REPOSITORY / "tests" / "worker"), str(REPOSITORY)])
+        paths = os.pathsep.join(str(REPOSITORY / folder) for folder in ("tests/worker", ".", "worker", "server"))
         environment = {**os.environ, BUILDER_VARIABLE: "tiny_builder:build", "PYTHONPATH": paths}
         self.process = subprocess.Popen(
             [sys.executable, "-c", PROGRAM, str(self.root / "data")], env=environment, cwd=self.root, stdout=subprocess.PIPE, text=True
@@ -49,7 +49,7 @@ class ServeProcess:
         assert self.process is not None
         start = time.monotonic()
         while time.monotonic() - start < PATIENCE_SECONDS:
-            found = [child for child in psutil.Process(self.process.pid).children() if "worker" in child.cmdline()]
+            found = [child for child in psutil.Process(self.process.pid).children() if "drgs_worker" in child.cmdline()]
             if found:
                 return found[0]
             time.sleep(0.05)
@@ -76,6 +76,7 @@ def capture(root: Path, **plan: object) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_build_survives_kill_9_of_the_worker_and_of_the_server(running: ServeProcess) -> None:
     client = running.start()
     job = client.submit_build(capture(running.root, iterations=60, seconds=0.04), preset="draft", idempotency_key="once")
@@ -107,6 +108,7 @@ def test_a_build_survives_kill_9_of_the_worker_and_of_the_server(running: ServeP
     assert running.stop() == 0
 
 
+@pytest.mark.slow
 def test_acknowledged_edits_are_there_after_kill_9_of_the_server(running: ServeProcess, tmp_path: Path) -> None:
     client = running.start()
     mesh = tmp_path / "tetrahedron.obj"

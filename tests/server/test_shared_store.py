@@ -9,11 +9,11 @@ from conftest import Service
 from painter import PaintedAsset, Painter
 from test_rest import exr, is_problem, uploaded_environments, zipped
 
-from server.routes_assets import remove_deleted_assets
-from server.settings import Limits
+from drgs_server.api.routes_assets import remove_deleted_assets
+from drgs_server.settings import Limits
+from drgs_worker.store.artifacts import share_job
+from drgs_worker.store.register_asset import register_asset
 from tests.worker import store_server as servers
-from worker.artifacts import keep_job
-from worker.register_asset import register_asset
 
 ASSET = "a" * 32
 
@@ -54,6 +54,7 @@ def add(service: Service) -> None:
     register_asset(service.context.directory, service.context.engine, ASSET, "ball", "upload")
 
 
+@pytest.mark.slow
 def test_what_one_server_has_the_other_shows(pair: tuple[Service, Service]) -> None:
     first, second = pair
     add(first)
@@ -71,6 +72,7 @@ def test_what_one_server_has_the_other_shows(pair: tuple[Service, Service]) -> N
     assert again == "sky-2.exr" and first.client.get(f"/api/environments/{again}").status_code == 200
 
 
+@pytest.mark.slow
 def test_a_store_that_is_away_is_a_problem_that_passes(pair: tuple[Service, Service], s3: servers.StoreServer) -> None:
     first, second = pair
     add(first)
@@ -88,6 +90,7 @@ def test_a_store_that_is_away_is_a_problem_that_passes(pair: tuple[Service, Serv
     assert second.client.get(f"/api/sessions/{session}/frame.jpg?spp=4").status_code == 200
 
 
+@pytest.mark.slow
 def test_a_damaged_asset_is_refused_and_leaves_nothing(pair: tuple[Service, Service], s3: servers.StoreServer) -> None:
     first, second = pair
     add(first)
@@ -119,7 +122,7 @@ def test_what_a_job_made_on_another_machine_is_listed_downloaded_and_deleted(
     (folder / "files" / "draft-asset.glb").write_bytes(b"half")
     (folder / "log.txt").write_text("render: finished\n")
     (folder / "preview.jpg").write_bytes(b"\xff\xd8")
-    keep_job(second.context.directory, job)
+    share_job(second.context.directory, job)
     url = f"/api/jobs/{job}"
     assert [found["name"] for found in first.client.get(f"{url}/files").json()["files"]] == ["asset-own-0000.png"]
     assert first.client.get(f"{url}/files/asset-own-0000.png", headers={"Range": "bytes=1-3"}).content == b"ict"

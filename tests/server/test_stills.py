@@ -6,16 +6,17 @@ import torch
 from conftest import Service
 from test_rest import is_problem
 
-from drgs.build.import_mesh import import_mesh
+from drgs.convert.import_mesh import import_mesh
 from drgs.exchange.exr import decode_exr
 from drgs.maths.color import srgb_from_linear
 from drgs.reference.tonemap import apply_tone_curve
+from drgs.render import render_bands
 from drgs.scene.asset import save_asset
-from server.drgs_renderer import DrgsRenderer
-from server.messages import CameraMessage, Settings
-from server.render_session import AbstractPose, LinearPixels
+from drgs_server.live.messages import CameraMessage, Channel, Settings
+from drgs_server.render.drgs_renderer import DrgsRenderer
+from drgs_server.render.interface import LINEAR_CHANNELS, AbstractPose, LinearPixels
+from drgs_worker.jobs.start_view import FOV_Y_DEGREES, start_view
 from tests.web.browser import write_ball
-from worker.start_view import FOV_Y_DEGREES, start_view
 
 
 def test_an_exr_holds_linear_values_and_alpha_only_where_there_is_some(service: Service) -> None:
@@ -87,3 +88,23 @@ def test_a_channel_holds_the_values_themselves(pose: AbstractPose) -> None:
     assert normal[inside].min() < -0.3, "not squeezed into 0..1"
     _, depth = rendered(pose, channel="depth")
     assert np.isinf(depth[0, 0, 0]) and 0.5 < depth[16, 24, 0] < 4
+
+
+@pytest.mark.parametrize("channel", ["final", "depth", "normal", "variance", "visibility", "indirect", "surfels"])
+def test_a_picture_rendered_once_in_bands_has_the_pixels_of_one_that_is_refined(
+    pose: AbstractPose, monkeypatch: pytest.MonkeyPatch, channel: Channel
+) -> None:
+    whole = render_bands.band_rows
+    monkeypatch.setattr(render_bands, "band_rows", lambda width, height, *_, at_least=0: whole(width, height, 1, at_least))
+    view = start_view((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).tolist()
+    camera = CameraMessage(type="camera", world_from_camera=view, fov_y_degrees=FOV_Y_DEGREES, width=40, height=72)
+    settings = Settings(spp_target=20, channel=channel, tone_curve="agx", exposure_stops=0.5)
+    refined = pose.begin(camera, settings, 40, 72, None)
+    while refined.samples < refined.samples_target:
+        refined.refine()
+    for linear in (False, True) if channel in LINEAR_CHANNELS else (False,):
+        still, slices = pose.still(camera, settings, 40, 72, linear), 0
+        while still.work():
+            slices += 1
+        assert slices >= (0 if channel == "surfels" else 2)
+        np.testing.assert_array_equal(still.picture(), refined.linear() if linear else refined.resolve())

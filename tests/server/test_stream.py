@@ -1,5 +1,6 @@
 """The stream protocol, spoken by a test client to a server that paints."""
 
+import asyncio
 import io
 import json
 import os
@@ -14,13 +15,16 @@ import numpy as np
 import pytest
 from anyio import ClosedResourceError, EndOfStream
 from conftest import Service
-from painter import Painter
+from painter import Painter, Painting
 from PIL import Image
+from sqlalchemy.orm import Session as Database
 from starlette.websockets import WebSocketDisconnect
 
-from server import messages
-from server.messages import FLAG_ALPHA, FLAG_CONVERGED, FLAG_MOVING, FrameHeader, unpack_frame
-from server.render_thread import MODESTY, give_way
+from drgs_server.live import messages, stream
+from drgs_server.live.messages import CLOSE_TRY_AGAIN, FLAG_ALPHA, FLAG_CONVERGED, FLAG_MOVING, FrameHeader, unpack_frame
+from drgs_server.render import thread
+from drgs_server.render.thread import MODESTY, give_way
+from drgs_worker.store.database import AssetRow, now
 
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
 PATIENCE_SECONDS = 60.0
@@ -93,6 +97,15 @@ def talk(service: Service, session: str, hello: dict | None = None, **options: b
         conversation = Talk(socket, **options)
         conversation.send(type="hello", **{"v": 1, **(hello or {})})
         yield conversation
+
+
+def test_a_page_that_takes_long_to_speak_may_come_again(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "HELLO_SECONDS", 0.05)
+    session = service.open_session()
+    with service.client.websocket_connect(f"/api/sessions/{session}/stream", headers={"Host": "127.0.0.1:8000"}) as socket:
+        with pytest.raises(WebSocketDisconnect) as closed:
+            socket.receive_json()
+        assert closed.value.code == CLOSE_TRY_AGAIN, "and no fatal error before it, after which a page gives up"
 
 
 def test_hello_is_answered_with_all_that_a_client_needs(service: Service) -> None:
@@ -169,8 +182,8 @@ def test_rendering_goes_on_where_priorities_are_forbidden(monkeypatch: pytest.Mo
     def refuse(*_: int) -> None:
         raise PermissionError("not in this sandbox")
 
-    monkeypatch.setattr("server.render_thread.sys.platform", "linux")
-    monkeypatch.setattr("server.render_thread.os.setpriority", refuse, raising=False)
+    monkeypatch.setattr("drgs_server.render.thread.sys.platform", "linux")
+    monkeypatch.setattr("drgs_server.render.thread.os.setpriority", refuse, raising=False)
     give_way()
     assert "keeps the priority" in caplog.text
 
@@ -349,6 +362,19 @@ def test_an_edit_sent_again_after_the_connection_was_lost_is_applied_once(servic
     assert service.client.get(f"/api/sessions/{session}").json()["revision"] == 1
 
 
+def test_a_drag_that_is_faster_than_its_poses_is_one_step_of_undo_and_every_message_is_answered(service: Service) -> None:
+    session = service.open_session()
+    service.painter.pose_seconds = 0.1
+    with talk(service, session) as client:
+        for number in range(1, 21):
+            client.send(type="edit", id=number, edit=material(number / 20), coalesce="drag")
+        answered = {client.text("accepted")["id"]: client.texts[-1]["revision"] for _ in range(20)}
+    log = service.client.get(f"/api/sessions/{session}").json()
+    assert sorted(answered) == list(range(1, 21)) and answered[20] == log["revision"] < 10
+    assert [edit["set"]["roughness"] for edit in log["edits"]] == [1.0] and log["can_undo"]
+    assert service.client.post(f"/api/sessions/{session}/undo").json()["edits"] == []
+
+
 def test_a_splice_over_the_stream_is_applied_once_coalesced_and_never_to_a_log_it_was_not_meant_for(service: Service) -> None:
     session = service.open_session()
     with talk(service, session) as client:
@@ -372,6 +398,22 @@ def test_a_splice_over_the_stream_is_applied_once_coalesced_and_never_to_a_log_i
     assert [edit["set"]["roughness"] for edit in log["edits"]] == [0.1, 0.2], "two splices of one drag are one step"
 
 
+def test_a_picture_that_cannot_be_made_is_said_to_its_viewer_and_tried_again(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thread, "PAUSE_AFTER_ERROR_SECONDS", 0.05)
+    session, refine = service.open_session(), Painting.refine
+
+    def fail_at_first(painting: Painting) -> None:
+        monkeypatch.setattr(Painting, "refine", refine)
+        raise RuntimeError("the paint is dry")
+
+    monkeypatch.setattr(Painting, "refine", fail_at_first)
+    with talk(service, session) as client:
+        client.socket.send_json(camera())
+        told = client.text("error")
+        assert told["message"] == "This picture could not be rendered: RuntimeError: the paint is dry" and not told["fatal"]
+        client.frame()
+
+
 def test_a_client_that_vanishes_while_its_picture_is_made_leaves_nothing_behind(tmp_path) -> None:
     service = Service(tmp_path, Painter(pass_seconds=0.3))
     with service.client:
@@ -381,9 +423,87 @@ def test_a_client_that_vanishes_while_its_picture_is_made_leaves_nothing_behind(
                 client.text("hello")
                 client.socket.send_json(camera())
         start = time.monotonic()
-        while service.context.sessions.viewer_count() or service.context.connections:
+        while service.context.sessions.viewer_count() or service.context.render_thread._viewers:
             assert time.monotonic() - start < PATIENCE_SECONDS
             time.sleep(0.02)
         with talk(service, session) as client:
             client.socket.send_json(camera())
             client.frame()
+
+
+def test_a_client_that_asks_for_changes_is_sent_those_and_can_tell_that_it_missed_one(service: Service) -> None:
+    session = service.open_session()
+    with talk(service, session, {"changes": True}) as client:
+        log = client.text("hello")["log"]
+        for number in range(1, 31):
+            client.send(type="edit", id=number, edit=material(number / 31))
+        client.send(type="undo", id=31)
+        client.send(type="splice", id=32, revision=31, start=1, remove=2, edits=[material(0.5)])
+        sizes = []
+        for _ in range(32):
+            change = client.text("change")
+            sizes.append(len(json.dumps(change)))
+            assert change["before"] == log["digest"]
+            for name in ("edits", "undone"):
+                part = change[name]
+                log[name][part["start"] : part["start"] + part["remove"]] = part["edits"]
+            log |= {name: change[name] for name in ("digest", "revision", "can_undo", "can_redo", "appended")}
+        info = service.client.get(f"/api/sessions/{session}").json()
+        assert {name: info[name] for name in ("revision", "edits", "undone", "can_undo", "can_redo", "appended")} == {
+            name: log[name] for name in ("revision", "edits", "undone", "can_undo", "can_redo", "appended")
+        }
+        assert (log["revision"], len(log["edits"])) == (32, 28)
+        assert max(sizes) < 2 * min(sizes), "a change of a long log is as short as one of a short log"
+        client.send(type="log")
+        assert client.text("state")["log"] == log
+    digests = [text["digest"] for text in client.texts if text["type"] == "change"]
+    assert len(set(digests)) == len(digests)
+
+
+def test_a_log_that_is_replayed_has_the_digest_it_had(service: Service, tmp_path) -> None:
+    session = service.open_session()
+    url = f"/api/sessions/{session}"
+    service.client.post(f"{url}/edits", json={"edit": material(0.1)})
+    service.client.put(f"{url}/edits", json={"edits": [material(0.2), {"op": "environment", "rotation": 1e-7}]})
+    digest = service.client.post(f"{url}/undo").json()["digest"]
+    again = Service(tmp_path, service.painter)
+    with again.client, talk(again, session) as client:
+        assert client.text("hello")["log"]["digest"] == digest
+
+
+def test_a_client_that_takes_nothing_is_let_go_and_leaves_nothing_behind(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "WRITE_SECONDS", 0.2)
+    monkeypatch.setattr(stream, "CLOSE_SECONDS", 0.1)
+    session, blocked = service.open_session(), threading.Event()
+    send = stream.WebSocket.send
+
+    async def send_unless_blocked(socket: stream.WebSocket, message: dict) -> None:
+        if blocked.is_set():
+            await asyncio.sleep(PATIENCE_SECONDS)
+        await send(socket, message)
+
+    monkeypatch.setattr(stream.WebSocket, "send", send_unless_blocked)
+    with talk(service, session, {"changes": True}) as client:
+        client.text("hello")
+        blocked.set()
+        for _ in range(3):
+            service.client.post(f"/api/sessions/{session}/edits", json={"edit": material(0.5)})
+        start = time.monotonic()
+        while service.context.sessions.viewer_count():
+            assert time.monotonic() - start < PATIENCE_SECONDS
+            time.sleep(0.02)
+        assert not service.context.render_thread._viewers
+
+
+def test_who_looks_at_an_asset_that_was_deleted_elsewhere_is_told(service: Service) -> None:
+    session = service.open_session()
+    with talk(service, session) as conversation:
+        conversation.text("hello")
+        with Database(service.context.engine) as database, database.begin():
+            database.get_one(AssetRow, "a" * 32).deleted_at = now()
+        service.client.portal.call(service.context.sessions.forget_deleted)
+        error = conversation.text("error")
+        assert error["fatal"] and "was deleted" in error["message"]
+        with pytest.raises(WebSocketDisconnect) as closed:
+            conversation.text("never")
+        assert closed.value.code == messages.CLOSE_POLICY

@@ -4,7 +4,9 @@ import json
 import resource
 from pathlib import Path
 
+import pytest
 from conftest import Service
+from test_rest import is_problem, left_on_disk, zipped
 
 from drgs.scene.asset import load_asset
 
@@ -20,6 +22,7 @@ def opened(service: Service) -> tuple[str, str]:
     return asset, session
 
 
+@pytest.mark.slow
 def test_an_export_of_a_session_holds_its_edits_and_keeps_no_version(service: Service, tmp_path: Path) -> None:
     asset, session = opened(service)
     plain, edited = (service.client.get(f"/api/{which}/export?format=zip") for which in (f"assets/{asset}", f"sessions/{session}"))
@@ -41,6 +44,29 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+def test_a_disk_that_is_full_while_something_comes_in_is_said_and_leaves_nothing(service: Service) -> None:
+    session = service.open_session()
+    noise = bytes(range(256)) * 2000
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        answers = [
+            service.client.post("/api/assets", files={"file": ("four.obj", TETRAHEDRON + b"#" * 200_000)}),
+            service.client.post("/api/jobs", files={"file": ("mug.zip", zipped({"transforms.json": b"{}", "a.png": noise}))}),
+            service.client.post("/api/environments", files={"file": ("sky.exr", noise)}),
+            service.client.get("/api/environments/sun-and-sky-30.exr"),
+            service.client.post("/api/weights", content=bytes(400_000), headers={"content-type": "application/octet-stream"}),
+            service.client.post(f"/api/sessions/{session}/edits", json={"edit": {"op": "environment", "file": "sun-and-sky-31.exr"}}),
+        ]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    for answer in answers:
+        assert "disk is full" in is_problem(answer, 503) and answer.headers["retry-after"]
+    assert left_on_disk(service) == [] and [path for path in service.context.directory.environments.rglob("*") if path.is_file()] == []
+    assert service.client.get(f"/api/sessions/{session}").json()["revision"] == 0
+
+
+@pytest.mark.slow
 def test_a_saved_session_is_a_new_version_with_its_edits_and_a_full_disk_leaves_all_as_it_was(service: Service) -> None:
     asset, session = opened(service)
     folder = service.context.directory.asset(asset)
@@ -51,9 +77,9 @@ def test_a_saved_session_is_a_new_version_with_its_edits_and_a_full_disk_leaves_
         full = service.client.post(f"/api/sessions/{session}/save", json={"name": "never"})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert full.status_code in (422, 503) and " " in full.json()["detail"], full.text
+    assert "disk is full" in is_problem(full, 503)
     assert files_of(folder) == before and service.client.get("/api/assets").json()["total"] == 1
-    assert list(service.context.directory.uploads.iterdir()) == []
+    assert left_on_disk(service) == []
     assert [path.name for path in service.context.directory.assets.iterdir()] == [asset]
 
     saved = service.client.post(f"/api/sessions/{session}/save").json()

@@ -14,11 +14,11 @@ from conftest import Service
 from PIL import Image
 from test_rest import is_problem
 
-from drgs.build.import_mesh import import_mesh
+from drgs.convert.import_mesh import import_mesh
 from drgs.exchange.photographs import encode_photographs
 from drgs.scene.asset import load_photographs, save_asset
 from drgs.scene.camera import camera_from_opengl
-from worker.file_tool import make_asset
+from drgs_worker.jobs.file_tool import make_asset
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 POSE = torch.tensor([[1.0, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 0.25], [0, 0, 0, 1]], dtype=torch.float64)
@@ -35,6 +35,7 @@ def zipped_asset(folder: Path, photographs: bytes | None = PHOTOGRAPHS) -> bytes
     return (folder / "four.zip").read_bytes()
 
 
+@pytest.mark.slow
 def test_an_uploaded_asset_brings_its_views_and_photographs_and_hands_them_on(service: Service, tmp_path: Path) -> None:
     asset = service.client.post("/api/assets", files={"file": ("four.zip", zipped_asset(tmp_path))}).json()["id"]
     listed = service.client.get(f"/api/assets/{asset}/views").json()

@@ -83,6 +83,7 @@ def test_every_law_lands_hard():
     assert_moves(sweeps.speed_rows(64, 0.05))
 
 
+@pytest.mark.slow
 def test_half_the_limit_to_the_limit_is_stable_and_twice_the_limit_is_contained():
     rows = sweeps.time_step_rows(216, 0.1)
     assert_contained(rows)

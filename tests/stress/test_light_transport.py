@@ -9,9 +9,9 @@ from benchmarks import _light_sweeps as sweeps
 from benchmarks import stability, stability_deformation
 from benchmarks._light_sweeps import Row
 from benchmarks._stability_page import PAGE, rewritten
-from drgs.render.environment_table import MAX_RADIANCE, build_environment_table
-from drgs.render.sample_rays import SampleCounts
-from drgs.render.trace_rays import build_tracer
+from drgs.render.integrate.environment_table import MAX_RADIANCE, build_environment_table
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.records import SampleCounts
 from drgs.scene.environment import Environment
 from tests.render.closed_form_scenes import constant_sky, points_seen_at, sphere_mesh, sunny_sky
 
@@ -76,6 +76,7 @@ def test_white_surfaces_return_no_more_than_what_comes() -> None:
     assert mirror.energy > 0.995
 
 
+@pytest.mark.slow
 def test_a_scene_is_the_same_at_any_scale_and_degrades_as_stated_far_away() -> None:
     rows = sweeps.placement_rows(12)
     scaled = [row for row in rows if row.case.startswith("scale")]
@@ -85,6 +86,7 @@ def test_a_scene_is_the_same_at_any_scale_and_degrades_as_stated_far_away() -> N
     assert far[0].mean_error < 1e-5 and far[1].mean_error < 1e-3
 
 
+@pytest.mark.slow
 def test_faulty_meshes_give_finite_pictures_and_faults_that_show_nothing_change_nothing() -> None:
     rows = sweeps.mesh_rows(8)
     turned = [row for row in rows if "turned over" in row.case]

@@ -15,7 +15,12 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
+from drgs_server.client import Client
 from tests.web.browser import CHROMIUM_ARGUMENTS, ROOT, RunningServer, chromium_path, write_ball
+
+PATIENCE_SECONDS = 120
+"""How long a test waits for what must come. No test is faster for less of it; on a busy machine drawing and loading take their time."""
+expect.set_options(timeout=1000 * PATIENCE_SECONDS)
 
 
 @dataclass
@@ -26,6 +31,15 @@ class Viewer:
     server: RunningServer
     complaints: list[str] = field(default_factory=list)
     """Console errors and uncaught exceptions."""
+    refusals: list[str] = field(default_factory=list)
+    """What the server said on streams that something is wrong; the page shows it for a few seconds only."""
+
+    def __post_init__(self) -> None:
+        self.page.on("websocket", lambda socket: socket.on("framereceived", self._hear))
+
+    def _hear(self, frame: str | bytes) -> None:
+        if isinstance(frame, str) and frame.startswith('{"type":"error"'):
+            self.refusals.append(frame)
 
     def edits(self) -> list[dict]:
         """The open session's edits as the server has them."""
@@ -68,7 +82,9 @@ class Viewer:
 
         wait_until(
             is_settled,
-            lambda: f"a fresh traced picture; the page says: {self.page.locator('.hud, .notices').all_inner_texts()}, {self.stage()}",
+            lambda: (
+                f"a fresh traced picture; the page says: {self.page.locator('.hud, .notices').all_inner_texts()}, {self.refusals}, {self.stage()}"
+            ),
         )
 
     def settled_color(self) -> tuple[float, float, float]:
@@ -87,7 +103,7 @@ MIDDLE_COLOR = """() => {
 }"""
 
 
-def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], seconds: float = 30) -> Any:
+def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], seconds: float = PATIENCE_SECONDS) -> Any:
     """The first true answer of `condition`; fails, naming `what`, after that many seconds."""
     deadline = time.monotonic() + seconds
     while not (answer := condition()):
@@ -95,6 +111,13 @@ def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], seco
             pytest.fail(f"waited {seconds:g} s for {what() if callable(what) else what}")
         time.sleep(0.05)
     return answer
+
+
+def patient_page(browser: Browser, **options: Any) -> Page:
+    """A page of its own context."""
+    page = browser.new_page(**options)
+    page.set_default_timeout(1000 * PATIENCE_SECONDS)
+    return page
 
 
 @pytest.fixture(scope="session")
@@ -115,7 +138,15 @@ def ball_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def ball_asset(server: RunningServer, ball_file: Path) -> str:
+    """Id of the ball on the server; every page that opens it has a session of its own."""
+    with Client(server.address, token=server.token) as client:
+        return client.upload_asset(ball_file).id
+
+
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    """A Chromium for each module: while Playwright runs, so does its event loop, and tests behind these could run none of their own."""
     with sync_playwright() as playwright:
         running = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
         yield running
@@ -126,7 +157,7 @@ def browser() -> Iterator[Browser]:
 def viewer(server: RunningServer, browser: Browser) -> Iterator[Viewer]:
     """One page for all tests of a module: each leaves the edit log empty."""
     # Half a device pixel per CSS pixel: these tests are about the way there and back, not about the renderer's speed.
-    page = browser.new_page(viewport={"width": 760, "height": 420}, device_scale_factor=0.5, color_scheme="dark")
+    page = patient_page(browser, viewport={"width": 760, "height": 420}, device_scale_factor=0.5, color_scheme="dark")
     shown = Viewer(page, server)
 
     def heard(message: ConsoleMessage) -> None:
@@ -142,10 +173,11 @@ def viewer(server: RunningServer, browser: Browser) -> Iterator[Viewer]:
 
 
 @pytest.fixture(scope="module")
-def ball(viewer: Viewer, ball_file: Path) -> Viewer:
+def ball(viewer: Viewer, ball_asset: str) -> Viewer:
     """The page with the ball open, its left panel away."""
-    viewer.page.get_by_label("Capture or mesh").set_input_files(ball_file)
-    expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=120_000)
+    viewer.page.goto(f"{viewer.server.address}/#asset={ball_asset}")
+    viewer.page.reload()
+    expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
     viewer.page.get_by_role("button", name="Library").click()
     viewer.settle()
     # The object may have come before or after the panel went: frame it in what is free now.

@@ -7,16 +7,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from unittest.mock import patch
 
-from worker.builders import BuildProgress, BuildRequest, build_with_drgs
+from drgs_worker.jobs.builders import BuildRequest, build_with_drgs
+from drgs_worker.jobs.progress import Tell
 
 FIT_ITERATIONS, MATERIAL_ITERATIONS = 40, 15
 
 
-def build(request: BuildRequest, progress: Callable[[BuildProgress], None], should_stop: Callable[[], bool]) -> Iterator[str]:
-    from drgs.build.build_asset import PRESETS
+def build(request: BuildRequest, tell: Tell, should_stop: Callable[[], bool]) -> Iterator[str]:
+    from drgs.reconstruct.build_asset import PRESETS
 
     draft = PRESETS["draft"]
     fit = replace(draft.fit, iterations=FIT_ITERATIONS)
     materials = replace(draft.materials, iterations=MATERIAL_ITERATIONS)
     with patch.dict(PRESETS, draft=replace(draft, fit=fit, materials=materials)):
-        yield from build_with_drgs(request, progress, should_stop)
+        yield from build_with_drgs(request, tell, should_stop)

@@ -15,10 +15,10 @@ import torch
 from PIL import Image
 from playwright.sync_api import expect
 
-from drgs.build.import_mesh import import_mesh
+from drgs.convert.import_mesh import import_mesh
 from drgs.deform.pose_scene import pose_scene
 from drgs.exchange.photographs import encode_photographs
-from drgs.render.accumulate import RenderSettings
+from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.asset import Asset, save_asset
 from drgs.scene.camera import Camera, camera_from_opengl
@@ -162,7 +162,7 @@ def test_the_split_shows_the_object_as_captured_beside_the_present_one(captured:
 
     wait_until(is_black_on_the_right_only, lambda: f"colours left and right of the divider: {halves(captured)}")
     # Traced as well, once the camera has been still for a while.
-    expect(captured.page.locator(".captured-still")).to_be_visible(timeout=60_000)
+    expect(captured.page.locator(".captured-still")).to_be_visible()
     wait_until(is_black_on_the_right_only, lambda: f"colours beside the divider: {halves(captured)}")
     box = divider.bounding_box()
     captured.page.mouse.move(box["x"] + 12, 150)
@@ -197,7 +197,9 @@ def test_number_keys_show_what_lies_behind_the_picture_with_a_legend(captured: V
     # From the dark blue of the scale's beginning on; the ball's own red is not on it.
     wait_until(lambda: (color := middle(captured))[2] > color[0] and color.max() > 8, "blue for little noise")
     captured.page.keyboard.press("0")
-    expect(captured.page.get_by_text("it has no surfels to show")).to_be_visible()
+    # The picture's own notes say so too, as soon as it has come.
+    hint = captured.page.locator("p.hint", has_text="it has no surfels to show")
+    expect(hint).to_be_visible()
     wait_until(lambda: middle(captured).max() < 4, "nothing")
     captured.page.keyboard.press("1")
     wait_until(lambda: middle(captured)[0] > 100, "the final picture")
@@ -226,6 +228,6 @@ def test_the_edges_of_the_mesh_lie_over_any_channel(captured: Viewer) -> None:
 def test_an_imported_mesh_says_that_it_has_no_photographs(captured: Viewer, ball_file: Path) -> None:
     captured.page.get_by_role("button", name="Library").click()
     captured.page.get_by_label("Capture or mesh").set_input_files(ball_file)
-    expect(captured.page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=120_000)
-    expect(captured.page.get_by_text("this asset was made from a mesh")).to_be_visible(timeout=30_000)
+    expect(captured.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
+    expect(captured.page.get_by_text("this asset was made from a mesh")).to_be_visible()
     assert captured.complaints == []

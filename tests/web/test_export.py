@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from drgs.build.import_mesh import import_mesh
-from drgs.build.load_views import load_cameras
+from drgs.convert.import_mesh import import_mesh
 from drgs.exchange.exr import decode_exr
+from drgs.reconstruct.capture.load_views import load_cameras
 from tests.web.conftest import Viewer, wait_until
 
 VIEWS = "Views of the film"
@@ -31,7 +31,7 @@ def enter(page: Page, label: str, value: str) -> None:
 
 def downloaded(viewer: Viewer, role: str, name: str, path: Path) -> Path:
     """The file that a click gives, moved to a folder and a name of our own."""
-    with viewer.page.expect_download(timeout=60_000) as download:
+    with viewer.page.expect_download() as download:
         viewer.page.get_by_role(role, name=name).click()  # type: ignore[arg-type]
     download.value.save_as(path)
     return path
@@ -79,7 +79,7 @@ def test_what_was_made_gold_is_exported_as_gold_or_as_captured(ball: Viewer, tmp
 def test_a_file_that_cannot_be_written_says_why(ball: Viewer) -> None:
     ball.page.get_by_role("link", name="Gaussians (2DGS PLY)").click()
     notice = ball.page.get_by_role("log").get_by_text("Gaussians")
-    expect(notice).to_be_visible(timeout=60_000)
+    expect(notice).to_be_visible()
     ball.page.get_by_role("button", name="Dismiss").click()
     ball.complaints[:] = [text for text in ball.complaints if "422" not in text]  # the browser's own line
 
@@ -99,7 +99,7 @@ def test_a_film_is_made_of_views_previewed_and_ordered_as_previewed(ball: Viewer
     page.get_by_role("button", name="Go to view 1").click()
     wait_until(lambda: np.abs(ball.settled_picture() - first).mean() < 2, "the first view")
     page.get_by_role("button", name="Preview").click()
-    expect(page.get_by_label("Moment, exact value")).to_have_value("0.50", timeout=30_000)
+    expect(page.get_by_label("Moment, exact value")).to_have_value("0.50")
     wait_until(lambda: np.abs(ball.settled_picture() - second).mean() < 2, "the second view at the end of the film")
     page.get_by_role("button", name="Move view 2 earlier").click()
     page.get_by_role("button", name="Go to view 1").click()
@@ -129,7 +129,7 @@ def test_the_views_of_a_film_survive_a_reload(ball: Viewer) -> None:
     page = ball.page
     expect(page.get_by_role("list", name=VIEWS).get_by_role("listitem")).to_have_count(2)
     page.reload()
-    expect(page.get_by_role("list", name=VIEWS).get_by_role("listitem")).to_have_count(2, timeout=30_000)
+    expect(page.get_by_role("list", name=VIEWS).get_by_role("listitem")).to_have_count(2)
     for _ in range(2):
         page.get_by_role("button", name="Remove view 1").click()
     expect(page.get_by_role("list", name=VIEWS)).to_have_count(0)

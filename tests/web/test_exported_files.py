@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from drgs.build.export_asset import display_sh, export_asset
+from drgs.convert.export_asset import display_sh, export_asset
 from drgs.exchange import texture_atlas
 from drgs.exchange.gaussian_ply import decode_gaussian_ply
 from drgs.exchange.glb import GlbMesh, encode_glb
@@ -23,7 +23,7 @@ from drgs.exchange.ply import encode_ply, parse_ply
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.scene.asset import Asset, save_asset
-from tests.build.test_export_asset import ball_asset
+from tests.convert.test_export_asset import ball_asset
 from tests.web.browser import ROOT
 
 WARNING, INFORMATION = 1, 2
@@ -44,8 +44,9 @@ def run_node() -> Callable[..., str]:
     assert node is not None
 
     def run(script: str, *arguments: object) -> str:
-        command = [node, ROOT / "web" / script, *map(str, arguments)]
-        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=60).stdout
+        # One thread: with compilers beside it, Node now and then waits for itself for ever when it ends (nodejs/node issue 54918).
+        command = [node, "--single-threaded", ROOT / "web" / script, *map(str, arguments)]
+        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=180).stdout
 
     return run
 

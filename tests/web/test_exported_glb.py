@@ -9,10 +9,10 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import Browser, Route
 
-from drgs.client import Client
+from drgs_server.client import Client
+from drgs_worker.jobs.start_view import FOV_Y_DEGREES, start_view
 from tests.web.browser import ROOT, RunningServer
-from tests.web.conftest import wait_until
-from worker.start_view import FOV_Y_DEGREES, start_view
+from tests.web.conftest import patient_page, wait_until
 
 THREE = ROOT / "web" / "node_modules" / "three"
 SIDE = 256
@@ -42,12 +42,11 @@ window.picture = renderer.domElement.toDataURL('image/png');
 </script>"""
 
 
-def test_an_exported_glb_looks_the_same_in_three(server: RunningServer, browser: Browser, ball_file: Path, tmp_path: Path) -> None:
+def test_an_exported_glb_looks_the_same_in_three(server: RunningServer, browser: Browser, ball_asset: str, tmp_path: Path) -> None:
     camera = start_view((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).tolist()
     with Client(server.address, token=server.token) as client:
-        asset = client.upload_asset(ball_file)
-        client.export(asset.id, "glb", tmp_path / "ball.glb")
-        session = client.open_session(asset.id)
+        client.export(ball_asset, "glb", tmp_path / "ball.glb")
+        session = client.open_session(ball_asset)
         session.edit({"op": "environment", "file": "studio.exr"})
         picture = session.frame(SIDE, SIDE, 256, camera, FOV_Y_DEGREES, background="transparent")
     light = (ROOT / "examples" / "environments" / "studio.exr").read_bytes()
@@ -82,7 +81,7 @@ def three_picture(browser: Browser, glb: bytes, light: bytes, camera: dict) -> I
         else:
             route.abort()
 
-    page = browser.new_page()
+    page = patient_page(browser)
     page.route("**/*", answer)
     page.goto("http://three.test/")
     data = wait_until(lambda: page.evaluate("window.picture"), "three.js to draw")

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Locator, Page, Route, expect
 
-from server.openapi_document import EXAMPLES
+from drgs_server.api.openapi_document import EXAMPLES
 from tests.web.conftest import Viewer, wait_until
 
 RUNNING = EXAMPLES["JobInfo"]["running"]
@@ -54,7 +54,7 @@ def shown(page: Page, jobs: Jobs, **values: object) -> Locator:
     jobs.list = [RUNNING | values]
     page.reload()
     card = page.get_by_role("listitem", name="Build Mug")
-    expect(card).to_be_visible(timeout=60_000)
+    expect(card).to_be_visible()
     return card
 
 
@@ -68,9 +68,9 @@ def test_a_running_build_shows_picture_quality_time_left_and_findings(viewer: Vi
     expect(card.get_by_text("12 views are few.")).to_be_visible()
     expect(card.get_by_text("Take 20 to 100 pictures")).to_be_visible()
     jobs.list = [jobs.list[0] | {"psnr": 26.5, "fraction": 0.4, "preview_version": 13}]
-    expect(card.get_by_role("img", name="Quality from 20.0 to 26.5 dB")).to_be_visible(timeout=30_000)
+    expect(card.get_by_role("img", name="Quality from 20.0 to 26.5 dB")).to_be_visible()
     page.reload()
-    expect(card.get_by_role("img", name="Quality from 20.0 to 26.5 dB")).to_be_visible(timeout=30_000)
+    expect(card.get_by_role("img", name="Quality from 20.0 to 26.5 dB")).to_be_visible()
     card.get_by_role("button", name="Cancel").click()
     wait_for_a_request(page, jobs)
     assert ("POST", f"/{RUNNING['id']}/cancel") in jobs.asked
@@ -94,7 +94,7 @@ def test_every_state_offers_what_can_be_done(viewer: Viewer, jobs: Jobs) -> None
     viewer.page.reload()
     for state, button in offered.items():
         card = viewer.page.get_by_role("listitem", name=f"Build {state}")
-        expect(card.get_by_role("button", name=button)).to_be_visible(timeout=60_000)
+        expect(card.get_by_role("button", name=button)).to_be_visible()
         expect(card.get_by_text("Nothing about this capture stands in the way.")).to_be_visible()
 
 

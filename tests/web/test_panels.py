@@ -49,7 +49,7 @@ def test_a_dropped_environment_joins_the_gallery_and_lights_the_object(ball: Vie
         }""",
         list(path.read_bytes()),
     )
-    expect(ball.page.get_by_role("radio", name="Red", exact=True)).to_be_checked(timeout=30_000)
+    expect(ball.page.get_by_role("radio", name="Red", exact=True)).to_be_checked()
     (edit,) = ball.wait_for_edits(1)
     assert edit["file"] == "red.exr"
     wait_for_change(ball, before, "a picture in red light")
@@ -156,7 +156,7 @@ def test_a_still_has_the_size_and_transparency_that_were_chosen(ball: Viewer) ->
     ball.page.get_by_role("radio", name="1024²").check()
     ball.page.get_by_role("radio", name="32", exact=True).check()
     ball.page.get_by_role("switch", name="Transparent background").check()
-    with ball.page.expect_download(timeout=60_000) as download:
+    with ball.page.expect_download() as download:
         ball.page.get_by_role("button", name="Render PNG").click()
     picture = Image.open(download.value.path())
     assert picture.size == (1024, 1024) and picture.mode == "RGBA"

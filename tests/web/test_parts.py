@@ -96,7 +96,7 @@ def test_what_is_being_typed_stays_while_news_of_the_value_arrives(ball: Viewer)
     # Somebody else who looks at the same session.
     edit = {"op": "material", "select": {"all": True}, "set": {"roughness": 0.3}, "mode": "absolute"}
     ball.append_edit(edit)
-    expect(ball.page.get_by_label("Roughness, exact value")).to_have_value("0.30", timeout=30_000)
+    expect(ball.page.get_by_label("Roughness, exact value")).to_have_value("0.30")
     expect(field).to_have_value("0.75")
     field.press("Enter")
     wait_until(lambda: ball.edits()[-1]["set"].get("metallic") == 0.75, "what was typed in the log")

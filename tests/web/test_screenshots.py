@@ -15,10 +15,9 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Route, expect
 
-from drgs.client import Client
-from server.rest_records import JobFile, JobFileList, JobInfo, JobList
+from drgs_server.api.rest_records import JobFile, JobFileList, JobInfo, JobList
 from tests.web.browser import ROOT, RunningServer
-from tests.web.conftest import Viewer
+from tests.web.conftest import Viewer, patient_page
 
 TABS = ("Material", "Light", "Shape", "View", "Export")
 LAPTOP, TABLET, LARGE = (1280, 720), (1024, 768), (3840, 2160)
@@ -167,18 +166,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def shown(server: RunningServer, browser: Browser, ball_file: Path) -> Iterator[Viewer]:
+def shown(server: RunningServer, browser: Browser, ball_asset: str) -> Iterator[Viewer]:
     """A ball with three edits open in a page."""
-    with Client(server.address, token=server.token) as client:
-        asset = client.upload_asset(ball_file)
-    page = browser.new_page(viewport=dict(zip(("width", "height"), LAPTOP, strict=True)), color_scheme="dark")
+    page = patient_page(browser, viewport=dict(zip(("width", "height"), LAPTOP, strict=True)), color_scheme="dark")
     viewer = Viewer(page, server)
     play_jobs(viewer)
-    page.goto(f"{server.address}/#token={server.token}&asset={asset.id}")
-    expect(page.get_by_role("heading", name="ball", exact=True)).to_be_visible(timeout=60_000)
+    page.goto(f"{server.address}/#token={server.token}&asset={ball_asset}")
+    expect(page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
     for edit in EDITS:
         viewer.append_edit(edit)
-    expect(page.get_by_role("list", name="Edits in force").get_by_role("button")).to_have_count(1 + len(EDITS), timeout=30_000)
+    expect(page.get_by_role("list", name="Edits in force").get_by_role("button")).to_have_count(1 + len(EDITS))
     viewer.open_tab("View")
     page.get_by_role("radio", name="Low", exact=True).check()  # these pictures are of panels
     yield viewer
@@ -209,7 +206,7 @@ def test_every_panel_fits_a_laptop(shown: Viewer, folder: Path, theme: str) -> N
         faults += look(shown, folder, f"{theme}-{tab.lower()}")
     page.get_by_role("button", name="Library").click()
     expect(page.get_by_alt_text("Preview of A jug")).to_be_visible()
-    expect(page.get_by_role("img", name="Quality from")).to_be_visible(timeout=30_000)
+    expect(page.get_by_role("img", name="Quality from")).to_be_visible()
     faults += look(shown, folder, f"{theme}-library")
     close_library(shown)
     page.keyboard.press("Escape")

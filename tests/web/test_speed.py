@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from tests.web.browser import ROOT
 from tests.web.conftest import RunningServer
 
@@ -11,6 +13,7 @@ ATTEMPTS = 3
 """Of a measurement on a machine that others may use too: one that keeps a promise shows that the code does."""
 
 
+@pytest.mark.alone
 def test_the_viewer_is_as_quick_as_promised(server: RunningServer) -> None:
     missed: list[str] = ["not measured"]
     for _ in range(ATTEMPTS):

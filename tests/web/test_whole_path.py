@@ -21,7 +21,7 @@ from playwright.sync_api import Browser, Download, Locator, expect
 from scipy import ndimage
 
 from tests.web.browser import ROOT, STOP_SECONDS, RunningServer
-from tests.web.conftest import Viewer, wait_until
+from tests.web.conftest import Viewer, patient_page, wait_until
 
 CAPTURE = ROOT / "examples" / "sample_capture"
 VIEW_STEP, SIDE = 2, 96
@@ -69,7 +69,7 @@ def small_capture() -> bytes:
 def worker(server: RunningServer) -> Iterator[None]:
     """A worker process on the server's data directory."""
     environment = os.environ | {"DRGS_BUILDER": "tests.web.short_builder:build"}
-    running = subprocess.Popen([sys.executable, "-m", "worker", "--data", str(server.data)], env=environment, cwd=ROOT)
+    running = subprocess.Popen([sys.executable, "-m", "drgs_worker", "--data", str(server.data)], env=environment, cwd=ROOT)
     yield
     running.terminate()
     try:
@@ -81,7 +81,7 @@ def worker(server: RunningServer) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def path(server: RunningServer, browser: Browser, worker: None) -> Iterator[Viewer]:
     """A page in which nobody has been before."""
-    page = browser.new_page(viewport={"width": 1000, "height": 620}, device_scale_factor=0.5, color_scheme="dark")
+    page = patient_page(browser, viewport={"width": 1000, "height": 620}, device_scale_factor=0.5, color_scheme="dark")
     shown = Viewer(page, server)
     page.on("pageerror", lambda error: shown.complaints.append(str(error)))
     page.on("console", lambda message: shown.complaints.append(message.text) if message.type == "error" else None)
@@ -144,7 +144,7 @@ def test_a_dropped_capture_becomes_a_job_whose_progress_is_shown(path: Viewer) -
     path.page.get_by_role("radio", name="Draft").check()
     path.page.evaluate(DROP, base64.b64encode(small_capture()).decode())
     listed = path.page.get_by_role("listitem", name="Build Little sample")
-    expect(listed).to_be_visible(timeout=60_000)
+    expect(listed).to_be_visible()
     (job,) = wait_until(lambda: jobs_of(path), "a job on the server", 60)
     assert (job["kind"], job["preset"]) == ("build", "draft")
     bar = listed.get_by_role("progressbar", name="Progress of Little sample")
@@ -235,10 +235,10 @@ def test_a_slider_twists_the_object(path: Viewer) -> None:
 def test_undoing_all_brings_the_first_picture_back(path: Viewer, first: np.ndarray) -> None:
     undo = path.page.get_by_role("button", name="Undo", exact=True)
     for left in (3, 2, 1, 0):
-        expect(undo).to_be_enabled(timeout=30_000)
+        expect(undo).to_be_enabled()
         undo.click()
         path.wait_for_edits(left)
-    expect(undo).to_be_disabled(timeout=30_000)
+    expect(undo).to_be_disabled()
     log = path.session()
     assert (log["edits"], log["can_undo"], log["can_redo"]) == ([], False, True)
     again = wait_for_picture(path, lambda now: change(first, now, silhouette(first)) < NOISE, "the first picture")

@@ -13,9 +13,11 @@ import pytest
 from sqlalchemy.orm import Session
 from test_jobs import Bench
 
-from tests.worker import store_server as servers
-from worker import artifacts
-from worker.artifact_store import (
+from drgs_worker.jobs.progress import JobStopped
+from drgs_worker.jobs.queue import JobQueue
+from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
+from drgs_worker.store import artifacts
+from drgs_worker.store.artifact_store import (
     PIECE_BYTES,
     ArtifactDamaged,
     ArtifactMissing,
@@ -26,11 +28,10 @@ from worker.artifact_store import (
     encode_manifest,
     open_artifact_store,
 )
-from worker.builders import BuildStopped
-from worker.data_directory import DataDirectory, open_data_directory
-from worker.database import AssetRow, open_database
-from worker.queue import JobQueue
-from worker.register_asset import register_asset
+from drgs_worker.store.data_directory import DataDirectory, open_data_directory
+from drgs_worker.store.database import AssetRow, open_database
+from drgs_worker.store.register_asset import register_asset
+from tests.worker import store_server as servers
 
 ASSET = "a" * 32
 
@@ -58,6 +59,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_folder_comes_back_byte_for_byte(store: ArtifactStore, tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "made", big=os.urandom(PIECE_BYTES + 17))
     assert not store.has("assets", "one")
@@ -161,9 +163,9 @@ def test_a_store_that_is_away_says_so_within_seconds(s3: servers.StoreServer, tm
             store.put("assets", "one", folder)
         assert time.monotonic() - start < 8
         stop_at = time.monotonic() + 0.1
-        with pytest.raises(BuildStopped):
-            artifacts.patiently(lambda: store.put("assets", "one", folder), lambda: time.monotonic() > stop_at)
-    artifacts.patiently(lambda: store.put("assets", "one", folder), lambda: False)
+        with pytest.raises(JobStopped):
+            retry_while_unavailable(lambda: store.put("assets", "one", folder), lambda: time.monotonic() > stop_at)
+    retry_while_unavailable(lambda: store.put("assets", "one", folder), lambda: False)
     assert store.has("assets", "one")
     with pytest.raises(StoreAway, match="does not exist; make the bucket"):
         open_artifact_store("s3://no-such-bucket").put("assets", "one", folder)
@@ -196,25 +198,25 @@ COUNTS = json.dumps({"counts": {"surfels": 0, "vertices": 8, "faces": 12}}).enco
 def test_an_asset_of_one_machine_is_opened_on_another(machines: Machines) -> None:
     made = make_folder(machines.first.asset(ASSET), **{"asset.json": COUNTS})
     register_asset(machines.first, machines.engine, ASSET, "ball", "upload")
-    assert contents(artifacts.bring_asset(machines.second, ASSET)) == contents(made)
+    assert contents(artifacts.fetch_asset(machines.second, ASSET)) == contents(made)
 
 
 def test_what_one_machine_deleted_leaves_the_others_caches(machines: Machines) -> None:
     make_folder(machines.first.asset(ASSET), **{"asset.json": COUNTS})
     register_asset(machines.first, machines.engine, ASSET, "ball", "upload")
-    artifacts.bring_asset(machines.second, ASSET)
+    artifacts.fetch_asset(machines.second, ASSET)
     make_folder(machines.second.job("j"))
-    artifacts.keep_job(machines.second, "j")
+    artifacts.share_job(machines.second, "j")
     make_folder(machines.second.jobs / "young")
     make_folder(machines.second.uploads / ".draft")
     for path in (machines.second.asset(ASSET), machines.second.job("j"), machines.second.uploads / ".draft"):
         os.utime(path, (0, 0))
-    assert artifacts.clear_cache(machines.second, machines.engine) == 0  # the one has a row, the other is in the store
+    assert artifacts.remove_deleted_elsewhere(machines.second, machines.engine) == 0  # the one has a row, the other is in the store
     with Session(machines.engine) as session, session.begin():
         session.delete(session.get_one(AssetRow, ASSET))
-    artifacts.drop(machines.first, "assets", ASSET)
-    artifacts.drop(machines.first, "jobs", "j")
-    assert artifacts.clear_cache(machines.second, machines.engine) == 2
+    artifacts.unshare_artifact(machines.first, "assets", ASSET)
+    artifacts.unshare_artifact(machines.first, "jobs", "j")
+    assert artifacts.remove_deleted_elsewhere(machines.second, machines.engine) == 2
     assert not machines.second.asset(ASSET).exists() and not machines.second.job("j").exists()
     assert (machines.second.jobs / "young").exists() and (machines.second.uploads / ".draft").exists()
 
@@ -233,7 +235,7 @@ def test_an_asset_that_cannot_be_shared_is_not_listed(machines: Machines, s3: se
 def test_a_job_goes_on_where_its_last_step_ended_on_another_machine(machines: Machines) -> None:
     first, second = machines.first.job("j"), machines.second.job("j")
     make_folder(first, **{"log.txt": b"read\n", ".lock": b"", "half.part": b"x"})
-    artifacts.keep_job(machines.first, "j")
+    artifacts.share_job(machines.first, "j")
     artifacts.refresh_job(machines.second, "j")
     assert contents(second).keys() - {".stored", ".lock"} == {"asset.json", "deep/empty", "mesh.glb", "log.txt"}
     (first / "log.txt").write_bytes(b"read\nfit")
@@ -241,8 +243,8 @@ def test_a_job_goes_on_where_its_last_step_ended_on_another_machine(machines: Ma
     assert (first / "log.txt").read_bytes() == b"read\nfit"
     (second / "log.txt").write_bytes(b"read\nfit by the second\n")
     (second / "deep/empty").unlink()
-    artifacts.keep_job(machines.second, "j")
-    artifacts.bring_job(machines.first, "j")
+    artifacts.share_job(machines.second, "j")
+    artifacts.fetch_job(machines.first, "j")
     assert (first / "log.txt").read_bytes() == b"read\nfit by the second\n" and not (first / "deep/empty").exists()
     assert (first / "half.part").exists() and (first / ".lock").exists()
 
@@ -250,14 +252,14 @@ def test_a_job_goes_on_where_its_last_step_ended_on_another_machine(machines: Ma
 def test_a_capture_is_looked_for_where_this_machine_keeps_uploads(machines: Machines, tmp_path: Path) -> None:
     job = "c" * 32
     make_folder(machines.first.uploads / job / "mug")
-    artifacts.keep(machines.first, "captures", job, machines.first.uploads / job)
+    artifacts.share_artifact(machines.first, "captures", job, machines.first.uploads / job)
     there = machines.first.uploads / job / "mug"
-    assert artifacts.bring_capture(machines.first, there) == there
+    assert artifacts.fetch_capture(machines.first, there) == there
     elsewhere = Path("/gone/first/uploads") / job / "mug"
-    found = artifacts.bring_capture(machines.second, elsewhere)
+    found = artifacts.fetch_capture(machines.second, elsewhere)
     assert found == machines.second.uploads / job / "mug" and contents(found) == contents(there)
     for strange in (Path("/gone/uploads"), Path("/gone/uploads/mug"), Path("/gone")):
-        assert artifacts.bring_capture(machines.second, strange) == strange
+        assert artifacts.fetch_capture(machines.second, strange) == strange
 
 
 class TwoMachines(Bench):
@@ -273,26 +275,27 @@ class TwoMachines(Bench):
         names = ("DRGS_DATABASE_URL", "DRGS_QUEUE_URL", "DRGS_ARTIFACT_URL")
         environment = self.environment() | dict(zip(names, self.machines.urls, strict=True)) | self.server.environment()
         worker = subprocess.Popen(
-            [sys.executable, "-m", "worker", "--data", str(self.machines.second.root)], env=environment, cwd=self.root
+            [sys.executable, "-m", "drgs_worker", "--data", str(self.machines.second.root)], env=environment, cwd=self.root
         )
         self.workers.append(worker)
         return worker
 
 
+@pytest.mark.slow
 def test_an_upload_of_one_machine_is_built_by_a_worker_of_another_and_waits_for_a_store_that_is_away(
     tmp_path: Path, machines: Machines, s3: servers.StoreServer
 ) -> None:
     bench = TwoMachines(tmp_path, machines, s3)
     try:
         job = bench.submit(iterations=10, seconds=0.05)
-        artifacts.keep(machines.first, "captures", job, machines.first.uploads / job)
+        artifacts.share_artifact(machines.first, "captures", job, machines.first.uploads / job)
         bench.start_worker()
         bench.wait(lambda: bench.row(job).iteration >= 3)
         with s3.away():
             time.sleep(1.0)
             assert bench.state(job) == "running"
         bench.wait_for(job, "done")
-        assert (artifacts.bring_asset(machines.first, job) / "asset.json").is_file()
+        assert (artifacts.fetch_asset(machines.first, job) / "asset.json").is_file()
         artifacts.refresh_job(machines.first, job)
         log = machines.first.job_log(job).read_text()
         assert log.count("finished") == 6 and bench.row(job).attempts == 1

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worker.camera_path import path_views
-from worker.requests import CameraKeyframe, CameraPath, path_frames
+from drgs_worker.jobs.camera_path import path_views
+from drgs_worker.jobs.requests import CameraKeyframe, CameraPath, path_frames
 
-FIXTURE = Path(__file__).parents[2] / "web" / "tests" / "camera_path.json"
+FIXTURE = Path(__file__).parents[2] / "web" / "tests" / "stage" / "camera" / "camera_path.json"
 """Keyframes and the cameras between them; vitest holds the page's twin to the same file."""
 
 

@@ -7,20 +7,22 @@ from pathlib import Path
 
 import pytest
 
-from drgs.build.build_asset import PRESETS, Preset
-from drgs.build.densify import DensifySettings
-from drgs.build.extract_mesh import MeshSettings
-from drgs.build.fit_gaussians import FitSettings
-from drgs.build.fit_materials import MaterialSettings
-from drgs.build.fit_mesh_surfels import MeshFitSettings
-from drgs.render.sample_rays import SampleCounts
+from drgs.reconstruct.build_asset import PRESETS, Preset
+from drgs.reconstruct.fit.densify import DensifySettings
+from drgs.reconstruct.fit.fit_gaussians import FitSettings
+from drgs.reconstruct.fit.fit_materials import MaterialSettings
+from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings
+from drgs.reconstruct.geometry.extract_mesh import MeshSettings
+from drgs.reconstruct.progress import STAGE_SHARES, Progress
+from drgs.render.records import SampleCounts
 from drgs.scene.asset import load_asset
-from tests.build.tiny_capture import write_nerf_synthetic
-from worker.builders import STAGES, build_with_drgs
-from worker.data_directory import DataDirectory, open_data_directory
-from worker.database import AssetRow, open_database
-from worker.job_build import BuildRun, RedecoupleRun
-from worker.job_run import JobContext
+from drgs_worker.jobs.builders import build_with_drgs
+from drgs_worker.jobs.capture_report import CaptureReport
+from drgs_worker.jobs.steps.build import BuildRun, RedecoupleRun
+from drgs_worker.jobs.steps.job_run import JobContext
+from drgs_worker.store.data_directory import DataDirectory, open_data_directory
+from drgs_worker.store.database import AssetRow, open_database
+from tests.reconstruct.tiny_capture import write_nerf_synthetic
 
 TINY = Preset(
     points=600,
@@ -46,9 +48,12 @@ def context(directory: DataDirectory, job_id: str, said: list[str], **parameters
     directory.job(job_id).mkdir(exist_ok=True)
     given = {"preset": "tiny", "seed": 0} | parameters
     capture = directory.root.parent
-    return JobContext(
-        job_id, "sphere", given, capture, directory, engine, build_with_drgs, "cpu", lambda made: said.append(made.stage), lambda: False
-    )
+
+    def tell(told: Progress | CaptureReport) -> None:
+        if isinstance(told, Progress):  # the doctor's report says of itself what it is about
+            said.append(told.stage)
+
+    return JobContext(job_id, "sphere", given, capture, directory, engine, build_with_drgs, "cpu", tell, lambda: False)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -59,6 +64,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return files | {"asset.json": json.dumps(manifest).encode()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("binding", ["particles", "mesh"])
 def test_a_build_that_begins_anew_after_every_stage_makes_the_same_asset_and_can_be_re_decoupled(
     directory: DataDirectory, binding: str
@@ -74,7 +80,7 @@ def test_a_build_that_begins_anew_after_every_stage_makes_the_same_asset_and_can
         if step == "materials":
             assert "fit" not in parts[before:]  # nothing but the capture is worked on again
     assert contents(directory.asset("a" * 32)) == contents(directory.asset("b" * 32))
-    assert list(dict.fromkeys(whole)) == list(STAGES[binding])
+    assert list(dict.fromkeys(whole)) == list(STAGE_SHARES[binding])
 
     said: list[str] = []
     asked = {"asset": "a" * 32, "preset": "more", "built_preset": "tiny", "built_seed": 0, "binding": binding}

@@ -1,8 +1,6 @@
-"""Renders, simulations, exports and new versions, each run in this process on a small real asset."""
+"""Renders, simulations and exports, each run in this process on a small real asset."""
 
-import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -13,21 +11,18 @@ import trimesh
 from PIL import Image
 
 from drgs.deform.clip import open_clip
-from drgs.deform.pose_scene import pose_scene
 from drgs.exchange.exr import encode_environment
-from drgs.scene.asset import Asset, load_asset, save_asset
-from drgs.scene.edits import parse_edits
+from drgs.reconstruct.progress import Progress
+from drgs.scene.asset import Asset, save_asset
 from drgs.scene.environment import Environment
-from drgs.scene.gaussians import surfel_tangents
-from tests.build.surfel_spheres import surfel_sphere
-from worker.builders import BuildProgress, BuildStopped
-from worker.data_directory import open_data_directory
-from worker.job_build import RedecoupleRun
-from worker.job_export import ExportRun
-from worker.job_render import RenderRun, turntable_view
-from worker.job_run import AbstractJobRun, JobContext
-from worker.job_simulate import SimulateRun
-from worker.save_version import with_edits
+from drgs_worker.jobs.progress import JobStopped
+from drgs_worker.jobs.start_view import turntable_view
+from drgs_worker.jobs.steps.build import RedecoupleRun
+from drgs_worker.jobs.steps.export import ExportRun
+from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
+from drgs_worker.jobs.steps.render import RenderRun
+from drgs_worker.jobs.steps.simulate import SimulateRun
+from drgs_worker.store.data_directory import open_data_directory
 
 ASSET, JOB = "a" * 32, "b" * 32
 SMALL = {"kind": "render", "asset": ASSET, "width": 32, "height": 24, "spp": 4, "denoise": False}
@@ -57,7 +52,7 @@ def job(tmp_path: Path, cube: Asset) -> Callable[..., JobContext]:
     (directory.environments / "dark.exr").write_bytes(encode_environment(dark))
     directory.job(JOB).mkdir()
 
-    def make(parameters: dict, progress: Callable[[BuildProgress], None] = lambda made: None, should_stop=lambda: False) -> JobContext:
+    def make(parameters: dict, progress: Callable[[Progress], None] = lambda made: None, should_stop=lambda: False) -> JobContext:
         return JobContext(JOB, "test", parameters, None, directory, None, None, "cpu", progress, should_stop)  # type: ignore[arg-type]
 
     return make
@@ -79,7 +74,7 @@ def test_a_render_makes_every_picture_once_and_a_video_of_each_row(job: Callable
         "variants": [{"name": "grey", "edits": []}, {"name": "black", "edits": [material(albedo=[0, 0, 0])]}],
         "video_fps": 12,
     }
-    reports: list[BuildProgress] = []
+    reports: list[Progress] = []
     context = job(request, reports.append)
     run(RenderRun(context))
     names = {path.name for path in context.files.iterdir()}
@@ -94,7 +89,7 @@ def test_a_render_makes_every_picture_once_and_a_video_of_each_row(job: Callable
     before = {path: path.read_bytes() for path in context.files.glob("*.png")}
     lost = context.files / "black-own-0002.png"
     lost.unlink()
-    again: list[BuildProgress] = []
+    again: list[Progress] = []
     run(RenderRun(job(request, again.append)))
     assert [made.message for made in again if made.preview_jpeg is not None] == [lost.name]  # the others were kept
     assert {path: path.read_bytes() for path in context.files.glob("*.png")} == before
@@ -118,7 +113,7 @@ def test_a_render_stops_between_slices_and_leaves_no_half_picture(job: Callable[
         return asked > 2
 
     context = job(SMALL | {"spp": 64}, should_stop=should_stop)
-    with pytest.raises(BuildStopped):
+    with pytest.raises(JobStopped):
         run(RenderRun(context))
     assert list(context.files.iterdir()) == []
 
@@ -151,12 +146,12 @@ def test_a_simulation_becomes_a_clip_that_pictures_show(job: Callable[..., JobCo
 
 def test_a_simulation_that_was_stopped_goes_on_with_the_next_frame(job: Callable[..., JobContext]) -> None:
     request = {"kind": "simulate", "asset": ASSET, "scene": {"particles": 200, "duration": 0.2, "fps": 10, "floor": None}}
-    told: list[BuildProgress] = []
+    told: list[Progress] = []
     context = job(request, told.append, lambda: len(told) >= 2)
-    with pytest.raises(BuildStopped):
+    with pytest.raises(JobStopped):
         run(SimulateRun(context))
     assert (context.folder / "frames" / "state.safetensors").is_file() and not context.directory.clip(JOB).exists()
-    again: list[BuildProgress] = []
+    again: list[Progress] = []
     run(SimulateRun(job(request, again.append)))
     assert [made.iteration for made in again] == [2, 3]
     assert told[0].eta_seconds is None and told[1].eta_seconds > 0, "one frame of three is left"
@@ -187,6 +182,7 @@ def test_a_film_passes_its_views_and_is_as_bright_as_asked(job: Callable[..., Jo
     assert darker < 0.85
 
 
+@pytest.mark.slow
 def test_an_export_writes_each_format(job: Callable[..., JobContext]) -> None:
     context = job({"kind": "export", "asset": ASSET, "formats": ["glb"]})
     run(ExportRun(context))
@@ -200,34 +196,3 @@ def test_an_export_writes_each_format(job: Callable[..., JobContext]) -> None:
 def test_an_asset_without_its_build_cannot_be_re_decoupled(job: Callable[..., JobContext]) -> None:
     with pytest.raises(ValueError, match="geometry was not kept"):
         run(RedecoupleRun(job({"kind": "redecouple", "asset": ASSET, "preset": "full"})))
-
-
-def test_a_version_looks_at_rest_as_its_edits_made_the_asset(tmp_path: Path, cube: Asset) -> None:
-    surfels = surfel_sphere(200)
-    asset = replace(cube, gaussians=surfels)
-    edits = parse_edits(
-        [
-            material(roughness=0.125),
-            {"op": "deform", "map": {"type": "bend", "curvature": 0.5}},
-            {"op": "deform", "map": {"type": "twist", "rate": 0.7}},
-            {"op": "environment", "rotation": 45.0, "intensity": 2.0},
-        ]
-    )
-    version = with_edits(asset, edits, tmp_path, 2)
-    posed = pose_scene(asset, edits)
-    assert torch.equal(version.mesh.vertices, posed.mesh.vertices) and torch.equal(version.mesh.roughness, posed.mesh.roughness)
-    assert torch.equal(version.environment.radiance, 2 * cube.environment.radiance)
-    assert version.gaussians is not None and posed.surfels is not None
-    made, wanted = surfel_tangents(version.gaussians).double(), posed.surfels.tangents.double()
-    torch.testing.assert_close(made @ made.mT, wanted @ wanted.mT, rtol=1e-4, atol=1e-7)
-    sides = torch.linalg.cross(made[..., 0], made[..., 1]) * torch.linalg.cross(wanted[..., 0], wanted[..., 1])
-    assert bool((sides.sum(-1) > 0).all())
-    save_asset(version, tmp_path / "asset")
-    assert load_asset(tmp_path / "asset").provenance["versions"] == json.loads(json.dumps(version.provenance["versions"]))
-
-
-def test_a_version_keeps_the_horizons_of_a_mesh_that_stayed_as_it_was(tmp_path: Path, cube: Asset) -> None:
-    known = replace(cube, horizons=torch.zeros(len(cube.mesh.faces), 8, dtype=torch.uint8))
-    painted, twisted = (parse_edits([edit]) for edit in (material(roughness=0.2), {"op": "deform", "map": {"type": "twist", "rate": 0.5}}))
-    assert with_edits(known, painted, tmp_path, 2).horizons is known.horizons
-    assert with_edits(known, twisted, tmp_path, 2).horizons is None

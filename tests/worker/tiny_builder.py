@@ -11,15 +11,17 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from worker.builders import STAGES, BuildProgress, BuildRequest, BuildStopped
-from worker.capture_report import CaptureReport
+from drgs.reconstruct.progress import STAGE_SHARES, Progress
+from drgs_worker.jobs.builders import BuildRequest
+from drgs_worker.jobs.capture_report import CaptureReport
+from drgs_worker.jobs.progress import JobStopped, Tell
 
 
-def build(request: BuildRequest, progress: Callable[[BuildProgress], None], should_stop: Callable[[], bool]) -> Iterator[str]:
+def build(request: BuildRequest, progress: Tell, should_stop: Callable[[], bool]) -> Iterator[str]:
     plan = json.loads((request.dataset / "plan.json").read_text())
     work = request.out.with_name(request.out.name + ".build")
     work.mkdir(exist_ok=True)
-    for stage in STAGES[request.binding]:
+    for stage in STAGE_SHARES[request.binding]:
         if stage == "fit":
             fit(request, plan, work, progress, should_stop)
         elif stage == "pack":
@@ -39,13 +41,13 @@ def other_stage(folder: Path, stage: str, plan: dict, work: Path, progress, shou
     if result.exists() and stage != "read":  # reading is repeated, as in the real builder
         return
     note(folder, stage, "begins")
-    progress(BuildProgress(stage, 0, 0, 0.0))
+    progress(Progress(stage, 0, 0, 0.0))
     if stage == "read" and "found" in plan:
-        progress(BuildProgress(stage, 0, 0, 0.0, capture=CaptureReport.model_validate(plan["found"])))
+        progress(CaptureReport.model_validate(plan["found"]))
     until = time.monotonic() + plan.get("stage_seconds", 0)
     while time.monotonic() < until:
         if should_stop():
-            raise BuildStopped
+            raise JobStopped
         time.sleep(0.02)
     result.write_text(stage)
     note(folder, stage, "ends")
@@ -66,7 +68,7 @@ def fit(request: BuildRequest, plan: dict, work: Path, progress, should_stop) ->
     with ran.open("a") as log:
         for iteration in range(first, plan["iterations"]):
             if should_stop():
-                raise BuildStopped
+                raise JobStopped
             if "fail" in plan:
                 raise ValueError(plan["fail"])
             if iteration == plan.get("die_at"):
@@ -78,6 +80,6 @@ def fit(request: BuildRequest, plan: dict, work: Path, progress, should_stop) ->
             draft.write_text(json.dumps({"next": iteration + 1}))
             draft.rename(checkpoint)
             fraction = (iteration + 1) / plan["iterations"]
-            progress(BuildProgress("fit", iteration + 1, plan["iterations"], fraction, psnr=20 + fraction, preview_jpeg=b"\xff\xd8tiny"))
+            progress(Progress("fit", iteration + 1, plan["iterations"], fraction, psnr=20 + fraction, preview_jpeg=b"\xff\xd8tiny"))
     if first < plan["iterations"]:
         (work / "stage1.safetensors").write_text("surfels")

@@ -1,12 +1,13 @@
 /** Start: sign in with the link's token if there is one, then show the page. */
 
 import { render } from 'preact';
-import * as api from './api';
-import { refreshAssets, refreshEnvironments, watchJobs } from './jobs';
-import { openAsset } from './session';
-import { attempt } from './state';
-import './style.css';
+import * as api from './session/api';
+import { watchJobs } from './session/jobs';
+import { refreshAssets, refreshEnvironments } from './session/library';
+import { attempt } from './session/notices';
+import { openAsset } from './session/session';
 import { App } from './ui/App';
+import './ui/style.css';
 
 async function start(): Promise<void> {
   const fragment = new URLSearchParams(location.hash.slice(1));

@@ -6,10 +6,12 @@ step, and, should that not help, without the particles that failed.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from drgs.deform.mpm.blocks import BLOCK_NODES, DRIFT, TILE_NODES, WALL, Blocks, Lattice, make_lattice, sort_particles
@@ -55,13 +57,18 @@ class AdvanceReport:
 class _Failed(Exception):
     """A step went wrong; holds the particles (bool, in their original order) that are to blame."""
 
-    def __init__(self, culprits: Tensor) -> None:
+    def __init__(self, culprits: Bool[Tensor, "particle"]) -> None:
         super().__init__()
         self.culprits = culprits
 
 
-def advance(model: Model, state: State, seconds: float, settings: MpmSettings | None = None) -> tuple[State, AdvanceReport]:
+def advance(
+    model: Model, state: State, seconds: float, settings: MpmSettings | None = None, go_on: Callable[[], None] | None = None
+) -> tuple[State, AdvanceReport]:
     """The state `seconds` later; the one given is not changed.
+
+    Args:
+        go_on: called between batches of substeps; what it raises ends the work.
 
     Raises:
         ValueError: it would take more than `max_substeps`.
@@ -76,7 +83,7 @@ def advance(model: Model, state: State, seconds: float, settings: MpmSettings | 
     while True:
         try:
             # When somebody is about to be stopped, every step is looked at: after a batch, all around them have failed as well.
-            after, report = _run(model, start, seconds, settings, scale, BATCH if retries < settings.retries else 1)
+            after, report = _run(model, start, seconds, settings, scale, BATCH if retries < settings.retries else 1, go_on)
             return after, replace(report, retries=retries)
         except _Failed as failure:
             retries += 1
@@ -85,8 +92,8 @@ def advance(model: Model, state: State, seconds: float, settings: MpmSettings | 
                 # The time step is not to blame. All that fail are stopped; in the end that is everything.
                 culprits = failure.culprits if retries <= settings.retries + 3 else torch.ones_like(failure.culprits)
                 scale = 2.0**-settings.retries
-                still = torch.where(culprits[:, None], torch.zeros_like(start.velocities), start.velocities)
-                start = replace(start, frozen=start.frozen | culprits, velocities=still)
+                velocities = torch.where(culprits[:, None], torch.zeros_like(start.velocities), start.velocities)
+                start = replace(start, frozen=start.frozen | culprits, velocities=velocities)
                 if bool(start.frozen.all()):
                     return replace(start, time=start.time + seconds), AdvanceReport(0, retries, len(start.frozen), 0.0, False, False)
 
@@ -102,7 +109,7 @@ class _Work:
     """Sorted copies of everything, on which kernels write in place."""
 
     arrays: dict[str, Tensor]
-    order: Tensor
+    order: Int[Tensor, "particle"]
     """Place in the arrays -> particle."""
     blocks: Blocks
     grid: Grid
@@ -111,7 +118,9 @@ class _Work:
     """Cells that some particle may have moved since the last sort."""
 
 
-def _run(model: Model, state: State, seconds: float, settings: MpmSettings, scale: float, batch: int) -> tuple[State, AdvanceReport]:
+def _run(
+    model: Model, state: State, seconds: float, settings: MpmSettings, scale: float, batch: int, go_on: Callable[[], None] | None
+) -> tuple[State, AdvanceReport]:
     lattice = make_lattice(model.grid)
     device = model.rest.device
     conditions = pack_conditions(model.conditions, device)
@@ -122,6 +131,8 @@ def _run(model: Model, state: State, seconds: float, settings: MpmSettings, scal
     own_speeds = [_speed(c) for c in model.conditions if c.effect != "push"]
     done, substeps, smallest, blast = 0.0, 0, math.inf, math.inf
     while done < seconds:
+        if go_on is not None:
+            go_on()
         speed = float(work.arrays["velocities"].norm(dim=-1).max())
         if not math.isfinite(speed):
             raise _Failed(_culprits(work))
@@ -240,7 +251,7 @@ def _unsorted(work: _Work, time: float) -> State:
     return State(**{name: work.arrays[name][back].contiguous() for name in MOVING}, time=time)
 
 
-def _culprits(work: _Work, speed: float = math.inf) -> Tensor:
+def _culprits(work: _Work, speed: float = math.inf) -> Bool[Tensor, "particle"]:
     """Particles (bool, in their original order) with values that are not finite, or faster than anything was expected to be."""
     bad = torch.zeros(len(work.order), dtype=torch.bool, device=work.order.device)
     for name in ("positions", "velocities", "affine", "total", "elastic", "stress"):

@@ -8,6 +8,7 @@ the blocks around them, and gather from the tiles that cover them.
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.deform.mpm.records import GridSettings
@@ -57,16 +58,16 @@ def make_lattice(settings: GridSettings) -> Lattice:
 class Blocks:
     """Where particles are, until they are sorted again."""
 
-    order: Tensor
-    """(particle,) int64: place in the sorted arrays -> particle."""
-    block_of: Tensor
-    """(particle,) int32, of sorted particles."""
-    starts: Tensor
-    """(blocks with particles + 1,) int32: each one's first sorted particle."""
-    corners: Tensor
-    """(block, 3) int32, first node of each block; those with particles come first."""
-    neighbours: Tensor
-    """(block, 27) int32: places of the blocks around, x slowest; -1 where there is none."""
+    order: Int[Tensor, "particle"]
+    """int64: place in the sorted arrays -> particle."""
+    block_of: Int[Tensor, "particle"]
+    """int32, of sorted particles."""
+    starts: Int[Tensor, "filled_plus_1"]
+    """int32: each filled block's first sorted particle."""
+    corners: Int[Tensor, "block 3"]
+    """int32, first node of each block; those with particles come first."""
+    neighbours: Int[Tensor, "block 27"]
+    """int32: places of the blocks around, x slowest; -1 where there is none."""
 
     @property
     def filled(self) -> int:
@@ -74,7 +75,7 @@ class Blocks:
         return len(self.starts) - 1
 
 
-def sort_particles(positions: Tensor, lattice: Lattice) -> Blocks:
+def sort_particles(positions: Float[Tensor, "particle 3"], lattice: Lattice) -> Blocks:
     """Sort positions (particle, 3) into blocks, by cell within each; stable, so the same on every run."""
     device = positions.device
     sizes = torch.tensor(lattice.blocks, device=device)
@@ -103,16 +104,18 @@ def sort_particles(positions: Tensor, lattice: Lattice) -> Blocks:
     return Blocks(order, block_of.int(), starts.int(), corners.contiguous(), neighbours.contiguous())
 
 
-def _linear(block: Tensor, sizes: Tensor) -> Tensor:
+def _linear(block: Int[Tensor, "*n 3"], sizes: Int[Tensor, "3"]) -> Int[Tensor, "*n"]:
     return (block[..., 0] * sizes[1] + block[..., 1]) * sizes[2] + block[..., 2]
 
 
-def _unravel(linear: Tensor, sizes: Tensor) -> Tensor:
+def _unravel(linear: Int[Tensor, "*n"], sizes: Int[Tensor, "3"]) -> Int[Tensor, "*n 3"]:
     plane = sizes[1] * sizes[2]
     return torch.stack([linear // plane, linear % plane // sizes[2], linear % sizes[2]], -1)
 
 
-def _around(linear: Tensor, offsets: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
+def _around(
+    linear: Int[Tensor, "block"], offsets: Int[Tensor, "27 3"], sizes: Int[Tensor, "3"]
+) -> tuple[Int[Tensor, "block 27"], Bool[Tensor, "block 27"]]:
     """(block, 27) indices of the blocks around, clamped into the room, and which of them exist."""
     block = _unravel(linear, sizes)[:, None] + offsets
     valid = ((block >= 0) & (block < sizes)).all(-1)

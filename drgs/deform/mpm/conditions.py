@@ -2,9 +2,11 @@
 
 import torch
 import warp as wp
+from jaxtyping import Float
 from torch import Tensor
 
 from drgs.deform.mpm.records import Box, Condition, Plane, Solid, Sphere
+from drgs.maths.constants import UNBOUNDED
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,7 +20,9 @@ MOST_DISTANCES = 1 << 24
 """Of all solids: places up to here are exact in float32."""
 
 
-def pack_conditions(conditions: tuple[Condition, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+def pack_conditions(
+    conditions: tuple[Condition, ...], device: torch.device
+) -> tuple[Float[Tensor, "condition width"], Float[Tensor, "distance"]]:
     """(condition, WIDTH) float32, one row each, and the distances of all solids, as `apply_conditions` reads them.
 
     Raises:
@@ -26,7 +30,10 @@ def pack_conditions(conditions: tuple[Condition, ...], device: torch.device) -> 
     """
     rows, distances, place = [], [torch.zeros(1, device=device)], 1
     for condition in conditions:
-        shape, nodes = condition.shape, (0, 0, 0)
+        shape = condition.shape
+        point: tuple[float, ...]
+        second: tuple[float, ...]
+        nodes: tuple[int, ...] = (0, 0, 0)
         if isinstance(shape, Plane):
             length = sum(c * c for c in shape.normal) ** 0.5
             if not length > 0:
@@ -66,13 +73,13 @@ def nearest_face(q: wp.vec3, half: wp.vec3):
 
 
 @wp.func
-def distance_from_solid(q: wp.vec3, place: int, nx: int, ny: int, nz: int, distances: wp.array(dtype=float)):
+def distance_from_solid(q: wp.vec3, place: int, nx: int, ny: int, nz: int, distances: wp.array[float]):
     """Trilinear, at q in cells from the lattice's first node; negative inside, huge beyond the lattice."""
     x = int(wp.floor(q[0]))
     y = int(wp.floor(q[1]))
     z = int(wp.floor(q[2]))
     if x < 0 or y < 0 or z < 0 or x > nx - 2 or y > ny - 2 or z > nz - 2:
-        return float(1.0e30)
+        return float(UNBOUNDED)
     fy = q[1] - float(y)
     fz = q[2] - float(z)
     low = place + (x * ny + y) * nz + z
@@ -83,7 +90,7 @@ def distance_from_solid(q: wp.vec3, place: int, nx: int, ny: int, nz: int, dista
 
 
 @wp.func
-def normal_of_solid(q: wp.vec3, place: int, nx: int, ny: int, nz: int, distances: wp.array(dtype=float)):
+def normal_of_solid(q: wp.vec3, place: int, nx: int, ny: int, nz: int, distances: wp.array[float]):
     """Outward, at a point inside: differences over one cell, centred, so that a curved surface tilts no normal to one side."""
     x = wp.vec3(0.5, 0.0, 0.0)
     y = wp.vec3(0.0, 0.5, 0.0)
@@ -98,7 +105,7 @@ def normal_of_solid(q: wp.vec3, place: int, nx: int, ny: int, nz: int, distances
 
 @wp.func
 def apply_conditions(
-    position: wp.vec3, velocity: wp.vec3, dt: float, time: float, conditions: wp.array2d(dtype=float), distances: wp.array(dtype=float)
+    position: wp.vec3, velocity: wp.vec3, dt: float, time: float, conditions: wp.array2d[float], distances: wp.array[float]
 ):
     """A node's velocity after all conditions, in their order."""
     v = velocity

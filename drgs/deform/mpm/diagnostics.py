@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from drgs.deform.mpm.records import LAWS, Model, State
@@ -21,10 +22,9 @@ class Balance:
     """Totals over all particles, in float64."""
 
     mass: float
-    momentum: Tensor
-    """(3,)"""
-    angular_momentum: Tensor
-    """(3,) about the world's origin, with that of the affine velocities, for a grid of this dx."""
+    momentum: Float[Tensor, "3"]
+    angular_momentum: Float[Tensor, "3"]
+    """About the world's origin, with that of the affine velocities, for a grid of this dx."""
     kinetic: float
     """Energy of the velocities and of the affine velocities."""
     elastic: float
@@ -52,7 +52,9 @@ def measure_balance(model: Model, state: State) -> Balance:
     )
 
 
-def energy_density(law: str, elastic: Tensor, plastic: Tensor, parameters: Tensor) -> Tensor:
+def energy_density(
+    law: str, elastic: Float[Tensor, "n 3 3"], plastic: Float[Tensor, "n"], parameters: Float[Tensor, "n 4"]
+) -> Float[Tensor, "n"]:
     """(n,) psi, the elastic energy in a cubic unit of rest volume: the specification that stresses are derived from.
 
     Args:
@@ -71,10 +73,10 @@ def energy_density(law: str, elastic: Tensor, plastic: Tensor, parameters: Tenso
     u, s, vt = torch.linalg.svd(elastic)
     signed = torch.cat([s[:, :2], s[:, 2:] * torch.sign(torch.linalg.det(u @ vt))[:, None]], 1)
     if law in ("fixed_corotated", "snow"):
-        factor = 1.0
-        if law == "snow":
-            factor = torch.exp(float(SNOW_HARDENING) * (1 - plastic)).clamp(float(SNOW_LEAST_FACTOR), float(SNOW_MOST_FACTOR))
-        return factor * (a * (signed - 1).square().sum(1) + 0.5 * b * (j - 1).square())
+        energy = a * (signed - 1).square().sum(1) + 0.5 * b * (j - 1).square()
+        if law == "fixed_corotated":
+            return energy
+        return energy * torch.exp(float(SNOW_HARDENING) * (1 - plastic)).clamp(float(SNOW_LEAST_FACTOR), float(SNOW_MOST_FACTOR))
     e = torch.log(signed.clamp(float(LEAST_STRETCH), float(MOST_STRETCH)))
     return a * e.square().sum(1) + 0.5 * b * e.sum(1).square()
 

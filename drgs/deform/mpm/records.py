@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 Law = Literal["fixed_corotated", "neo_hookean", "von_mises", "drucker_prager", "fluid", "snow"]
@@ -116,8 +117,8 @@ class Solid:
     minimum: Triple
     """Where the lattice's first node lies; beyond the lattice nothing is inside."""
     spacing: float
-    distances: Tensor
-    """(x, y, z) float32, negative inside."""
+    distances: Float[Tensor, "x y z"]
+    """Negative inside."""
 
 
 @dataclass(frozen=True)
@@ -174,16 +175,16 @@ class MpmSettings:
 class Model:
     """What does not change while time passes."""
 
-    rest: Tensor
-    """(particle, 3) positions at rest."""
-    volumes: Tensor
-    """(particle,) at rest."""
-    masses: Tensor
-    """(particle,) kg."""
-    laws: Tensor
-    """(particle,) int32, places in LAWS."""
-    parameters: Tensor
-    """(particle, 4): see Material.parameters."""
+    rest: Float[Tensor, "particle 3"]
+    """Positions at rest."""
+    volumes: Float[Tensor, "particle"]
+    """At rest."""
+    masses: Float[Tensor, "particle"]
+    """kg"""
+    laws: Int[Tensor, "particle"]
+    """int32, places in LAWS."""
+    parameters: Float[Tensor, "particle 4"]
+    """See Material.parameters."""
     wave_speed: float
     """The fastest material's."""
     grid: GridSettings
@@ -196,31 +197,29 @@ class Model:
 class State:
     """Matter at one time."""
 
-    positions: Tensor
-    """(particle, 3)."""
-    velocities: Tensor
-    """(particle, 3)."""
-    affine: Tensor
-    """(particle, 3, 3) C, the local velocity gradient."""
-    total: Tensor
-    """(particle, 3, 3) F against rest; a rotation for fluid and sand, whose stretches mean nothing once they have mixed."""
-    elastic: Tensor
-    """(particle, 3, 3) F_e: what stress comes from."""
-    stress: Tensor
-    """(particle, 3, 3) Kirchhoff stress of F_e."""
-    plastic: Tensor
-    """(particle,) von_mises: growth of the yield stress; drucker_prager: volume gained; snow: J_p; fluid: J."""
-    frozen: Tensor
-    """(particle,) bool: taken out of the motion after repeated failure."""
+    positions: Float[Tensor, "particle 3"]
+    velocities: Float[Tensor, "particle 3"]
+    affine: Float[Tensor, "particle 3 3"]
+    """C, the local velocity gradient."""
+    total: Float[Tensor, "particle 3 3"]
+    """F against rest; a rotation for fluid and sand, whose stretches mean nothing once they have mixed."""
+    elastic: Float[Tensor, "particle 3 3"]
+    """F_e: what stress comes from."""
+    stress: Float[Tensor, "particle 3 3"]
+    """Kirchhoff stress of F_e."""
+    plastic: Float[Tensor, "particle"]
+    """von_mises: growth of the yield stress; drucker_prager: volume gained; snow: J_p; fluid: J."""
+    frozen: Bool[Tensor, "particle"]
+    """Taken out of the motion after repeated failure."""
     time: float
     """Seconds."""
 
 
 def make_model(
-    positions: Tensor,
-    volumes: Tensor,
+    positions: Float[Tensor, "particle 3"],
+    volumes: Float[Tensor, "particle"],
     materials: tuple[Material, ...],
-    material_of: Tensor,
+    material_of: Int[Tensor, "particle"],
     grid: GridSettings,
     gravity: Triple = (0.0, 0.0, 0.0),
     conditions: tuple[Condition, ...] = (),
@@ -251,7 +250,7 @@ def make_model(
     )  # fmt: skip
 
 
-def rest_state(model: Model, velocity: Triple | Tensor = (0.0, 0.0, 0.0)) -> State:
+def rest_state(model: Model, velocity: Triple | Float[Tensor, "particle 3"] = (0.0, 0.0, 0.0)) -> State:
     """Matter at rest, unstrained, moving with one velocity or with one for each particle."""
     count, device = len(model.rest), model.rest.device
     velocities = torch.as_tensor(velocity, dtype=torch.float32, device=device).expand(count, 3).contiguous()

@@ -196,24 +196,3 @@ def respond(law: int, trial: wp.mat33, plastic: float, affine: wp.mat33, dt: flo
     else:
         elastic, after, tau = snow(u, s, v, plastic, parameters)
     return elastic, after, tau
-
-
-@wp.kernel
-def evaluate_laws(
-    first: int,
-    laws: wp.array[wp.int32],
-    parameters: wp.array[wp.vec4],
-    trial: wp.array[wp.mat33],
-    affine: wp.array[wp.mat33],
-    dt: float,
-    # outputs
-    plastic: wp.array[float],
-    elastic: wp.array[wp.mat33],
-    stress: wp.array[wp.mat33],
-):
-    """The response of each particle; `plastic` is updated in place."""
-    i = first + wp.tid()
-    f, after, tau = respond(laws[i], trial[i], plastic[i], affine[i], dt, parameters[i])
-    elastic[i] = f
-    plastic[i] = after
-    stress[i] = tau

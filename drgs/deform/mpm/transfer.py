@@ -35,30 +35,30 @@ class Grid:
     nodes_x: int
     nodes_y: int
     nodes_z: int
-    corners: wp.array(dtype=wp.vec3i)
-    neighbours: wp.array2d(dtype=wp.int32)
-    starts: wp.array(dtype=wp.int32)
-    block_of: wp.array(dtype=wp.int32)
-    tiles: wp.array(dtype=wp.vec4)
+    corners: wp.array[wp.vec3i]
+    neighbours: wp.array2d[wp.int32]
+    starts: wp.array[wp.int32]
+    block_of: wp.array[wp.int32]
+    tiles: wp.array[wp.vec4]
     """Momentum and mass."""
-    nodes: wp.array(dtype=wp.vec4)
+    nodes: wp.array[wp.vec4]
     """Velocity, and 1 where there is mass."""
 
 
 @wp.struct
 class Matter:
-    x: wp.array(dtype=wp.vec3)
-    v: wp.array(dtype=wp.vec3)
-    c: wp.array(dtype=wp.mat33)
-    total: wp.array(dtype=wp.mat33)
-    elastic: wp.array(dtype=wp.mat33)
-    stress: wp.array(dtype=wp.mat33)
-    plastic: wp.array(dtype=float)
-    mass: wp.array(dtype=float)
-    volume: wp.array(dtype=float)
-    law: wp.array(dtype=wp.int32)
-    parameters: wp.array(dtype=wp.vec4)
-    frozen: wp.array(dtype=wp.bool)
+    x: wp.array[wp.vec3]
+    v: wp.array[wp.vec3]
+    c: wp.array[wp.mat33]
+    total: wp.array[wp.mat33]
+    elastic: wp.array[wp.mat33]
+    stress: wp.array[wp.mat33]
+    plastic: wp.array[float]
+    mass: wp.array[float]
+    volume: wp.array[float]
+    law: wp.array[wp.int32]
+    parameters: wp.array[wp.vec4]
+    frozen: wp.array[wp.bool]
 
 
 def _source(name: str) -> str:
@@ -68,14 +68,14 @@ def _source(name: str) -> str:
 @wp.func_native(_source("spread_particle.h"))
 def spread_particle(
     first: int, start: wp.vec4, qx: wp.vec4, qy: wp.vec4, qz: wp.vec4, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3,
-    tiles: wp.array(dtype=wp.vec4),
+    tiles: wp.array[wp.vec4],
 ): ...  # fmt: skip
 
 
 @wp.func_native(_source("collect_nodes.h"))
 def collect_nodes(
     block: int, x: int, y: int, z: int, f: wp.vec3, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3,
-    neighbours: wp.array2d(dtype=wp.int32), nodes: wp.array(dtype=wp.vec4),
+    neighbours: wp.array2d[wp.int32], nodes: wp.array[wp.vec4],
 ) -> wp.mat44: ...  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def spline(f: float):
 
 
 @wp.func
-def deposit(p: int, block: int, matter: Matter, grid: Grid, dt: float, affine: float, flags: wp.array(dtype=wp.int32)):
+def deposit(p: int, block: int, matter: Matter, grid: Grid, dt: float, affine: float, flags: wp.array[wp.int32]):
     """Add one particle's momentum, force times dt and mass to its block's tile."""
     x = matter.x[p]
     v = matter.v[p]
@@ -129,7 +129,7 @@ def deposit(p: int, block: int, matter: Matter, grid: Grid, dt: float, affine: f
 
 
 @wp.kernel
-def scatter_blocks(first: int, matter: Matter, grid: Grid, dt: float, affine: float, flags: wp.array(dtype=wp.int32)):
+def scatter_blocks(first: int, matter: Matter, grid: Grid, dt: float, affine: float, flags: wp.array[wp.int32]):
     block = first + wp.tid()
     for n in range(TILE_SIZE):
         grid.tiles[block * TILE_SIZE + n] = wp.vec4()
@@ -138,7 +138,7 @@ def scatter_blocks(first: int, matter: Matter, grid: Grid, dt: float, affine: fl
 
 
 @wp.kernel
-def scatter_particles(first: int, matter: Matter, grid: Grid, dt: float, affine: float, flags: wp.array(dtype=wp.int32)):
+def scatter_particles(first: int, matter: Matter, grid: Grid, dt: float, affine: float, flags: wp.array[wp.int32]):
     """Tiles must have been cleared."""
     p = first + wp.tid()
     deposit(p, grid.block_of[p], matter, grid, dt, affine, flags)
@@ -162,8 +162,8 @@ def update_nodes(
     dt: float,
     time: float,
     gravity: wp.vec3,
-    conditions: wp.array2d(dtype=float),
-    distances: wp.array(dtype=float),
+    conditions: wp.array2d[float],
+    distances: wp.array[float],
 ):
     i = first + wp.tid()
     block = i // BLOCK_SIZE
@@ -210,7 +210,7 @@ def update_nodes(
 
 @wp.kernel
 def gather_particles(
-    first: int, matter: Matter, grid: Grid, dt: float, strain_kept: float, velocity_kept: float, flags: wp.array(dtype=wp.int32)
+    first: int, matter: Matter, grid: Grid, dt: float, strain_kept: float, velocity_kept: float, flags: wp.array[wp.int32]
 ):
     p = first + wp.tid()
     if matter.frozen[p]:

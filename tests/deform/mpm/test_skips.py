@@ -18,7 +18,13 @@ def cube(materials=None, side=8, room=1.5, conditions=(), gravity=(0.0, 0.0, 0.0
     points = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     grid = GridSettings((-room, -room, -room), (room, room, room), DX)
     return make_model(
-        points, torch.full((len(points),), (DX / 2) ** 3), materials or (Material(),), torch.zeros(len(points)), grid, gravity, conditions
+        points,
+        torch.full((len(points),), (DX / 2) ** 3),
+        materials or (Material(),),
+        torch.zeros(len(points), dtype=torch.int32),
+        grid,
+        gravity,
+        conditions,
     )
 
 

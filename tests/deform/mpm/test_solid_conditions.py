@@ -25,13 +25,16 @@ def block(shape, effect="separate", friction=0.0, gravity=(0.0, 0.0, -9.81), vel
     condition = Condition(shape, effect, friction, own)
     grid = GridSettings((-1.5, -1.5, 0.0), (1.5, 1.5, 2.0), DX)
     volumes = torch.full((len(points),), (DX / 2) ** 3)
-    model = make_model(points, volumes, (Material(young_modulus=5e4),), torch.zeros(len(points)), grid, gravity, (condition,))
+    model = make_model(
+        points, volumes, (Material(young_modulus=5e4),), torch.zeros(len(points), dtype=torch.int32), grid, gravity, (condition,)
+    )
     return model, rest_state(model, velocity)
 
 
 TABLE = ((-1.0, -1.0, -0.3), (1.0, 1.0, 0.2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["sticky", "slip", "separate"])
 def test_a_mesh_box_acts_as_the_plane_that_is_its_top(effect):
     ends = []
@@ -86,6 +89,7 @@ def test_distances_of_a_box_are_exact_on_every_side_and_inside_is_negative():
     assert torch.equal(distances_from_solid(solid, random) < 0, inside)
 
 
+@pytest.mark.slow
 def test_a_holed_mesh_still_has_an_inside_and_large_ones_get_a_larger_spacing():
     vertices, faces = mesh_box(*TABLE)
     holed = measure_solid(vertices, faces[1:], 0.1)
@@ -124,7 +128,7 @@ def test_boxes_beside_solids_in_one_list_both_act():
     solid = measure_solid(*mesh_box(*TABLE), DX)
     model, state = block(solid)
     both = make_model(
-        model.rest, model.volumes, (Material(young_modulus=5e4),), torch.zeros(len(model.rest)), model.grid, (0, 0, -9.81),
+        model.rest, model.volumes, (Material(young_modulus=5e4),), torch.zeros(len(model.rest), dtype=torch.int32), model.grid, (0, 0, -9.81),
         (Condition(Box((-1, -1, 0.3), (1, 1, 1)), "sticky"), Condition(solid), Condition(Sphere((3, 3, 3), 0.1))),
     )  # fmt: skip
     after, _ = advance(both, state, 0.1)

@@ -7,14 +7,37 @@ import torch
 
 from drgs.deform.mpm import LAWS, Material
 from drgs.deform.mpm.diagnostics import energy_density
-from drgs.deform.mpm.stress_laws import evaluate_laws
+from drgs.deform.mpm.stress_laws import respond
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.reference import mpm as reference
 from drgs.warp_torch import launch, warp_array
 
 import warp as wp  # isort: skip
 
+wp.set_module_options({"enable_backward": False})
+
 STIFF = {"young_modulus": 1e5, "poisson_ratio": 0.3}
+
+
+@wp.kernel
+def evaluate_laws(
+    first: int,
+    laws: wp.array[wp.int32],
+    parameters: wp.array[wp.vec4],
+    trial: wp.array[wp.mat33],
+    affine: wp.array[wp.mat33],
+    dt: float,
+    # outputs
+    plastic: wp.array[float],
+    elastic: wp.array[wp.mat33],
+    stress: wp.array[wp.mat33],
+):
+    """The response of each particle; `plastic` is updated in place."""
+    i = first + wp.tid()
+    f, after, tau = respond(laws[i], trial[i], plastic[i], affine[i], dt, parameters[i])
+    elastic[i] = f
+    plastic[i] = after
+    stress[i] = tau
 
 
 def rotations(count):
@@ -97,6 +120,7 @@ def test_the_kernel_agrees_with_the_float64_twin(law):
         assert float((ours - twin).abs().max()) <= tolerance * max(1.0, float(twin.abs().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("determinant", [-1.0, -1e-3, 0.0, 1e-6, 1e-3, 1.0, 1e3])
 def test_no_gradient_whatever_its_determinant_makes_a_stress_that_is_not_finite(law, determinant):

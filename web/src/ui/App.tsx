@@ -1,22 +1,26 @@
 /** The page: full-window stage, panels over it, files dropped anywhere. */
 
 import { useEffect, useRef, useState } from 'preact/hooks';
-import { CHANNELS, wireframe } from '../channels';
-import { stepView, turnPhotographs, viewNumber } from '../photographs';
-import { redo, undo, changeSettings } from '../session';
-import { selectAll } from '../selecting';
-import { choose, removeChosen, turning } from '../shaping';
-import { listenForKeys, titleFor, type Actions } from '../shortcuts';
-import { assets, before, dismiss, flash, flying, helpOpen, inspectorOpen, libraryOpen, localPicture, log, notices, notify, session, theme } from '../state';
-import type { Viewport } from '../viewport';
-import { download } from '../download';
-import { Compare, turnSplit } from './Compare';
+import { showPhotographs, stepView, viewNumber } from '../capture/photographs';
+import { copyMaterial, pasteMaterial } from '../edit/material/presets';
+import { flash, selectAll } from '../edit/material/selection';
+import { choose, gizmoMode, removeChosen } from '../edit/shape/shape_tools';
+import { log, redo, undo } from '../session/edit_log';
+import { assets } from '../session/library';
+import { dismiss, notices, notify } from '../session/notices';
+import { changeSettings, session } from '../session/session';
+import { CHANNELS } from '../stage/channels';
+import { before, flying, localPicture, wireframe } from '../stage/switches';
+import type { Viewport } from '../stage/viewport';
+import { Compare, toggleSplit } from './Compare';
 import { Help } from './Help';
 import { Hud } from './Hud';
+import { download } from './download';
 import { Icon } from './icons';
-import { Inspector } from './Inspector';
-import { Library, takeFiles } from './Library';
-import { copyMaterial, pasteMaterial } from './MaterialPanel';
+import { Inspector } from './inspector/Inspector';
+import { helpOpen, inspectorOpen, libraryOpen, theme } from './layout';
+import { Library, takeFiles } from './library/Library';
+import { listenForKeys, titleFor, type Actions } from './shortcuts';
 
 export function App() {
   const stage = useRef<HTMLDivElement>(null);
@@ -33,7 +37,7 @@ export function App() {
   useEffect(() => {
     let gone = false;
     // three.js comes in its own file: panels and builds do not wait for it.
-    void import('../viewport').then(({ Viewport }) => {
+    void import('../stage/viewport').then(({ Viewport }) => {
       if (!gone) viewport.current = new Viewport(stage.current!, traced.current!, local.current!);
     });
     const actions: Actions = {
@@ -52,7 +56,7 @@ export function App() {
       all: selectAll,
       show: () => flash.value++,
       remove: removeChosen,
-      turn: () => (turning.value = !turning.value),
+      turn: () => (gizmoMode.value = gizmoMode.value === 'rotate' ? 'translate' : 'rotate'),
       copy: copyMaterial,
       paste: pasteMaterial,
       before: () => (before.value = true),
@@ -62,10 +66,10 @@ export function App() {
       inspector: () => (inspectorOpen.value = !inspectorOpen.value),
       ...Object.fromEntries(CHANNELS.map(({ value }, i) => [`channel${i + 1}`, () => changeSettings({ channel: value })])),
       wireframe: () => session.value && (wireframe.value = !wireframe.value),
-      photographs: () => session.value && turnPhotographs(viewNumber.value === null),
+      photographs: () => session.value && showPhotographs(viewNumber.value === null),
       previousView: () => stepView(-1),
       nextView: () => stepView(1),
-      split: () => session.value && turnSplit(),
+      split: () => session.value && toggleSplit(),
       still: () => void saveStill(),
     };
     const silence = listenForKeys(actions, { before: () => (before.value = false) }, () => flying.value);

@@ -1,13 +1,13 @@
 /** Photograph, captured object and divider over the picture, and what the View page says of them. */
 
-import * as api from '../api';
-import { capturedStill } from '../captured_still';
-import { freeEdges } from '../free_area';
-import { photographInSight, photographOpacity, photographPlace, split, stepView, trainingViews, turnPhotographs, viewInSight, viewNumber } from '../photographs';
-import { titleFor } from '../shortcuts';
-import { session } from '../state';
+import * as api from '../session/api';
+import { capturedStill } from '../capture/captured_still';
+import { photographInSight, photographOpacity, photographPlace, showPhotographs, split, stepView, trainingViews, viewInSight, viewNumber } from '../capture/photographs';
+import { session } from '../session/session';
+import { freeEdges } from '../stage/camera/free_area';
 import { Section, Slider, Switch } from './fields';
 import { Icon } from './icons';
+import { titleFor } from './shortcuts';
 
 const STEP = 0.01;
 const BIG_STEP = 0.1;
@@ -15,7 +15,7 @@ const BIG_STEP = 0.1;
 const EDGE = 0.02;
 
 /** At first through the middle of what the panels leave free, where the object is. */
-export function turnSplit(): void {
+export function toggleSplit(): void {
   const { left, right } = freeEdges(window.innerWidth, window.innerHeight);
   split.value = split.value === null ? (left + right) / 2 / window.innerWidth : null;
 }
@@ -99,7 +99,7 @@ function ViewBar() {
       <button class="ghost" aria-label={`Next ${what}`} title={titleFor('nextView')} onClick={() => stepView(1)}>
         <Icon name="right" />
       </button>
-      <button class="ghost" aria-label="Leave the view" title={titleFor('photographs', 'Leave: the camera goes back to where it was')} onClick={() => turnPhotographs(false)}>
+      <button class="ghost" aria-label="Leave the view" title={titleFor('photographs', 'Leave: the camera goes back to where it was')} onClick={() => showPhotographs(false)}>
         <Icon name="close" />
       </button>
     </nav>
@@ -122,14 +122,14 @@ export function CompareSection() {
   const count = known?.views.length ?? 0;
   return (
     <Section title="Compare">
-      <Switch label="Split the window" title={titleFor('split', 'The object as captured on the left, or the photograph; as it is now on the right. Drag the line, or move it with the arrow keys')} value={split.value !== null} onChange={turnSplit} />
+      <Switch label="Split the window" title={titleFor('split', 'The object as captured on the left, or the photograph; as it is now on the right. Drag the line, or move it with the arrow keys')} value={split.value !== null} onChange={toggleSplit} />
       {count > 0 && (
         <>
           <Switch
             label={known!.has_photographs ? 'Photographs, from their own cameras' : 'Look through the cameras of the capture'}
             title={titleFor('photographs', 'Begins with the one nearest to the present view; the arrow keys go on. Leaving brings the camera back')}
             value={viewNumber.value !== null}
-            onChange={turnPhotographs}
+            onChange={showPhotographs}
           />
           {viewNumber.value !== null && (
             <Slider label="View" value={viewNumber.value + 1} min={1} max={Math.max(2, count)} step={1} onChange={(value) => (viewNumber.value = Math.min(count, value) - 1)} />

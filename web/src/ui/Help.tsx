@@ -1,9 +1,9 @@
 /** The `?` overlay, written from the shortcut table. */
 
 import { useEffect, useRef } from 'preact/hooks';
-import { chordText, shortcuts } from '../shortcuts';
-import { helpOpen } from '../state';
 import { Icon } from './icons';
+import { helpOpen } from './layout';
+import { chordText, shortcuts } from './shortcuts';
 
 export function Help() {
   const dialog = useRef<HTMLDialogElement>(null);

@@ -1,7 +1,7 @@
 /** What the picture is right now: samples, size, speed, and whether the server is there. */
 
-import { entryOf } from '../channels';
-import { connection, session, settings, status } from '../state';
+import { connection, session, settings, status } from '../session/session';
+import { entryOf } from '../stage/channels';
 
 const PHASE_TEXT = { loading: 'Loading the asset…', moving: 'Moving', still: 'Refining', converged: 'Converged', paused: 'Paused' };
 

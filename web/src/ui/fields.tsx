@@ -1,8 +1,9 @@
-/** Form pieces that every panel uses. While a value is dragged they show the dragged value, not the echo of the server. */
+/** Form pieces that every panel uses. While a value is dragged they show it, not the server's echo. */
 
 import { useState } from 'preact/hooks';
 import type { ComponentChildren, InputHTMLAttributes } from 'preact';
-import { hexFromLinear, linearFromHex, type Triple } from '../color';
+import type { Vec3 } from '../session/view';
+import { hexFromLinear, linearFromHex, type Rgb } from '../edit/material/color';
 import { Icon } from './icons';
 
 export function Section({ title, children, open = true }: { title: string; children: ComponentChildren; open?: boolean }) {
@@ -36,7 +37,7 @@ function Entry({ value, onEnter, ...attributes }: EntryProps) {
   );
 }
 
-export interface SliderProps {
+interface SliderProps {
   label: string;
   value: number;
   min: number;
@@ -147,9 +148,9 @@ function ResetButton({ label, onReset }: { label: string; onReset?: () => void }
 
 interface ColorProps {
   label: string;
-  value: Triple;
+  value: Rgb;
   unset?: boolean;
-  onChange(value: Triple): void;
+  onChange(value: Rgb): void;
   onCommit?: () => void;
   onReset?: () => void;
 }
@@ -189,7 +190,7 @@ export function ColorField({ label, value, unset, onChange, onCommit, onReset }:
             onEnter={(text) => {
               const number = Number(text);
               if (text.trim() === '' || !Number.isFinite(number)) return;
-              onChange(value.map((old, k) => (k === i ? clamp(number, 0, 1) : old)) as Triple);
+              onChange(value.map((old, k) => (k === i ? clamp(number, 0, 1) : old)) as Rgb);
               onCommit?.();
             }}
           />
@@ -201,10 +202,10 @@ export function ColorField({ label, value, unset, onChange, onCommit, onReset }:
 
 interface PlaceProps {
   label: string;
-  value: Triple;
+  value: Vec3;
   step: number;
   unit?: string;
-  onEnter(value: Triple): void;
+  onEnter(value: Vec3): void;
 }
 
 /** Three numbers: a place, or a turn. */
@@ -222,7 +223,7 @@ export function PlaceField({ label, value, step, unit, onEnter }: PlaceProps) {
           value={value[i]!.toFixed(digits)}
           onEnter={(text) => {
             const number = Number(text);
-            if (text.trim() !== '' && Number.isFinite(number)) onEnter(value.with(i, number) as Triple);
+            if (text.trim() !== '' && Number.isFinite(number)) onEnter(value.with(i, number) as Vec3);
           }}
         />
       ))}

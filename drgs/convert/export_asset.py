@@ -1,0 +1,138 @@
+"""An asset as a file that other programs read: the formats of drgs/exchange/export_formats.py.
+
+ply   2D Gaussians, two scales, `SplatRenderMode: 2dgs` (SuperSplat, splat-transform)
+ply3  the same with a flat third scale, for viewers of 3D Gaussians
+glb   mesh with base colour and metallic-roughness textures (Blender, three.js, Unreal, Unity)
+usd   mesh and surfels as a particle field (OpenUSD 26)
+env   the recovered light, lat-long EXR, linear
+Viewers of Gaussians show colours as they stand in the file, so there the linear radiance is turned to sRGB.
+"""
+
+import io
+import math
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from drgs.exchange.export_formats import EXPORT_FORMATS, ExportFormat
+from drgs.exchange.exr import encode_environment
+from drgs.exchange.gaussian_ply import encode_gaussian_ply
+from drgs.exchange.glb import GlbMesh, encode_glb
+from drgs.exchange.texture_atlas import paint, unwrap
+from drgs.exchange.usd import write_usd
+from drgs.maths.color import srgb_from_linear
+from drgs.maths.frames import rotation_from_quat_wxyz
+from drgs.maths.spherical_harmonics import SH_OFFSET, sh_basis
+from drgs.scene.asset import Asset
+from drgs.scene.gaussians import Gaussians
+
+PROBE_DIRECTIONS = 96
+"""Directions in which a surfel's colour is turned to sRGB before it is fitted again; 16 coefficients need well over 16."""
+
+
+def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> None:
+    """Write one file; an existing one is replaced at once.
+
+    Raises:
+        ValueError: unknown format, Gaussians asked of an asset that has none, or usd-core is missing.
+    """
+    out = Path(out)
+    if format not in EXPORT_FORMATS:
+        raise ValueError(f"format {format!r} is unknown; expected {', '.join(EXPORT_FORMATS)}")
+    if out.is_dir():
+        raise ValueError(f"{out}: is a folder; expected the name of a file")
+    if format in ("ply", "ply3") and asset.gaussians is None:
+        raise ValueError(f"format {format!r} needs Gaussians, and this asset has only a mesh; export it as glb")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{out.stem}.", suffix=out.suffix, dir=out.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        if format == "usd":
+            write_usd(temporary, _mesh_arrays(asset), _surfel_arrays(asset.gaussians), asset.meters_per_unit)
+        else:
+            temporary.write_bytes(_file_bytes(asset, format))
+        temporary.chmod(0o644)
+        temporary.replace(out)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _file_bytes(asset: Asset, format: str) -> bytes:
+    if format == "env":
+        return encode_environment(_array(asset.environment.radiance))
+    if format == "glb":
+        return encode_textured_glb(asset)
+    gaussians = asset.gaussians
+    assert gaussians is not None
+    arrays = {key: _array(values) for key, values in vars(gaussians).items()}
+    arrays["sh"] = _array(display_sh(gaussians.sh))
+    normals = _array(rotation_from_quat_wxyz(gaussians.quats_wxyz)[..., 2])
+    note = "spherical harmonics: sRGB colours under the light of the capture"
+    return encode_gaussian_ply(arrays, normals, third_scale=format == "ply3", comments=(note,))
+
+
+def encode_textured_glb(asset: Asset) -> bytes:
+    """Bytes of a GLB whose textures hold the vertex materials: base colour in sRGB; roughness in green, metallic in blue."""
+    mesh = asset.mesh
+    atlas = unwrap(_array(mesh.vertices), _array(mesh.faces))
+    values = torch.cat([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], -1)
+    picture = torch.from_numpy(paint(atlas, _array(values))).clamp(0, 1)
+    surface = torch.cat([torch.ones_like(picture[..., :1]), picture[..., 3:]], -1)
+    images = (_png(srgb_from_linear(picture[..., :3])), _png(surface))
+    normals = torch.nn.functional.normalize(mesh.normals, dim=-1)
+    attributes = {"POSITION": _array(mesh.vertices)[atlas.vertex_of], "NORMAL": _array(normals)[atlas.vertex_of], "TEXCOORD_0": atlas.uv}
+    material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
+    return encode_glb(GlbMesh(attributes, atlas.faces, material, images), asset.meters_per_unit)
+
+
+def display_sh(sh: Float[Tensor, "surfel 16 3"]) -> Float[Tensor, "surfel 16 3"]:
+    """(surfel, 16, 3) coefficients of the sRGB colours of linear radiance sh (surfel, 16, 3), by least squares over directions.
+
+    Both sides without the offset of 0.5; colours above 1 are clipped, as a screen would.
+    """
+    index = torch.arange(PROBE_DIRECTIONS, dtype=torch.float64) + 0.5
+    height, turn = 1 - 2 * index / PROBE_DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index  # a Fibonacci lattice
+    side = torch.sqrt(1 - height * height)
+    basis = sh_basis(torch.stack([side * torch.cos(turn), side * torch.sin(turn), height], -1))
+    fit = torch.linalg.pinv(basis).to(sh)
+    basis = basis.to(sh)
+    chunks = [basis @ chunk + SH_OFFSET for chunk in sh.split(20_000)]
+    return torch.cat([fit @ (srgb_from_linear(colors.clamp(0, 1)) - SH_OFFSET) for colors in chunks]) if chunks else sh
+
+
+def _mesh_arrays(asset: Asset) -> dict[str, np.ndarray]:
+    return {key: _array(values) for key, values in vars(asset.mesh).items()}
+
+
+def _surfel_arrays(gaussians: Gaussians | None) -> dict[str, np.ndarray] | None:
+    """Activated: linear scales, opacities, unit quaternions."""
+    if gaussians is None:
+        return None
+    tensors = {
+        "centers": gaussians.centers,
+        "scales": torch.exp(gaussians.log_scales),
+        "quats_wxyz": torch.nn.functional.normalize(gaussians.quats_wxyz, dim=-1),
+        "opacities": torch.sigmoid(gaussians.opacity_logits),
+        "sh": gaussians.sh,
+        "albedo": gaussians.albedo,
+        "roughness": gaussians.roughness,
+        "metallic": gaussians.metallic,
+    }
+    return {key: _array(values) for key, values in tensors.items()}
+
+
+def _png(values: Float[Tensor, "height width channel"]) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray((values * 255).round().to(torch.uint8).cpu().numpy()).save(stream, "PNG", compress_level=4)
+    return stream.getvalue()
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().contiguous().numpy()

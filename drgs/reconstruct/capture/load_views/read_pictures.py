@@ -1,0 +1,125 @@
+"""Decode the pictures and masks of a capture into one pair of arrays, optionally smaller.
+
+Shrinking averages areas of linear, premultiplied light: colour of the background must not bleed into the object's edge.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from PIL import Image
+
+from drgs.exchange.pictures import as_eight_bits
+from drgs.maths.color import linear_from_srgb, srgb_from_linear
+from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, camera_of, resize_pinhole
+from drgs.scene.views import Views
+
+DECODE_THREADS = 2
+NERO_DEPTH_OF_ONE = 15.0
+"""Depth [world units] of the value 65535 in NeRO's depth pictures."""
+NERO_BACKGROUND_DEPTH = 14.5
+_LINEAR_OF_BYTE = linear_from_srgb(torch.arange(256) / 255).numpy().astype(np.float32)
+_BYTE_STEPS = 8192
+_BYTE_OF_LINEAR = (srgb_from_linear(torch.linspace(0, 1, _BYTE_STEPS).double()) * 255).numpy()
+
+
+def read_pictures(capture: Capture, max_side: int | None) -> Views:
+    """Views of a checked capture, the longer side at most `max_side` pixels."""
+    native = capture.photographs[0].pinhole
+    scale = min(1.0, max_side / max(native.width, native.height)) if max_side else 1.0
+    width, height = max(1, round(native.width * scale)), max(1, round(native.height * scale))
+    count = len(capture.photographs)
+    images = np.empty((count, height, width, 3), np.uint8)
+    coverage = np.empty((count, height, width), np.uint8)
+
+    def decode(index: int) -> bool:
+        color, alpha, has_mask = _decode(capture.photographs[index])
+        if (height, width) != alpha.shape:
+            color, alpha = shrink(color, alpha, width, height)
+        images[index], coverage[index] = color, alpha
+        return has_mask
+
+    with ThreadPoolExecutor(DECODE_THREADS) as pool:
+        has_masks = list(pool.map(decode, range(count)))
+    if any(has_masks) and not all(has_masks):
+        lacking = [photograph.image for photograph, has_mask in zip(capture.photographs, has_masks, strict=True) if not has_mask]
+        raise ValueError(f"{lacking[0]}: neither alpha nor a mask ({len(lacking)} of {count} images), but the others have one.")
+    cameras = tuple(
+        camera_of(photo.camera_from_world, resize_pinhole(photo.pinhole, width, height), photo.name) for photo in capture.photographs
+    )
+    return Views(
+        cameras=cameras,
+        images_srgb=torch.from_numpy(images),
+        coverage=torch.from_numpy(coverage),
+        points_world=None if capture.points_world is None else torch.from_numpy(capture.points_world),
+        point_colors_srgb=None if capture.point_colors_srgb is None else torch.from_numpy(capture.point_colors_srgb),
+        # An alpha channel that is opaque everywhere says nothing.
+        has_masks=all(has_masks) and bool((coverage < 128).any()),
+        source=capture.source,
+    )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    try:
+        with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
+            yield image
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{path}: the image cannot be decoded ({error}).") from error
+
+
+def _decode(photograph: Photograph) -> tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "height width"], bool]:
+    """Colour (h, w, 3), alpha (h, w), and whether alpha came from the file or a mask rather than from nothing."""
+    with _opened(photograph.image) as image:
+        picture = as_eight_bits(image)
+        has_alpha = "A" in picture.getbands() or "transparency" in picture.info
+        pixels = np.asarray(picture.convert("RGBA" if has_alpha else "RGB"))
+    color = pixels[..., :3]
+    alpha = pixels[..., 3] if has_alpha else np.full(pixels.shape[:2], 255, np.uint8)
+    if photograph.mask is None:
+        return color, alpha, has_alpha
+    mask = _mask_of_depth(photograph.mask) if photograph.mask_is_depth else _mask_channel(photograph.mask)
+    if mask.shape != alpha.shape:
+        raise ValueError(
+            f"{photograph.mask}: the mask is {mask.shape[1]}x{mask.shape[0]}, but its image {photograph.image.name} is {alpha.shape[1]}x{alpha.shape[0]}."
+        )
+    return color, np.minimum(alpha, mask), True
+
+
+def _mask_of_depth(path: Path) -> UInt8[ndarray, "height width"]:
+    """(h, w) 0 or 255 of a NeRO depth picture."""
+    with _opened(path) as image:
+        mode, values = image.mode, np.asarray(image)
+    if not mode.startswith("I"):
+        raise ValueError(f"{path}: a depth picture of mode {mode}, expected 16-bit grey.")
+    depth = values.astype(np.float32) / 65535 * NERO_DEPTH_OF_ONE
+    return np.where(depth < NERO_BACKGROUND_DEPTH, 255, 0).astype(np.uint8)
+
+
+def _mask_channel(path: Path) -> UInt8[ndarray, "height width"]:
+    """(h, w) 0..255. A mask's alpha channel is used when its colour says nothing (cut-outs saved as masks)."""
+    with _opened(path) as image:
+        picture = as_eight_bits(image)
+        rgba = np.asarray(picture.convert("RGBA"))
+        return rgba[..., 3] if (rgba[..., 3] < 255).any() else np.asarray(picture.convert("L"))
+
+
+def shrink(
+    color_srgb: UInt8[ndarray, "rows columns 3"], alpha: UInt8[ndarray, "rows columns"], width: int, height: int
+) -> tuple[UInt8[ndarray, "{height} {width} 3"], UInt8[ndarray, "{height} {width}"]]:
+    """Area-averaged colour (height, width, 3) and alpha (height, width), 8 bit, from straight 8-bit sRGB."""
+    alpha_share = alpha.astype(np.float32) / 255
+
+    def average(channel: Float[ndarray, "rows columns"]) -> Float[ndarray, "height width"]:
+        return np.asarray(Image.fromarray(channel).resize((width, height), Image.Resampling.BOX))
+
+    alpha_small = average(alpha_share)
+    linear = np.stack([average(_LINEAR_OF_BYTE[color_srgb[..., channel]] * alpha_share) for channel in range(3)], -1)
+    linear /= np.maximum(alpha_small, 1e-6)[..., None]
+    steps = np.clip(linear * (_BYTE_STEPS - 1) + 0.5, 0, _BYTE_STEPS - 1).astype(np.int32)
+    return np.round(_BYTE_OF_LINEAR[steps]).astype(np.uint8), np.round(alpha_small * 255).astype(np.uint8)

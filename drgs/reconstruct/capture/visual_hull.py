@@ -1,0 +1,299 @@
+"""The visual hull: the largest shape that fits inside every silhouette, carved from masks.
+
+In: cameras and coverage. Out: a closed surface and the sphere that bounds it. Knows nothing of colours or Gaussians.
+The field at a point is the (k+1)-th smallest coverage over the views that see the point, so up to k wrong masks are outvoted;
+k is a few percent of the views. The surface is the field's level set, found coarse to fine.
+Source: Laurentini 1994, "The visual hull concept"; marching cubes by scikit-image.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import warp as wp
+from jaxtyping import Float, Int, Shaped, UInt8
+from numpy import ndarray
+from scipy import ndimage
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from drgs.scene.camera import Camera
+from drgs.scene.views import Views
+from drgs.warp_torch import launch, warp_array, warp_device
+
+MOST_OUTVOTED = 3
+"""The kernel keeps the MOST_OUTVOTED + 1 smallest values in one wp.vec4."""
+
+
+@dataclass(frozen=True)
+class VisualHullSettings:
+    coarse_cells: int = 64
+    """Cells along the longest axis of the box in which the object is looked for."""
+    fine_cells: int = 192
+    """Cells along the longest axis of the box that holds the object."""
+    wrong_mask_share: float = 0.03
+    """Share of the views whose masks may be wrong."""
+    mask_side: int = 512
+    """Larger masks are averaged down to at most this [pixels]: finer ones outdo the grid."""
+    level: float = 0.4
+    """Coverage that counts as object; below one half so that details as wide as a cell survive."""
+    smallest_part: float = 0.002
+    """Parts smaller than this share of the largest are dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class VisualHull:
+    """A closed surface around the object."""
+
+    vertices_world: Float[ndarray, "vertex 3"]
+    faces: Int[ndarray, "face 3"]
+    """Counter-clockwise seen from outside."""
+    cell: float
+    """Edge of a voxel [world units]."""
+
+
+@wp.kernel
+def outvote(
+    first: int,
+    points: wp.array[wp.vec3],
+    pixel_from_world: wp.array[wp.vec4],
+    masks: wp.array3d[wp.uint8],
+    outvoted: int,
+    fewest_seen: int,
+    # outputs
+    field: wp.array[float],
+):
+    """One thread a point: the (outvoted+1)-th smallest coverage, looked up bilinearly, over the views that see the point."""
+    i = first + wp.tid()
+    point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
+    width = masks.shape[2]
+    height = masks.shape[1]
+    smallest = wp.vec4(1.0, 1.0, 1.0, 1.0)
+    seen = int(0)  # Warp: a variable that a loop changes must not be a constant
+    for view in range(masks.shape[0]):
+        depth = wp.dot(pixel_from_world[3 * view + 2], point)
+        if depth > 0.0:
+            x = wp.dot(pixel_from_world[3 * view], point) / depth
+            y = wp.dot(pixel_from_world[3 * view + 1], point) / depth
+            # A view that does not see the point says nothing about it.
+            if x >= 0.0 and y >= 0.0 and x < float(width) and y < float(height):
+                seen += 1
+                u = wp.clamp(x - 0.5, 0.0, float(width - 1))
+                v = wp.clamp(y - 0.5, 0.0, float(height - 1))
+                column = wp.min(int(u), width - 2)
+                row = wp.min(int(v), height - 2)
+                fu = u - float(column)
+                fv = v - float(row)
+                top = float(masks[view, row, column]) * (1.0 - fu) + float(masks[view, row, column + 1]) * fu
+                bottom = float(masks[view, row + 1, column]) * (1.0 - fu) + float(masks[view, row + 1, column + 1]) * fu
+                value = (top * (1.0 - fv) + bottom * fv) / 255.0
+                for rank in range(4):
+                    larger = wp.max(smallest[rank], value)
+                    smallest[rank] = wp.min(smallest[rank], value)
+                    value = larger
+                if smallest[outvoted] <= 0.0:
+                    break
+    field[i] = wp.where(seen >= fewest_seen or smallest[outvoted] <= 0.0, smallest[outvoted], 0.0)
+
+
+def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings()) -> VisualHull | None:
+    """Carve the hull; None where the masks have no common shape."""
+    views = _with_small_masks(views, settings.mask_side)
+    carver = _Carver(views, settings)
+    box = _first_box(views)
+    if box is None:
+        return None
+    for _ in range(4):  # possibly the first guess cuts the object: grow it until nothing touches its sides
+        lower, upper = box
+        cell = float((upper - lower).max()) / settings.coarse_cells
+        shape = _grid_shape(lower, upper, cell)
+        occupied = (carver.upper_field(_grid_points(lower, cell, shape), cell) > settings.level).reshape(shape)
+        if not occupied.any():
+            return None
+        sides = [occupied[0], occupied[-1], occupied[:, 0], occupied[:, -1], occupied[:, :, 0], occupied[:, :, -1]]
+        if not any(bool(side.any()) for side in sides):
+            break
+        center, half = (lower + upper) / 2, (upper - lower) / 2
+        box = center - 1.5 * half, center + 1.5 * half
+    indices = torch.nonzero(occupied)
+    lower = lower + (indices.min(0).values.double().numpy() - 1.0) * cell
+    upper = lower + (indices.max(0).values - indices.min(0).values + 3).double().numpy() * cell
+    return _fine_surface(carver, lower, upper, settings)
+
+
+def axes_meeting_point(centers: Float[ndarray, "view 3"], directions: Float[ndarray, "view 3"]) -> Float[ndarray, "3"]:
+    """The point with the least sum of squared distances to the lines; pulled weakly in front of parallel axes."""
+    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    matrix = projectors.sum(0)
+    right = (projectors @ centers[:, :, None]).sum(0)[:, 0]
+    spread = np.linalg.norm(centers - centers.mean(0), axis=1).mean()
+    fallback = (centers + directions * spread).mean(0)
+    weight = 1e-4 * len(centers)
+    return np.linalg.solve(matrix + weight * np.eye(3), right + weight * fallback)
+
+
+def camera_geometry(views: Views) -> tuple[Float[ndarray, "view 4 4"], Float[ndarray, "view 3 3"], Float[ndarray, "view 3"]]:
+    """Float64 (view, 4, 4) camera_from_world, (view, 3, 3) intrinsics, (view, 3) centres."""
+    camera_from_world = torch.stack([camera.camera_from_world for camera in views.cameras]).double().cpu().numpy()
+    intrinsics = torch.stack([camera.intrinsics for camera in views.cameras]).double().cpu().numpy()
+    centers = -np.einsum("vji,vj->vi", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3])
+    return camera_from_world, intrinsics, centers
+
+
+def _with_small_masks(views: Views, side: int) -> Views:
+    """Masks averaged over squares of whole pixels, cameras to match; the pictures are left alone, nothing here reads them."""
+    factor = math.ceil(max(views.coverage.shape[1:]) / side)
+    if factor == 1:
+        return views
+    small = [
+        torch.nn.functional.avg_pool2d(mask.float()[None], factor, ceil_mode=True)[0].round().to(torch.uint8)
+        for mask in views.coverage.cpu()
+    ]
+    height, width = small[0].shape
+    shrink = torch.diag(torch.tensor([1 / factor, 1 / factor, 1.0]))
+    cameras = tuple(Camera(c.camera_from_world.cpu(), shrink @ c.intrinsics.cpu(), width, height, c.name) for c in views.cameras)
+    return replace(
+        views, cameras=cameras, coverage=torch.stack(small), images_srgb=torch.zeros(len(small), height, width, 3, dtype=torch.uint8)
+    )
+
+
+def _first_box(views: Views) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]] | None:
+    """Cube around the point where rays through the mask centroids meet, as large as the masks' cones are there."""
+    camera_from_world, intrinsics, centers = camera_geometry(views)
+    coverage = views.coverage.cpu().numpy()
+    kept, directions, corner_rays = [], [], []
+    for index, mask in enumerate(coverage):
+        ys, xs = np.nonzero(mask[::2, ::2] > 127)
+        if len(xs) == 0:
+            continue
+        x0, x1, y0, y1 = 2 * xs.min(), 2 * xs.max() + 2, 2 * ys.min(), 2 * ys.max() + 2
+        pixels = np.array([[2 * xs.mean() + 1, 2 * ys.mean() + 1, 1], [x0, y0, 1], [x1, y0, 1], [x0, y1, 1], [x1, y1, 1]])
+        rays = pixels @ np.linalg.inv(intrinsics[index]).T @ camera_from_world[index, :3, :3]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        kept.append(index)
+        directions.append(rays[0])
+        corner_rays.append(rays[1:])
+    if len(kept) < 3:
+        return None
+    center = axes_meeting_point(centers[kept], np.array(directions))
+    to_center = center - centers[kept]
+    distance = np.linalg.norm(to_center, axis=1)
+    cosines = np.einsum("vki,vi->vk", np.array(corner_rays), to_center / distance[:, None]).min(1)
+    radius = float(np.percentile(distance * np.sqrt(1 - np.clip(cosines, 0, 1) ** 2), 90))
+    # Never around a camera: what is that near cannot be the object.
+    radius = min(1.1 * radius, 0.95 * float(distance.min()))
+    return center - radius, center + radius
+
+
+class _Carver:
+    """Masks and projections, prepared once for many queries."""
+
+    def __init__(self, views: Views, settings: VisualHullSettings) -> None:
+        count = len(views.cameras)
+        # Neighbours in the file are neighbours in space; views far apart empty a point sooner.
+        order = np.argsort((np.arange(count) * 0.6180339887) % 1.0)
+        self.masks = views.coverage.cpu().numpy()[order]
+        self.cameras = [views.cameras[index] for index in order]
+        self.pixel_from_world = torch.stack(
+            [(c.intrinsics.double() @ c.camera_from_world.double()[:3]).float().cpu() for c in self.cameras]
+        )
+        self.outvoted = min(MOST_OUTVOTED, math.ceil(settings.wrong_mask_share * count)) if count >= 12 else 0
+        self.fewest_seen = max(3, count // 4)
+
+    def upper_field(self, points: Float[Tensor, "point 3"], cell: float) -> Float[Tensor, "point"]:
+        """At least the field (n,) anywhere in a cell around each point (n, 3)."""
+        return self._outvote(points, self._widened(points, cell, ndimage.maximum_filter))
+
+    def lower_field(self, points: Float[Tensor, "point 3"], cell: float) -> Float[Tensor, "point"]:
+        """At most the field (n,) anywhere in a cell around each point (n, 3)."""
+        return self._outvote(points, self._widened(points, cell, ndimage.minimum_filter))
+
+    def field(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
+        """The field (n,) at `points` (n, 3)."""
+        return self._outvote(points, self.masks)
+
+    def _widened(
+        self, points: Float[Tensor, "point 3"], cell: float, widen: Callable[[ndarray, int], ndarray]
+    ) -> UInt8[ndarray, "view height width"]:
+        """Masks in which each pixel stands for all pixels that a cell's half diagonal covers around it."""
+        widened = np.empty_like(self.masks)
+        middle = points.mean(0)
+        for index, (camera, projection) in enumerate(zip(self.cameras, self.pixel_from_world, strict=True)):
+            depth = max(float(projection[2, :3] @ middle + projection[2, 3]), 2 * cell)
+            # One pixel more than the projection: lookups are bilinear.
+            reach = math.ceil(0.87 * cell * float(camera.intrinsics[0, 0]) / depth * 1.15) + 1
+            widened[index] = widen(self.masks[index], 2 * min(reach, min(self.masks.shape[1:]) // 2) + 1)
+        return widened
+
+    def _outvote(self, points: Float[Tensor, "point 3"], masks: UInt8[ndarray, "view height width"]) -> Float[Tensor, "point"]:
+        points = points.float().contiguous()
+        field = torch.zeros(len(points))
+        launch(
+            outvote,
+            len(points),
+            inputs=[
+                warp_array(points, wp.vec3),
+                warp_array(self.pixel_from_world.reshape(-1, 4), wp.vec4),
+                warp_array(torch.from_numpy(masks)),
+                self.outvoted,
+                self.fewest_seen,
+            ],
+            outputs=[warp_array(field)],
+            device=warp_device(points),
+        )
+        return field
+
+
+def _grid_shape(lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], cell: float) -> tuple[int, int, int]:
+    x, y, z = (max(2, int(count)) for count in np.ceil((upper - lower) / cell - 1e-6))
+    return x, y, z
+
+
+def _grid_points(lower: Float[ndarray, "3"], cell: float, shape: tuple[int, int, int]) -> Float[Tensor, "point 3"]:
+    """(x·y·z, 3) cell centres."""
+    axes = [torch.from_numpy(lower[axis] + (np.arange(shape[axis]) + 0.5) * cell).float() for axis in range(3)]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def _refined(grid: Shaped[Tensor, "x y z"]) -> Shaped[Tensor, "2*x 2*y 2*z"]:
+    """Each cell becomes 2x2x2."""
+    return grid.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2).contiguous()
+
+
+def _fine_surface(
+    carver: _Carver, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], settings: VisualHullSettings
+) -> VisualHull | None:
+    """Level set on the fine grid. Cells that the coarse grid proves empty or full are not looked at again."""
+    cell = float((upper - lower).max()) / settings.fine_cells
+    coarse_cell = 2 * cell
+    coarse_shape = _grid_shape(lower, upper, coarse_cell)
+    coarse_points = _grid_points(lower, coarse_cell, coarse_shape)
+    maybe = carver.upper_field(coarse_points, coarse_cell) > settings.level
+    sure = torch.zeros_like(maybe)
+    sure[maybe] = carver.lower_field(coarse_points[maybe], coarse_cell) > settings.level
+    field = _refined(sure.float().reshape(coarse_shape))
+    undecided = _refined((maybe & ~sure).reshape(coarse_shape))
+    indices = torch.nonzero(undecided)
+    points = torch.from_numpy(lower).float() + (indices.float() + 0.5) * cell
+    field[undecided] = carver.field(points)
+
+    volume = field.numpy()
+    parts, part_count = ndimage.label(volume > settings.level)
+    if part_count == 0:
+        return None
+    sizes = np.bincount(parts.reshape(-1), minlength=part_count + 1)
+    small = sizes < settings.smallest_part * sizes[1:].max()
+    small[0] = False
+    volume = np.where(small[parts], 0.0, volume)
+    # A mask's edge is a step one pixel wide: a little blur makes its level set, and so the normals, smooth.
+    volume = ndimage.gaussian_filter(np.pad(volume, 2).astype(np.float32), 0.7)
+    if not volume.min() < settings.level < volume.max():
+        return None
+    vertices, faces, _, _ = marching_cubes(volume, settings.level)
+    corners = vertices[faces]
+    if np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:  # signed volume: faces wind inwards
+        faces = faces[:, ::-1]
+    vertices_world = lower + (vertices - 2 + 0.5) * cell
+    return VisualHull(vertices_world.astype(np.float32), np.ascontiguousarray(faces, dtype=np.int64), cell)

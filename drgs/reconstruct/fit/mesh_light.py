@@ -1,0 +1,116 @@
+"""Light on the mesh while its surface is fitted: split sum, with what the object itself blocks and sends back.
+
+In: the mesh with its materials (through its tracer), the filtered environment. Out: of a mirrored ray, whether it escapes and the radiance of
+what it meets; of each vertex, the share of the irradiance of an open sky that arrives there, light from the object included. Nothing here
+passes a gradient on: what was reflected twice is taken as known. One ray a point, drawn from its lobe: steps average over them.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from drgs.maths.brdf import f0_from_base
+from drgs.maths.frames import tangents_from_normal
+from drgs.reconstruct.fit.split_sum import shade_split_sum
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.environment import Environment, environment_radiance
+from drgs.scene.mesh import TriangleMesh
+
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+SHARE_LIFT = 4.0
+"""Of the tracer's lift: rays from vertices must clear all faces around them."""
+BRIGHTEST_SHARE = 3.0
+"""More than this times the open sky's irradiance is noise."""
+CLEAR_OF_FACE = 1e-3
+"""Least cosine of a mirrored ray to its face; rays below it count as free."""
+
+
+def at_corners(values: Tensor, corners: Tensor, weights: Tensor) -> Tensor:
+    """(point, ...) of vertex values (vertex, ...) at corners (point, 3) by weights (point, 3)."""
+    return torch.einsum("pk,pk...->p...", weights, values[corners])
+
+
+def corner_weights(barycentric: Tensor) -> Tensor:
+    """(point, 3) of the weights (point, 2) of second and third corner."""
+    return torch.cat([1 - barycentric.sum(-1, keepdim=True), barycentric], -1)
+
+
+def hit_radiance(mesh: TriangleMesh, corners: Tensor, weights: Tensor, towards: Tensor, open_share: Tensor, tables: Tensor) -> Tensor:
+    """(point, 3) radiance that places on the mesh send in the directions `towards` (point, 3), by split sum and open_share (vertex, 3)."""
+    normal = torch.nn.functional.normalize(at_corners(mesh.normals, corners, weights), dim=-1)
+    albedo, metallic = at_corners(mesh.albedo, corners, weights), at_corners(mesh.metallic, corners, weights)
+    return shade_split_sum(
+        albedo * (1 - metallic)[:, None],
+        torch.zeros_like(albedo),
+        f0_from_base(albedo, metallic),
+        at_corners(mesh.roughness, corners, weights),
+        normal,
+        towards,
+        tables,
+        open_share=at_corners(open_share, corners, weights),
+    ).clamp(min=0)
+
+
+def radiance_along(
+    tracer: AbstractTracer, origins: Tensor, directions: Tensor, open_share: Tensor, tables: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(ray,) 1 where nothing is met, and (ray, 3) radiance of what is, 0 elsewhere."""
+    hits = trace_rays(origins, directions, tracer)
+    radiance = torch.zeros_like(directions)
+    met = hits.hit.nonzero().squeeze(1)
+    if len(met):
+        corners = tracer.mesh.faces[hits.face[met].long()].long()
+        radiance[met] = hit_radiance(tracer.mesh, corners, corner_weights(hits.barycentric[met]), -directions[met], open_share, tables)
+    return (~hits.hit).float(), radiance
+
+
+def mirrored_light(
+    tracer: AbstractTracer,
+    position: Tensor,
+    face_normal: Tensor,
+    normal: Tensor,
+    roughness: Tensor,
+    wo: Tensor,
+    open_share: Tensor,
+    tables: Tensor,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Of each point (point, 3): whether a ray mirrored at a half vector drawn from its lobe escapes (point,), and what it meets (point, 3)."""
+    alpha = roughness * roughness
+    u = torch.rand(2, len(normal), generator=generator).to(normal.device)
+    cosine2 = (1 - u[0]) / (1 + (alpha * alpha - 1) * u[0])
+    sine, azimuth = (1 - cosine2).clamp(min=0).sqrt(), 2 * math.pi * u[1]
+    t_u, t_v = tangents_from_normal(normal)
+    half = t_u * (sine * azimuth.cos())[:, None] + t_v * (sine * azimuth.sin())[:, None] + normal * cosine2.sqrt()[:, None]
+    mirrored = 2 * (half * wo).sum(-1, keepdim=True) * half - wo
+    transmittance, met = torch.ones_like(roughness), torch.zeros_like(normal)
+    above = ((mirrored * face_normal).sum(-1) > CLEAR_OF_FACE).nonzero().squeeze(1)
+    origin = position[above] + tracer.lift * face_normal[above]
+    transmittance[above], met[above] = radiance_along(tracer, origin, mirrored[above], open_share, tables)
+    return transmittance, met
+
+
+def irradiance_share(
+    tracer: AbstractTracer, environment: Environment, tables: Tensor, open_share: Tensor, rays: int, generator: torch.Generator
+) -> Tensor:
+    """(vertex, 3) share of an open sky's irradiance that arrives, by `rays` stratified cosine-distributed rays a vertex.
+
+    Args:
+        open_share: (vertex, 3) as known so far: light that was reflected once more with each call.
+    """
+    mesh = tracer.mesh
+    t_u, t_v = tangents_from_normal(mesh.normals)
+    origins = mesh.vertices + SHARE_LIFT * tracer.lift * mesh.normals
+    arriving, of_sky = torch.zeros_like(origins), torch.zeros_like(origins)
+    for ray in range(rays):
+        sine2 = (ray + 0.5) / rays
+        azimuth = ray * GOLDEN_ANGLE + 2 * math.pi * torch.rand(len(origins), generator=generator).to(origins.device)
+        around = t_u * azimuth.cos()[:, None] + t_v * azimuth.sin()[:, None]
+        directions = math.sqrt(sine2) * around + math.sqrt(1 - sine2) * mesh.normals
+        sky = environment_radiance(environment, directions)
+        transmittance, met = radiance_along(tracer, origins, directions, open_share, tables)
+        of_sky += sky
+        arriving += sky * transmittance[:, None] + met
+    return (arriving / of_sky.clamp(min=1e-6)).clamp(0, BRIGHTEST_SHARE)

@@ -1,0 +1,115 @@
+"""Whether a place is metal, by what the photographs say: two explanations of its brightness over all views, each at its best.
+
+With geometry, roughness and light as they are, the radiance of a vertex in view v is, by split sum,
+
+    L_v = d E + f A_v + B_v,   A_v = S_v F1,  B_v = S_v F2,
+
+with d the diffuse albedo, f the reflectance at normal incidence, E the irradiance over pi that arrives and S_v the light of the mirror lobe.
+Matter that is no metal has f = 0.04 and a free d, metal has d = 0 and a free f: three numbers each, so that their residuals compare fairly.
+Gradients never decide this: a darker light and a diffuse part trade places without a trace in the loss.
+
+In: the mesh through its tracer, photographs, light. Out: evidence in -1 (no metal) .. 1 (metal) a vertex, 0 where views say nothing.
+"""
+
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drgs.maths.color import linear_from_srgb
+from drgs.maths.constants import F0
+from drgs.reconstruct.fit.mesh_light import radiance_along
+from drgs.reconstruct.fit.split_sum import shade_split_sum
+from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+
+FEWEST_VIEWS = 4
+FACING = 0.25
+"""Least cosine between normal and view."""
+SOLID = 0.995
+SATURATED = 254 / 255
+DARK = 0.05
+"""Radiance below which errors count as absolute rather than relative."""
+NOISE = 0.02
+"""Standard deviation of a photograph's radiance, relative above DARK, that explains nothing."""
+NEIGHBOURHOOD = 3
+"""Times that residuals are averaged with the neighbours'."""
+DECISIVE = 0.7
+"""Difference of the residuals' logarithms at which evidence is 0.6."""
+
+
+def metal_evidence(
+    tracer: AbstractTracer, targets: list[ViewTarget], open_share: Tensor, tables: Tensor, edges: MeshEdges
+) -> Float[Tensor, "vertex"]:
+    """Of the tracer's mesh, whose roughness is taken as known."""
+    mesh = tracer.mesh
+    count, device = len(mesh.vertices), mesh.vertices.device
+    sums = torch.zeros(7, count, 3, device=device)  # w, E y0, E^2 (of no metal); A y, A^2, y^2 (of metal); y0^2
+    views = torch.zeros(count, device=device)
+    for target in targets:
+        seen, photo, wo = _seen_vertices(tracer, target)
+        if len(seen) == 0:
+            continue
+        normal, roughness = mesh.normals[seen], mesh.roughness[seen]
+        mirrored = 2 * (normal * wo).sum(-1, keepdim=True) * normal - wo
+        origin = mesh.vertices[seen] + 4 * tracer.lift * normal
+        transmittance, met = radiance_along(tracer, origin, mirrored, open_share, tables)
+
+        white = torch.ones(len(seen), 3, device=device)
+        shaded = partial(shade_split_sum, residual=0 * white, roughness=roughness, normal=normal, wo=wo, tables=tables)
+        lit = partial(shaded, transmittance=transmittance, hit_radiance=met, open_share=open_share[seen])
+        b = lit(diffuse_albedo=0 * white, f0=0 * white)
+        a, e = lit(diffuse_albedo=0 * white, f0=white) - b, lit(diffuse_albedo=white, f0=0 * white) - b
+        y = photo - b
+        y0 = y - F0 * a
+        weight = 1 / (photo + DARK) ** 2
+        for k, term in enumerate((torch.ones_like(y), e * y0, e * e, a * y, a * a, y * y, y0 * y0)):
+            sums[k].index_add_(0, seen, weight * term)
+        views.index_add_(0, seen, torch.ones_like(roughness))
+    _, ey, ee, ay, aa, yy, y0y0 = sums
+    diffuse = (ey / ee.clamp(min=1e-12)).clamp(0, 1)
+    plain = (y0y0 - 2 * diffuse * ey + diffuse**2 * ee).clamp(min=0).sum(-1)
+    reflectance = (ay / aa.clamp(min=1e-12)).clamp(0, 1)
+    metal = (yy - 2 * reflectance * ay + reflectance**2 * aa).clamp(min=0).sum(-1)
+    floor = 3 * NOISE**2 * views
+    plain, metal = (_averaged(error + floor, views, edges) for error in (plain, metal))
+    evidence = torch.tanh(torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) / DECISIVE)
+    return torch.where(views >= FEWEST_VIEWS, evidence, torch.zeros_like(evidence))
+
+
+def _seen_vertices(tracer: AbstractTracer, target: ViewTarget) -> tuple[Tensor, Tensor, Tensor]:
+    """Vertices that this view shows (n,), the radiance that it has there (n, 3), and unit directions to it (n, 3)."""
+    mesh, camera = tracer.mesh, target.camera
+    towards = camera.center_world - mesh.vertices
+    wo = torch.nn.functional.normalize(towards, dim=-1)
+    at = mesh.vertices @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    homogeneous = at @ camera.intrinsics.T
+    place = homogeneous[:, :2] / homogeneous[:, 2:]
+    size = torch.tensor([camera.width, camera.height], device=place.device)
+    seen = ((mesh.normals * wo).sum(-1) > FACING) & (at[:, 2] > 1e-6) & (place > 1).all(1) & (place < size - 1).all(1)
+    index = seen.nonzero().squeeze(1)
+    column, row = place[index].long().unbind(1)
+    colour = target.saturation[row, column]
+    index_ok = (target.mask[row, column] > SOLID) & (colour.amax(-1) < SATURATED)
+    index, place = index[index_ok], place[index][index_ok]
+    origin = mesh.vertices[index] + 4 * tracer.lift * mesh.normals[index]
+    open_ = ~trace_rays(origin, wo[index], tracer).hit
+    index, place = index[open_], place[open_]
+    grid = (2 * place / size - 1)[None, None]
+    sampled = torch.nn.functional.grid_sample(target.saturation.permute(2, 0, 1)[None], grid, mode="bilinear", align_corners=False)
+    return index, linear_from_srgb(sampled[0, :, 0].T), wo[index]
+
+
+def _averaged(error: Tensor, views: Tensor, edges: MeshEdges) -> Tensor:
+    """(vertex,) error a view, averaged over the neighbourhood by the number of views."""
+    start, end = edges.vertices.unbind(1)
+    total, weight = error.clone(), views.clone()
+    for _ in range(NEIGHBOURHOOD):
+        total, weight = (
+            values + torch.zeros_like(values).index_add_(0, start, values[end]).index_add_(0, end, values[start])
+            for values in (total, weight)
+        )
+    return total / weight.clamp(min=1)

@@ -1,0 +1,59 @@
+"""Photographs as the losses want them, and which of them a step looks at.
+
+In: Views. Out: one ViewTarget a view, at full or at half size, on the fit's device.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.views import Views
+
+
+@dataclass(frozen=True, eq=False)
+class ViewTarget:
+    """A photo as the losses want it."""
+
+    camera: Camera
+    photo: Float[Tensor, "height width 3"]
+    """SRGB times mask."""
+    saturation: Float[Tensor, "height width 3"]
+    """SRGB as stored."""
+    mask: Float[Tensor, "height width"]
+    rows: slice
+    columns: slice
+    """Box around the mask: outside it only coverage is compared."""
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns."""
+        return self.rows, self.columns
+
+
+def view_targets(views: Views, factor: float, device: torch.device) -> list[ViewTarget]:
+    """Photos at `factor` times their size, premultiplied by their masks."""
+    targets = []
+    for camera, image, mask in zip(views.cameras, views.images_srgb, views.coverage, strict=True):
+        photo, alpha = image.float() / 255, mask.float() / 255
+        small = scaled_camera(camera, factor)
+        if factor != 1:
+            stacked = torch.cat([photo * alpha[..., None], alpha[..., None], photo], -1).permute(2, 0, 1)[None]
+            stacked = torch.nn.functional.interpolate(stacked, (small.height, small.width), mode="area")[0].permute(1, 2, 0)
+            premultiplied, alpha, photo = stacked[..., :3], stacked[..., 3], stacked[..., 4:]
+        else:
+            premultiplied = photo * alpha[..., None]
+        rows, columns = (alpha > 0).any(1).nonzero().flatten(), (alpha > 0).any(0).nonzero().flatten()
+        margin = 8
+        box = [slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else slice(0, 1) for x in (rows, columns)]
+        premultiplied, photo, alpha = (x.contiguous().to(device) for x in (premultiplied, photo, alpha))
+        targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, *box))
+    return targets
+
+
+def drawn_view(iteration: int, count: int, seed: int) -> int:
+    """Which of `count` views a step looks at: all once a round, in an order that only seed and round decide, so a resumed fit keeps it."""
+    rounds, place = divmod(iteration, count)
+    return int(torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + rounds))[place])

@@ -1,0 +1,141 @@
+"""Positions from normals: the mesh is moved until its edges lie across the normals that shading found, and its outlines on the masks'.
+
+Each vertex moves along its own normal by s, which minimises
+
+    sum_edges w_e ((x_i - x_j) . n_e / |x_i - x_j|)^2  +  w_outline sum_outlines w_o l_o d_o(x)^2  +  anchor sum_vertices (s / mean edge)^2
+    +  even sum_edges ((s_i - s_j) / |x_i - x_j|)^2
+
+with n_e the mean of the wanted normals at the edge's ends and d_o the outlines' distances in pixels, by a sparse linear solve in float64.
+Weights are robust (Cauchy's), so that creases, where no normal fits an edge, and wrong outlines do not pull their surroundings along.
+Source: Nehab et al. 2005 (positions from normals), with outlines in place of measured depths (docs/sources.md: nehab2005).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix, diags, identity
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from drgs.reconstruct.geometry.mask_outlines import OutlineResiduals
+from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.scene.mesh import vertex_normals
+
+TURNED = 0.3
+"""Cosine between a face's normals before and after a solve below which it has turned over, or nearly."""
+UNFOLDINGS = 8
+
+
+@dataclass(frozen=True)
+class IntegrationSettings:
+    """How much each part counts."""
+
+    outline_weight: float = 0.05
+    """Of a pixel of outline, squared, against an edge across its normal by a radian."""
+    anchor: float = 1e-3
+    """Of a mean edge's length moved."""
+    even: float = 0.02
+    """Of a difference between neighbours' moves, as an edge's tilt: keeps slivers, which hardly know their normal, with their surroundings."""
+    crease_angle: float = 0.2
+    """[radians] at which an edge's weight is halved."""
+    outline_outlier: float = 1.0
+    """[pixels] at which an outline's weight is halved."""
+    reweightings: int = 3
+    longest_move: float = 2.0
+    """Mean edges at a vertex that it may move in one solve: what wants to go farther is badly determined."""
+
+
+def integrate_normals(
+    vertices: Tensor, faces: Tensor, wanted_normals: Tensor, edges: MeshEdges, outlines: OutlineResiduals, settings: IntegrationSettings
+) -> Tensor:
+    """(vertex, 3) positions after one solve.
+
+    Args:
+        vertices: (vertex, 3). faces: (face, 3). wanted_normals: (vertex, 3) unit. outlines: of these vertices.
+    """
+    direction = vertex_normals(vertices, faces)
+    start, end = edges.vertices.unbind(1)
+    normal = torch.nn.functional.normalize(wanted_normals[start] + wanted_normals[end], dim=-1)
+    across = vertices[start] - vertices[end]
+    length = across.norm(dim=1).clamp(min=1e-30)
+    tilt = (across * normal).sum(1) / length
+    by_start, by_end = (direction[start] * normal).sum(1) / length, -(direction[end] * normal).sum(1) / length
+    first, second = edges.vertices[outlines.edge].unbind(1)
+    by_first, by_second = (0.5 * (outlines.gradient * direction[corner]).sum(1) for corner in (first, second))
+
+    edge_count, outline_count, count = len(tilt), len(outlines.edge), len(vertices)
+    row = torch.arange(edge_count, device=vertices.device)
+    outline_row = edge_count + torch.arange(outline_count, device=vertices.device)
+    rows = _numpy(torch.cat([row, row, outline_row, outline_row]))
+    columns = _numpy(torch.cat([start, end, first, second]))
+    values = _numpy(torch.cat([by_start, by_end, by_first, by_second]).double())
+    jacobian = csr_matrix((values, (rows, columns)), shape=(edge_count + outline_count, count))
+    residual = _numpy(torch.cat([tilt, outlines.distance]).double())
+    outline_length = settings.outline_weight * _numpy(outlines.length.double())
+    anchor = settings.anchor / float(length.mean()) ** 2 * identity(count)
+    inverse = _numpy((1 / length).double())
+    differences = csr_matrix(
+        (np.concatenate([inverse, -inverse]), (np.tile(np.arange(edge_count), 2), _numpy(torch.cat([start, end])))),
+        shape=(edge_count, count),
+    )
+    fixed = anchor + settings.even * differences.T @ differences
+    moved = np.zeros(count)
+    for _ in range(settings.reweightings):
+        now = jacobian @ moved + residual
+        weight = np.concatenate(
+            [
+                1 / (1 + (now[:edge_count] / settings.crease_angle) ** 2),
+                outline_length / (1 + (now[edge_count:] / settings.outline_outlier) ** 2),
+            ]
+        )
+        normal_matrix = (jacobian.T @ diags(weight) @ jacobian + fixed).tocsc()
+        factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        moved = factors.solve(-(jacobian.T @ (weight * residual)))
+    reach = settings.longest_move * _mean_of_edges(length, edges, count)
+    step = torch.maximum(torch.minimum(torch.from_numpy(moved).to(vertices), reach), -reach)
+    return vertices + unfolded(vertices, direction, step, faces, edges)[:, None] * direction
+
+
+def unfolded(vertices: Tensor, direction: Tensor, step: Tensor, faces: Tensor, edges: MeshEdges) -> Tensor:
+    """(vertex,) steps along the directions, but the neighbours' mean at the corners of faces that would turn over, and 0 where that does not help."""
+    corners = faces.long()
+    own = _face_normals(vertices, corners)
+    for attempt in range(UNFOLDINGS):
+        turned = (_face_normals(vertices + step[:, None] * direction, corners) * own).sum(-1) < TURNED * own.norm(dim=-1)
+        if not bool(turned.any()):
+            break
+        folded = torch.zeros_like(step, dtype=torch.bool)
+        folded[corners[turned].flatten()] = True
+        around = _mean_of_neighbours(step, edges) if attempt < UNFOLDINGS // 2 else torch.zeros_like(step)
+        step = torch.where(folded, around, step)
+    return step
+
+
+def _face_normals(vertices: Tensor, corners: Tensor) -> Tensor:
+    """(face, 3) unit normals; zero where a face has no area."""
+    a, b, c = vertices[corners].unbind(1)
+    return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1, eps=1e-30)
+
+
+def _mean_of_edges(values: Tensor, edges: MeshEdges, count: int) -> Tensor:
+    """(vertex,) mean of edge values (edge,) over a vertex's edges."""
+    total, number = values.new_zeros(count), values.new_zeros(count)
+    for corner in edges.vertices.unbind(1):
+        total.index_add_(0, corner, values)
+        number.index_add_(0, corner, torch.ones_like(values))
+    return total / number.clamp(min=1)
+
+
+def _mean_of_neighbours(values: Tensor, edges: MeshEdges) -> Tensor:
+    """(vertex,) mean of the values (vertex,) at the other ends of a vertex's edges."""
+    start, end = edges.vertices.unbind(1)
+    total, number = torch.zeros_like(values), torch.zeros_like(values)
+    for here, there in ((start, end), (end, start)):
+        total.index_add_(0, here, values[there])
+        number.index_add_(0, here, torch.ones_like(values[there]))
+    return total / number.clamp(min=1)
+
+
+def _numpy(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy()

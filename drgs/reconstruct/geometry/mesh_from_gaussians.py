@@ -1,0 +1,68 @@
+"""The surfels that cameras see, and the mesh around them: grey, since bake_materials gives it its materials."""
+
+from dataclasses import fields
+from typing import TypeVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from drgs.reconstruct.capture.initial_points import InitialPoints, near_plane
+from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, clean_mesh, extract_mesh
+from drgs.render.visible.rasterize import RasterSettings, rasterize
+from drgs.scene.binding import Binding
+from drgs.scene.camera import Camera
+from drgs.scene.gaussians import Gaussians, surfel_tangents
+from drgs.scene.mesh import TriangleMesh, vertex_normals
+
+Surfels = TypeVar("Surfels", Gaussians, Binding)
+
+
+def drop_unseen(gaussians: Gaussians, cameras: tuple[Camera, ...], radius: float, least_weight: float = 0.02) -> Gaussians:
+    """Without the surfels that no camera sees with a blending weight above `least_weight`: what hides inside would only cast shadows."""
+    return chosen_surfels(gaussians, seen_surfels(gaussians, cameras, radius, least_weight))
+
+
+def seen_surfels(gaussians: Gaussians, cameras: tuple[Camera, ...], radius: float, least_weight: float = 0.02) -> Bool[Tensor, "surfel"]:
+    """(surfel,) whether some camera sees the surfel with a blending weight above `least_weight`."""
+    weight = torch.zeros(len(gaussians.centers), 1, device=gaussians.centers.device)
+    tangents, opacities = surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)
+    settings = RasterSettings(near_plane(radius), depth=False)
+    for camera in cameras:
+        # The gradient of sum_p w(p) f with respect to f is the surfel's total weight in the picture.
+        feature = torch.zeros_like(weight, requires_grad=True)
+        maps = rasterize(gaussians.centers, tangents, opacities, feature, camera.to(weight.device), settings)
+        weight = torch.maximum(weight, torch.autograd.grad(maps.features.sum(), feature)[0])
+    return weight[:, 0] > least_weight
+
+
+def chosen_surfels(record: Surfels, kept: Bool[Tensor, "surfel"]) -> Surfels:
+    """The entries of a record whose every field is by surfel, where `kept` (surfel,) is True."""
+    return type(record)(*(getattr(record, entry.name)[kept] for entry in fields(record)))
+
+
+def reduced_mesh(mesh: TriangleMesh, face_limit: int, radius: float) -> TriangleMesh:
+    """The mesh with at most `face_limit` faces, grey again where its vertices are new."""
+    if len(mesh.faces) <= face_limit:
+        return mesh
+    settings = MeshSettings(smoothing_passes=0, face_limit=face_limit)
+    return _grey_mesh(*clean_mesh(mesh.vertices, mesh.faces, settings, shortest_edge=1e-5 * radius))
+
+
+def mesh_from_gaussians(gaussians: Gaussians, cameras: tuple[Camera, ...], points: InitialPoints, settings: MeshSettings) -> TriangleMesh:
+    """Fuse the median depth of every training view (mean depth draws a second sheet between two surfaces)."""
+    tangents, opacities = surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)
+    empty = torch.zeros(len(gaussians.centers), 1, device=gaussians.centers.device)
+    raster = RasterSettings(near_plane(points.bounds_radius))
+    maps = []
+    for camera in cameras:
+        drawn = rasterize(gaussians.centers, tangents, opacities, empty, camera.to(empty.device), raster)
+        assert drawn.median_depth is not None  # asked for by RasterSettings.depth
+        maps.append(DepthMap(camera.to(empty.device), drawn.median_depth, drawn.coverage))
+    return _grey_mesh(*extract_mesh(maps, points.bounds_center, points.bounds_radius, settings))
+
+
+def _grey_mesh(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> TriangleMesh:
+    """Shape alone; bake_materials gives it its materials."""
+    grey = torch.full((len(vertices),), 0.5, device=vertices.device)
+    return TriangleMesh(vertices, faces, vertex_normals(vertices, faces), grey[:, None].repeat(1, 3), grey, torch.zeros_like(grey))

@@ -1,0 +1,285 @@
+"""The stages of a build, each with what it leaves in the build's folder: done again from there, it does not start anew.
+
+Every stage takes the `Workplace` and what the stages before gave. What it leaves says of which build it is; what another build left is
+refused. A stage that computes at once goes through `_kept_or_made`, a fit through `_checkpointed_fit`: told to stop, it writes its
+checkpoint and raises BuildStopped. What the stages compute is in the steps' own files.
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from drgs.reconstruct.capture.find_masks import find_masks
+from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points, near_plane
+from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
+from drgs.reconstruct.fit.environment_pyramid import environment_table
+from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
+from drgs.reconstruct.fit.fit_loop import FitReport, FitState
+from drgs.reconstruct.fit.fit_materials import MaterialSettings, fit_materials, start_materials
+from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings, MeshFitState, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
+from drgs.reconstruct.fit.render_stage_one import render_stage_one
+from drgs.reconstruct.fit.render_stage_two import render_stage_two
+from drgs.reconstruct.fit.split_sum import filter_environment
+from drgs.reconstruct.geometry.extract_mesh import MeshSettings
+from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen, mesh_from_gaussians
+from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
+from drgs.reconstruct.report_progress import BuildReporter, encode_preview
+from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.gaussians import Gaussians
+from drgs.scene.mesh import TriangleMesh
+from drgs.scene.views import Views
+
+MASKS = "masks.safetensors"
+"""Of a capture that has none of its own."""
+FIT, MESH, MATERIALS = "stage1.safetensors", "mesh.safetensors", "stage2.safetensors"
+SURFELS_ON_MESH, MATERIALS_ON_MESH = "mesh_surfels.safetensors", "stage2_mesh.safetensors"
+CHECKPOINTS = (FIT, MESH, MATERIALS, SURFELS_ON_MESH, MATERIALS_ON_MESH)
+"""In the order of the stages, first those of either binding and of particles."""
+PREVIEW_SIDE = 256
+"""[pixels]"""
+
+
+class BuildStopped(Exception):
+    """should_stop() was true; the checkpoint is on disk."""
+
+
+@dataclass(frozen=True, eq=False)
+class Workplace:
+    """Where a build keeps what its stages leave, whom it tells, and who may stop it."""
+
+    folder: Path
+    identity: dict[str, Any]
+    """What tells this build from others, as far as the stages so far depend on it; checkpoints carry it."""
+    resume: bool
+    reporter: BuildReporter
+    should_stop: Callable[[], bool]
+
+    def of(self, **more: str) -> "Workplace":
+        """The same for the stages that depend on more."""
+        return replace(self, identity=self.identity | more)
+
+
+def capture_digest(views: Views) -> str:
+    """Hex digest of the photos, masks and poses: a checkpoint belongs to these and no others."""
+    digest = hashlib.sha256()
+    for part in (views.images_srgb, views.coverage, *(camera.camera_from_world for camera in views.cameras)):
+        digest.update(part.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def forget_checkpoints(place: Workplace) -> None:
+    """Else a later build that resumes would take them for this one's."""
+    for stale in (MASKS, *CHECKPOINTS):
+        (place.folder / stale).unlink(missing_ok=True)
+
+
+def masks_stage(place: Workplace, views: Views, points: InitialPoints, settings: FitSettings, device: torch.device) -> Views:
+    """find_masks."""
+
+    def report(r: FitReport) -> None:
+        place.reporter.report("read", r.iteration / r.iterations, "no masks: looking for the object", r)
+
+    def found() -> dict[str, Tensor]:
+        masked = find_masks(views, points, settings, device, report, place.should_stop)
+        if masked is None:
+            raise BuildStopped
+        return {"coverage": masked.coverage}
+
+    kept = _kept_or_made(place, MASKS, torch.device("cpu"), found)
+    return replace(views, coverage=kept["coverage"], has_masks=True)
+
+
+def points_of_found_masks(masked: Views, points: InitialPoints, count: int, seed: int) -> InitialPoints:
+    """Points on the found masks' hull; the given ones where the masks have none."""
+    try:
+        return initial_points(masked, count, seed)
+    except ValueError:  # a first guess may be wrong where the user's own masks may not: the fit then starts from random points
+        return points
+
+
+def fit_stage(place: Workplace, views: Views, points: InitialPoints, settings: FitSettings, device: torch.device) -> FitState:
+    """fit_gaussians."""
+    state, radius = start_fit(points, settings, device, views.has_masks), points.bounds_radius
+    _checkpointed_fit(
+        place,
+        FitStage(
+            "fit",
+            FIT,
+            state,
+            settings.iterations,
+            lambda report: fit_gaussians(views, state, settings, radius, report, place.should_stop),
+            lambda r: f"{r.elements} surfels",
+            lambda: stage_one_preview(state.parameters, views.cameras, radius, settings.sh_degree),
+        ),
+    )
+    return state
+
+
+def mesh_stage(
+    place: Workplace, views: Views, points: InitialPoints, fit: FitState, settings: MeshSettings
+) -> tuple[Gaussians, TriangleMesh]:
+    """The surfels that cameras see and the mesh around them."""
+
+    def made() -> dict[str, Tensor]:
+        gaussians = drop_unseen(gaussians_from_state(fit), views.cameras, points.bounds_radius)
+        mesh = mesh_from_gaussians(gaussians, views.cameras, points, settings)
+        return {f"{type(record).__name__}.{name}": value for record in (gaussians, mesh) for name, value in vars(record).items()}
+
+    return _geometry(_kept_or_made(place, MESH, fit.parameters["centers"].device, made))
+
+
+def read_geometry(path: Path, device: torch.device) -> tuple[Gaussians, TriangleMesh]:
+    """What the stage `mesh` left: the surfels that cameras see, and the mesh.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    return _geometry(read_tensors(path, device)[0])
+
+
+def _geometry(tensors: dict[str, Tensor]) -> tuple[Gaussians, TriangleMesh]:
+    def fields_of(record: type[Gaussians] | type[TriangleMesh]) -> dict[str, Tensor]:
+        return {entry.name: tensors[f"{record.__name__}.{entry.name}"] for entry in fields(record)}
+
+    return Gaussians(**fields_of(Gaussians)), TriangleMesh(**fields_of(TriangleMesh))
+
+
+def bind_stage(
+    place: Workplace, views: Views, gaussians: Gaussians, mesh: TriangleMesh, fit: FitState, radius: float, settings: MeshFitSettings
+) -> MeshFitState:
+    """mesh_surfels and fit_mesh_surfels; `fit` gives the light."""
+    state = start_mesh_fit(*mesh_surfels(gaussians, mesh), mesh, fit.parameters, settings)
+    _checkpointed_fit(
+        place,
+        FitStage(
+            "bind",
+            SURFELS_ON_MESH,
+            state.fit,
+            settings.iterations,
+            lambda report: fit_mesh_surfels(views, state, settings, radius, report, place.should_stop),
+            lambda r: f"{r.elements} surfels on faces",
+            lambda: stage_one_preview(surfels_on_faces(state), views.cameras, radius, settings.losses.sh_degree),
+        ),
+    )
+    return state
+
+
+def materials_stage(
+    place: Workplace,
+    views: Views,
+    gaussians: Gaussians,
+    light: dict[str, Tensor],
+    mesh: TriangleMesh,
+    radius: float,
+    settings: MaterialSettings,
+) -> FitState:
+    """fit_materials; `light` are the parameters of the fit before."""
+    on_mesh = "binding" in place.identity
+    if on_mesh:  # a surfel never leaves its face
+        settings = replace(settings, rates=replace(settings.rates, centers=0.0))
+    state = start_materials(gaussians, light, mesh, settings, radius)
+    _checkpointed_fit(
+        place,
+        FitStage(
+            "materials",
+            MATERIALS_ON_MESH if on_mesh else MATERIALS,
+            state,
+            settings.iterations,
+            lambda report: fit_materials(views, mesh, state, settings, radius, report, place.should_stop),
+            lambda _: "materials and light",
+        ),
+    )
+    return state
+
+
+@dataclass(frozen=True, eq=False)
+class FitStage:
+    """A fit as a stage: what it is called, where it is kept, and what goes on with it."""
+
+    name: str
+    """In reports of progress."""
+    file: str
+    """Of its checkpoint, in the build's folder."""
+    state: FitState
+    iterations: int
+    run: Callable[[Callable[[FitReport], None]], object]
+    """Goes on with the fit until it is done or told to stop; takes whom to report to."""
+    message: Callable[[FitReport], str]
+    preview: Callable[[], bytes] | None = None
+    """JPEG of how far it is."""
+
+
+def _checkpointed_fit(place: Workplace, stage: FitStage) -> None:
+    """Restore, run, save, stop.
+
+    Raises:
+        BuildStopped: the fit was told to stop; its checkpoint is written.
+        ValueError: there is a checkpoint, but it is damaged, or of another build or version.
+    """
+    state, path = stage.state, place.folder / stage.file
+    kept = _kept(place, path, state.parameters["opacity_logits"].device)
+    if kept is not None:
+        restore_fit(kept, state)
+
+    def save() -> None:
+        write_tensors(path, fit_tensors(state), place.identity)
+
+    def report(r: FitReport) -> None:
+        place.reporter.report(stage.name, r.iteration / r.iterations, stage.message(r), r, stage.preview, save)
+
+    if state.iteration < stage.iterations:
+        stage.run(report)
+        save()
+    if state.iteration < stage.iterations:
+        raise BuildStopped
+
+
+def _kept_or_made(place: Workplace, file: str, device: torch.device, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    """What a stage left that computes at once, else what it makes now, which is then left."""
+    path = place.folder / file
+    tensors = _kept(place, path, device)
+    if tensors is None:
+        tensors = make()
+        write_tensors(path, tensors, place.identity)
+    return tensors
+
+
+def _kept(place: Workplace, path: Path, device: torch.device) -> dict[str, Tensor] | None:
+    """Tensors of a file of this build, if it should go on and there is one."""
+    if not (place.resume and path.exists()):
+        return None
+    tensors, facts = read_tensors(path, device)
+    found = {key: facts.get(key) for key in place.identity}
+    if found != place.identity:
+        raise ValueError(
+            f"the checkpoint {path} is of another build (found {found}, expected {place.identity}); delete its folder or choose another OUT"
+        )
+    return tensors
+
+
+def stage_one_preview(parameters: dict[str, Tensor], cameras: tuple[Camera, ...], radius: float, sh_degree: int) -> bytes:
+    """JPEG of the first view as stage 1 draws it."""
+    with torch.no_grad():
+        camera = preview_camera(cameras).to(parameters["centers"].device)
+        tables = filter_environment(environment_table(parameters))
+        maps = render_stage_one(parameters, tables, camera, near_plane(radius), sh_degree)
+        return encode_preview(maps.radiance_linear, maps.coverage)
+
+
+def stage_two_preview(parameters: dict[str, Tensor], cameras: tuple[Camera, ...], radius: float) -> bytes:
+    """JPEG of the first view as stage 2 draws it, by the surfels' own radiance."""
+    with torch.no_grad():
+        camera = preview_camera(cameras).to(parameters["centers"].device)
+        maps = render_stage_two(parameters, camera, near_plane(radius))
+        return encode_preview(maps.splat_radiance, maps.coverage)
+
+
+def preview_camera(cameras: tuple[Camera, ...]) -> Camera:
+    """The first camera, its picture reduced to PREVIEW_SIDE."""
+    camera = cameras[0]
+    return scaled_camera(camera, min(1.0, PREVIEW_SIDE / max(camera.width, camera.height)))

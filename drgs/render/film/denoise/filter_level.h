@@ -1,0 +1,56 @@
+// filter_level of denoise.py for 16 pixels of a row at once, CPU only. Body of a Warp native function; denoise.py puts simd_vector.h and
+// the constants before it. A test keeps both equal. The maps lie as in smooth_variance.h.
+//
+// in   at, guides (8 planes: coverage, footprint, position, normal), source (8: diffuse, specular, variance), smooth (2)
+// out  target (8: diffuse, specular, variance)
+const long plane = (long)height * pitch;
+const float* const guide = guides.data;
+const float* const from = source.data;
+const float* const soft = smooth.data;
+const i16 covered = load16(guide + at) > 0.0f;
+const v16 x = load16(guide + 2 * plane + at), y = load16(guide + 3 * plane + at), z = load16(guide + 4 * plane + at);
+const v16 nx = load16(guide + 5 * plane + at), ny = load16(guide + 6 * plane + at), nz = load16(guide + 7 * plane + at);
+const auto luminance = [&](const float* p) { return LUMINANCE_RED * load16(p) + LUMINANCE_GREEN * load16(p + plane) + LUMINANCE_BLUE * load16(p + 2 * plane); };
+const v16 y_d = luminance(from + at), y_s = luminance(from + 3 * plane + at);
+const v16 local_d = load16(soft + at), local_s = load16(soft + plane + at);
+const v16 plane_scale = 1.0f / max16(sigma_plane * (float)step * load16(guide + plane + at), v16(1e-12f));
+v16 sum[8], weights_d(0.0f), weights_s(0.0f);
+for (int k = 0; k < 8; ++k) sum[k] = v16(0.0f);
+const float hat[3] = {0.375f, 0.25f, 0.0625f};
+const int row_here = at / pitch;
+for (int dy = -2; dy <= 2; ++dy) {
+    const int row = row_here + dy * step;
+    if (row < 0 || row >= height) continue;
+    for (int dx = -2; dx <= 2; ++dx) {
+        const long q = at + (long)dy * step * pitch + dx * step;
+        const v16 there = load16(guide + q);
+        if (!any(there > 0.0f)) continue;
+        v16 alike = max16(nx * load16(guide + 5 * plane + q) + ny * load16(guide + 6 * plane + q) + nz * load16(guide + 7 * plane + q), v16(0.0f));
+        for (int k = 1; k < NORMAL_POWER; k *= 2) alike *= alike;
+        const v16 off = nx * (load16(guide + 2 * plane + q) - x) + ny * (load16(guide + 3 * plane + q) - y) + nz * (load16(guide + 4 * plane + q) - z);
+        const v16 off_plane = abs16(off) * plane_scale;
+        const v16 shared = (hat[dx < 0 ? -dx : dx] * hat[dy < 0 ? -dy : dy]) * alike * max16(there, v16(0.0f));
+        const v16 both_d = local_d + neighbour_variance * load16(soft + q), both_s = local_s + neighbour_variance * load16(soft + plane + q);
+        const v16 d0 = load16(from + q), d1 = load16(from + plane + q), d2 = load16(from + 2 * plane + q);
+        const v16 s0 = load16(from + 3 * plane + q), s1 = load16(from + 4 * plane + q), s2 = load16(from + 5 * plane + q);
+        const v16 off_d = abs16(LUMINANCE_RED * d0 + LUMINANCE_GREEN * d1 + LUMINANCE_BLUE * d2 - y_d) / (sigma_luminance * sqrt16(both_d) + 1e-6f);
+        const v16 off_s = abs16(LUMINANCE_RED * s0 + LUMINANCE_GREEN * s1 + LUMINANCE_BLUE * s2 - y_s) / (sigma_luminance * sqrt16(both_s) + 1e-6f);
+        const v16 w_d = shared * exp_negative(off_plane + off_d), w_s = shared * exp_negative(off_plane + off_s);
+        sum[0] += w_d * d0;
+        sum[1] += w_d * d1;
+        sum[2] += w_d * d2;
+        sum[3] += w_s * s0;
+        sum[4] += w_s * s1;
+        sum[5] += w_s * s2;
+        sum[6] += w_d * w_d * load16(from + 6 * plane + q);
+        sum[7] += w_s * w_s * load16(from + 7 * plane + q);
+        weights_d += w_d;
+        weights_s += w_s;
+    }
+}
+const v16 inverse_d = 1.0f / max16(weights_d, v16(1e-20f)), inverse_s = 1.0f / max16(weights_s, v16(1e-20f));
+for (int k = 0; k < 8; ++k) {
+    const v16 inverse = k < 3 || k == 6 ? inverse_d : inverse_s;
+    const v16 mean = sum[k] * inverse * (k < 6 ? v16(1.0f) : inverse);
+    store16(target.data + k * plane + at, select(covered, mean, v16(0.0f)));
+}

@@ -1,0 +1,129 @@
+"""The picture of a frame in the making: sums in, Frame out, at any time.
+
+All but the last step happens in the window around the tiles that show something; around it the picture is empty.
+"""
+
+import time
+from dataclasses import asdict, replace
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from drgs.render.film.blur_environment import blurred_light
+from drgs.render.film.denoise import denoise
+from drgs.render.film.tonemap import tonemap
+from drgs.render.integrate.environment_table import EnvironmentLight, lookup_radiance, uv_from_world_direction
+from drgs.render.progressive.converge import frame_errors
+from drgs.render.progressive.frame_state import FrameState, GaussianView
+from drgs.render.progressive.mean_radiance import mean_gbuffer, mean_radiance
+from drgs.render.records import Frame, GBuffer, Radiance
+from drgs.render.visible.image_tiles import Window
+from drgs.scene.camera import world_from_pixel
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+
+def resolve_frame(state: FrameState) -> Frame:
+    """The picture so far."""
+    clock = time.perf_counter()
+    settings, window = state.inputs.settings, state.window
+    maps, radiance = mean_gbuffer(state), mean_radiance(state)
+    shown = denoise(radiance, maps, window.camera(state.inputs.camera), settings.denoise)
+    denoised = time.perf_counter()
+    background = _background(state)
+    linear = window.pad(shown.diffuse + shown.specular)
+    if background is None:
+        rgba = window.pad(tonemap(window.crop(linear), maps.coverage, settings.exposure, curve=settings.tone_curve))
+    else:
+        rgba = tonemap(linear, window.pad(maps.coverage), settings.exposure, background, settings.tone_curve)
+    gbuffer = state.view.gbuffer if isinstance(state.view, GaussianView) else _padded_gbuffer(maps, window)
+    seconds = {**state.seconds, "denoise": denoised - clock, "resolve": time.perf_counter() - denoised}
+    return Frame(rgba, linear, gbuffer, _padded_radiance(shown, window), _metadata(state, seconds))
+
+
+def linear_picture(state: FrameState) -> Tensor:
+    """(height, width, 4) the light behind the picture so far, before exposure and tone curve.
+
+    Radiance is multiplied with the coverage, the last channel, as OpenEXR defines alpha. Over a background the coverage is 1.
+    """
+    frame, background = resolve_frame(state), _background(state)
+    alpha = frame.gbuffer.coverage.clamp(0, 1)[..., None]
+    color = torch.where(alpha > 0, alpha * frame.radiance_linear, 0.0)
+    if background is not None:
+        color, alpha = color + (1 - alpha) * background, torch.ones_like(alpha)
+    return torch.cat([color, alpha], -1)
+
+
+def _metadata(state: FrameState, seconds: dict[str, float]) -> dict:
+    """Plain JSON: how the picture was made, and what was left out."""
+    return {
+        "samples": state.samples,
+        "passes": state.passes,
+        "bounces": state.inputs.settings.bounces,
+        "counts": asdict(state.plan.counts),
+        "skipped": [asdict(skip) for skip in state.plan.skips],
+        "horizons": _horizons(state),
+        "made": list(state.computed_parts),
+        "error": round(float(frame_errors(state).max()), 6),
+        "tiles_at_rest": int((~state.tiles.active).sum()),
+        "tiles": len(state.tiles.active),
+        "primary": state.inputs.primary,
+        "milliseconds": {step: round(1000 * duration, 3) for step, duration in seconds.items()},
+    }
+
+
+def _horizons(state: FrameState) -> dict[str, float]:
+    """How far the search for rays that need no tracing has come, and what it found."""
+    horizons = state.traced.tracer.horizons if state.inputs.settings.skip else None
+    if horizons is None:
+        return {"faces": 0, "faces_known": 0, "rays_spared": 0.0}
+    return {"faces": horizons.faces, "faces_known": horizons.found, "rays_spared": round(horizons.spared(), 4)}
+
+
+def _padded_gbuffer(maps: GBuffer, window: Window) -> GBuffer:
+    """The whole image's."""
+    return GBuffer(**{name: window.pad(values, torch.inf if name == "depth" else 0.0) for name, values in vars(maps).items()})
+
+
+def _padded_radiance(radiance: Radiance, window: Window) -> Radiance:
+    """The whole image's."""
+    maps: dict[str, Any] = {name: window.pad(values) for name, values in vars(radiance).items() if isinstance(values, Tensor)}
+    return replace(radiance, **maps)
+
+
+def _background(state: FrameState) -> Tensor | None:
+    """(3,) or (height, width, 3) linear; None where the picture stays transparent."""
+    background = state.inputs.settings.background
+    if background == "transparent":
+        return None
+    if not isinstance(background, str):
+        return torch.tensor(background, device=state.sums.weight.device)
+    scene, camera, light = state.inputs.scene, state.inputs.camera, state.traced.environment_light
+    if background == "blurred":
+        light = blurred_light(scene.environment, scene.environment_rotation_degrees, scene.environment_intensity)
+    rows = state.inputs.rows
+    radiance = state.sums.weight.new_empty(state.inputs.height, camera.width, 3)
+    inputs = [camera.width, rows.start, wp.mat33(*world_from_pixel(camera).flatten().tolist()), light]
+    launch(
+        environment_behind, state.inputs.height * camera.width, inputs, [warp_array(radiance.view(-1, 3), wp.vec3)], warp_device(radiance)
+    )
+    return radiance
+
+
+@wp.kernel
+def environment_behind(
+    first: int,
+    width: int,
+    top: int,
+    world_of_pixel: wp.mat33,
+    light: EnvironmentLight,
+    # outputs
+    radiance: wp.array[wp.vec3],
+):
+    i = first + wp.tid()
+    y = i / width
+    direction = world_of_pixel * wp.vec3(float(i - y * width) + 0.5, float(top + y) + 0.5, 1.0)
+    radiance[i] = lookup_radiance(light, uv_from_world_direction(light, wp.normalize(direction)))

@@ -1,0 +1,144 @@
+"""Light at shading points: L_o = sum over samples of f L_i (n.wi) weight. What every integrator offers, and what they share.
+
+In: points with the places their rays start from, the environment, settings. Out: diffuse and specular radiance, the variance of the
+luminance, and the open share of the sky, per point. L_i is the environment where a ray escapes, else the outgoing light of what it
+meets: nothing with 0 bounces, otherwise the light that a path from there finds.
+Rays that cannot carry light (below the true surface, black sky with no bounce) are void and cost next to nothing.
+
+Implementations: wavefront (any device, any tracer) and fused_embree (CPU); choose_integrator.py chooses.
+Source: Veach 1995 (balance heuristic). Truth: drgs/reference/path_integrator.py.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from drgs.render.integrate.ray_scene import ray_scene
+from drgs.render.integrate.sample_rays import point_arrays, sample_set, start_arrays
+from drgs.render.integrate.sum_samples import LightSums
+from drgs.render.intersect.ray_memory import RayMemory, empty_rays, usable_rays
+from drgs.render.intersect.trace_rays import over_slices
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.render.records import RayStarts, SampleCounts, ShadedPoints, ShadingPoints, TracedRays
+from drgs.warp_torch import in_thread_pool, thread_count, warp_array
+
+MIN_RAYS_A_SLICE = 8192
+"""Fewer are not cut up further to balance threads: launches cost half a millisecond a slice."""
+
+
+@dataclass(frozen=True)
+class IntegratorSettings:
+    """Which rays an estimate is made of."""
+
+    counts: SampleCounts
+    bounces: int = 0
+    """Surfaces that light may meet between the environment and the points."""
+    seed: int = 0
+    by_material: bool = False
+    """Each point shares its samples out by its material (sample_rays.split_at)."""
+    split_indirect: bool = False
+    """Say how much of the light comes from other surfaces (ShadedPoints.indirect)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """One estimate in the making, as its slices see it. The structs share memory with the tensors."""
+
+    points: Any
+    """PointArrays."""
+    starts: Any
+    """StartArrays."""
+    scene: Any
+    """RayScene."""
+    samples: Any
+    """SampleSet."""
+    rays_a_point: int
+    bounces: int
+    known: TracedRays | None
+    """What rays met before, of all points; used for those that are still the same."""
+    kept: TracedRays | None
+    """Where to write down what the rays meet."""
+    sums: Any
+    """LightSums of all points."""
+
+
+class AbstractIntegrator(ABC):
+    """Light at shading points, by the rays of one tracer."""
+
+    def __init__(self, tracer: AbstractTracer) -> None:
+        self.tracer = tracer
+
+    @abstractmethod
+    def load_kernels(self) -> None:
+        """Compile what slices launch, before threads race for it."""
+
+    @abstractmethod
+    def rays_a_slice(self) -> int:
+        """Most rays of a slice."""
+
+    @abstractmethod
+    def shade_slice(self, estimate: Estimate, first: int, last: int) -> int:
+        """Write the sums of points `first` to `last`; returns how many rays were traced. Runs on the calling thread."""
+
+    def shade(
+        self,
+        points: ShadingPoints,
+        starts: RayStarts,
+        light: Any,
+        settings: IntegratorSettings,
+        samples_round: int | Tensor = 0,
+        memory: RayMemory | None = None,
+        horizon: Tensor | None = None,
+    ) -> ShadedPoints:
+        """Outgoing light of all points, one estimate of `settings.counts.total` rays each.
+
+        Args:
+            light: EnvironmentLight struct (environment_table.environment_light).
+            samples_round: how many estimates of the same settings came before; continues their sequences. (point,) int32 where it differs.
+            memory: of an estimate of the same counts from the same starts: rays that are known are not traced, and it then knows these.
+            horizon: (face, SECTORS) sines (horizon.Horizons); rays above them are not traced.
+        """
+        device, point_count, rays_a_point = points.normal_world.device, len(points.pixel), settings.counts.total
+        diffuse, specular, variance = (torch.zeros(point_count, 3, device=device) for _ in range(3))
+        indirect = torch.zeros(point_count, 3, device=device) if settings.split_indirect else None
+        result = ShadedPoints(diffuse, specular, variance, torch.zeros(point_count, device=device), indirect)
+        ray_count, finds_surfaces = point_count * rays_a_point, settings.bounces > 0
+        if ray_count == 0:
+            return result
+        rounds, first_round = (samples_round, 0) if isinstance(samples_round, Tensor) else (None, samples_round)
+        estimate = Estimate(
+            point_arrays(points, rounds),
+            start_arrays(starts),
+            ray_scene(light, self.tracer, horizon),
+            sample_set(settings.counts, settings.seed, first_round, settings.by_material),
+            rays_a_point,
+            settings.bounces,
+            usable_rays(memory, ray_count, finds_surfaces),
+            empty_rays(memory, ray_count, finds_surfaces, device),
+            _light_sums(result),
+        )
+        self.load_kernels()
+        shrinking = device.type == "cpu" and thread_count() > 1 and not in_thread_pool()
+        over_slices(
+            point_count,
+            device,
+            lambda first, last: self.shade_slice(estimate, first, last),
+            max(1, self.rays_a_slice() // rays_a_point),
+            max(1, MIN_RAYS_A_SLICE // rays_a_point) if shrinking else None,
+        )
+        if memory is not None:
+            memory.rays = estimate.kept
+        return result
+
+
+def _light_sums(light: ShadedPoints) -> Any:
+    """The struct that kernels write to."""
+    sums = LightSums()
+    sums.diffuse, sums.specular = warp_array(light.diffuse, wp.vec3), warp_array(light.specular, wp.vec3)
+    sums.variance, sums.visibility = warp_array(light.variance, wp.vec3), warp_array(light.visibility)
+    sums.indirect = warp_array(light.diffuse[:0] if light.indirect is None else light.indirect, wp.vec3)
+    return sums

@@ -1,0 +1,136 @@
+"""What a frame leaves out, and why: facts about the scene in, a RenderPlan out.
+
+Most rules are exact in expectation: they move samples between strategies or drop work whose result is known; `bound` says where one is
+not. With `skip` off nothing is left out, and tests compare both. The plan is reported in the frame's metadata.
+What one frame takes over from another is invalidate.py's.
+"""
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import torch
+
+from drgs.render.integrate.sample_rays import sample_counts
+from drgs.render.records import FrameInputs, RenderPlan, SampleCounts, Skip
+from drgs.scene.environment import Environment
+from drgs.scene.materials import Materials
+from drgs.scene.mesh import TriangleMesh
+from drgs.scene.posed_scene import PosedScene
+
+EVEN_SKY = 1e-3
+"""A sky whose texels differ by no more than this share is sampled as well by the cosine."""
+CONCENTRATED = 0.05
+"""Spread of a sky (light_spread) below which half of the samples go to it. Measured at 8 samples a pixel, direct light: a dielectric under
+lamps (spread 0.026) has half the error, under a dawn (0.11) a quarter more."""
+ROUGH = 0.7
+"""From this roughness on the lobe of a dielectric is so broad that cosine samples find it."""
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What plan_frame looks at besides the light; over all surfaces, seen or not."""
+
+    largest_diffuse: float
+    """Of (1 - metallic) times the albedo's largest channel."""
+    largest_metallic: float
+    smallest_roughness: float
+    empty_tiles: int = 0
+    """Tiles of the image without a surface, of `tiles`."""
+    tiles: int = 0
+
+
+def scene_facts(scene: PosedScene, empty_tiles: int = 0, tiles: int = 0) -> SceneFacts:
+    """Facts about the materials of mesh and Gaussians."""
+    carriers: list[TriangleMesh | Materials] = [scene.mesh] if scene.surfels is None else [scene.mesh, scene.surfels.materials]
+    return SceneFacts(
+        max(float(((1 - m.metallic) * m.albedo.amax(-1)).max()) for m in carriers),
+        max(float(m.metallic.max()) for m in carriers),
+        min(float(m.roughness.min()) for m in carriers),
+        empty_tiles,
+        tiles,
+    )
+
+
+_spreads: WeakKeyDictionary[Environment, float] = WeakKeyDictionary()
+
+
+def light_spread(environment: Environment) -> float:
+    """Share of the sphere that lights, 0..1: (mean L)^2 / mean L^2 of the largest channel; 1 for an even sky, 1e-4 under a midday sun."""
+    if environment not in _spreads:
+        radiance = environment.radiance.detach().amax(-1).double()
+        height = len(radiance)
+        polar = (torch.arange(height, device=radiance.device, dtype=torch.float64) + 0.5) * (torch.pi / height)
+        weight = torch.sin(polar) / torch.sin(polar).sum()
+        mean, square = (weight @ values.mean(1) for values in (radiance, radiance.square()))
+        _spreads[environment] = float(mean * mean / square.clamp(min=1e-300))
+    return _spreads[environment]
+
+
+def samples_per_pass(inputs: FrameInputs) -> SampleCounts:
+    """Samples of each strategy that a pass is asked for, before the plan moves any."""
+    settings = inputs.settings
+    return settings.counts or sample_counts(settings.samples_per_pass or (4 if inputs.primary == "mesh" else 32))
+
+
+def plan_frame(
+    environment: Environment,
+    intensity: float,
+    counts: SampleCounts,
+    bounces: int,
+    skip: bool,
+    facts: SceneFacts | None = None,
+    skip_error: float = 0.0,
+) -> RenderPlan:
+    """The plan for a scene's light and a frame's settings.
+
+    Args:
+        counts: samples a pass of each strategy as asked for.
+        skip: False leaves nothing out.
+        facts: None: nothing is known of the surfaces.
+        skip_error: share of the sky that rays may be spared without proof (RenderSettings).
+    """
+    if not skip:
+        return RenderPlan(counts, False, bounces, ())
+    skips = []
+    darkest, brightest = (float(x) for x in environment.radiance.detach().aminmax())
+    if brightest * intensity <= 0:
+        skips.append(Skip("light rays", "the sky is black", "exact"))
+        return RenderPlan(SampleCounts(0, 0, 0), False, 0, tuple(skips))
+    if facts is not None and facts.empty_tiles:
+        why = f"nothing can be seen in {facts.empty_tiles} of {facts.tiles} tiles of the picture"
+        skips.append(Skip("rays through empty tiles", why, "exact"))
+    if counts.environment > 0 and brightest - darkest <= EVEN_SKY * brightest:
+        skips.append(Skip("environment samples", "the sky is even: they go to the other strategies", "exact in the mean"))
+        ggx = counts.ggx + counts.environment // 2
+        counts = SampleCounts(counts.total - ggx, ggx, 0)
+    elif counts.environment > 0 and (spread := light_spread(environment)) < CONCENTRATED:
+        environment_samples = max(counts.environment, counts.total // 2)
+        ggx = min(counts.ggx, (counts.total - environment_samples + 1) // 2)
+        why = f"the light comes from {100 * spread:.2g} % of the sky"
+        skips.append(Skip("part of the cosine and GGX samples", f"{why}: they go to the environment", "exact in the mean"))
+        counts = SampleCounts(counts.total - environment_samples - ggx, ggx, environment_samples)
+    if facts is not None and facts.largest_diffuse <= 0 and counts.cosine > 0 and counts.total > counts.cosine:
+        skips.append(Skip("cosine samples", "no surface has a diffuse part: they go to the other strategies", "exact in the mean"))
+        counts = SampleCounts(0, counts.ggx + counts.cosine, counts.environment)
+    if facts is not None and facts.largest_metallic <= 0 and facts.smallest_roughness >= ROUGH and counts.ggx > 0 and counts.cosine > 0:
+        skips.append(Skip("GGX samples", "every surface is rough and no metal: cosine samples find its lobe", "exact in the mean"))
+        counts = SampleCounts(counts.cosine + counts.ggx, 0, counts.environment)
+    by_material = counts.ggx > 0 and counts.cosine + counts.environment > 0
+    if by_material:
+        skips.append(
+            Skip("samples of strategies that a point's material hardly needs", "they go to its other strategies", "exact in the mean")
+        )
+    skips.append(
+        Skip(
+            "tracing of rays that leave above all the mesh has there",
+            "horizons of faces, the asset's or found as rays pay for them",
+            "exact",
+        )
+        if skip_error <= 0
+        else Skip(
+            "tracing of rays that leave above nearly all the mesh has there",
+            "horizons of faces, the asset's or found as rays pay for them",
+            f"at most {100 * skip_error:g} % of the cosine-weighted sky at a point taken for open",
+        )
+    )
+    return RenderPlan(counts, by_material, bounces, tuple(skips))

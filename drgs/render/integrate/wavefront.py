@@ -1,0 +1,116 @@
+"""The integrator of any device and any tracer: sample, trace, follow and sum, each for a whole batch of rays before the next.
+
+For CUDA; and on the CPU the specification of fused_embree.py, ray by ray in plain kernels. drgs/reference/shade.py and
+drgs/reference/scatter_hits.py say the same in float64.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+
+from drgs.maths.constants import VOID_ORIGIN
+from drgs.render.integrate.brdf_warp import alpha_of, specular_brdf
+from drgs.render.integrate.environment_table import lookup_radiance, uv_from_world_direction
+from drgs.render.integrate.integrator import AbstractIntegrator, Estimate
+from drgs.render.integrate.ray_scene import RayScene
+from drgs.render.integrate.sample_rays import PointArrays, SampleSet, StartArrays, balance_weight, round_at, sampled_direction, split_at
+from drgs.render.integrate.sum_samples import RaySamples, ray_samples, sum_samples
+from drgs.render.integrate.trace_indirect import add_contributions, paths_of_hits, scatter_hits, trace_indirect
+from drgs.render.intersect.mesh_surface import face_limit, far_along
+from drgs.render.intersect.ray_memory import note_directions, trace_batch
+from drgs.warp_torch import load_kernel, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+RAYS_A_BATCH = 65536
+"""Rays of one CPU batch: its 4 MB of ray data stay in the cache between sampling, tracing and shading."""
+RAYS_A_BATCH_GPU = 1 << 23
+
+
+@wp.kernel
+def start_rays(
+    first: int,
+    bounces: int,
+    points: PointArrays,
+    starts: StartArrays,
+    scene: RayScene,
+    samples: SampleSet,
+    # outputs
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    rays: RaySamples,
+):
+    i = wp.tid()
+    count = samples.cosine + samples.ggx + samples.environment
+    point = (first + i) // count
+    n = points.normal[point]
+    wo = points.wo[point]
+    roughness = points.roughness[point]
+    alpha = alpha_of(roughness)
+    start = wp.vec3(VOID_ORIGIN, VOID_ORIGIN, VOID_ORIGIN)  # void rays leave from far outside and miss at the root of the tree
+    wi = wp.vec3(0.57735027, 0.57735027, 0.57735027)
+    w = wp.float32(0.0)
+    f = wp.vec3(0.0, 0.0, 0.0)
+    seen = wp.vec3(0.0, 0.0, 0.0)
+    if wp.dot(n, wo) > 0.0:
+        split = split_at(samples, points, point)
+        candidate = sampled_direction(
+            samples, split, scene.light, points.pixel[point], round_at(samples, points, point), (first + i) % count, wo, n, alpha
+        )
+        surface_normal = starts.surface_normal[point]
+        if wp.dot(n, candidate) > 0.0 and wp.dot(surface_normal, candidate) > 0.0:
+            uv = uv_from_world_direction(scene.light, candidate)
+            seen = lookup_radiance(scene.light, uv)
+            if bounces > 0 or wp.max(seen) > 0.0:
+                limit = wp.float32(2.0)
+                if starts.face.shape[0] > 0:
+                    limit = face_limit(scene.mesh, starts.face[point], surface_normal, candidate)
+                start = wp.where(wp.dot(surface_normal, candidate) <= limit, starts.origin[point], far_along(candidate))
+                wi = candidate
+                w = balance_weight(split, scene.light, wi, wo, n, alpha, uv) * wp.dot(n, wi)
+                f = w * specular_brdf(wi, wo, n, alpha, points.albedo[point], points.metallic[point])
+    origin[i] = start
+    direction[i] = wi
+    rays.cosine_weight[i] = w
+    rays.specular[i] = f
+    rays.radiance[i] = seen
+
+
+class WavefrontIntegrator(AbstractIntegrator):
+    """Final."""
+
+    def load_kernels(self) -> None:
+        for kernel in (start_rays, note_directions, scatter_hits, add_contributions, sum_samples):
+            load_kernel(kernel, self._device())
+
+    def rays_a_slice(self) -> int:
+        return RAYS_A_BATCH_GPU if self._device().is_cuda else RAYS_A_BATCH
+
+    def shade_slice(self, estimate: Estimate, first: int, last: int) -> int:
+        device, first_ray, count = self.tracer.mesh.vertices.device, first * estimate.rays_a_point, (last - first) * estimate.rays_a_point
+        origin, direction, rays = torch.empty(count, 3, device=device), torch.empty(count, 3, device=device), ray_samples(count, device)
+        wp.launch(
+            start_rays,
+            dim=count,
+            inputs=[first_ray, estimate.bounces, estimate.points, estimate.starts, estimate.scene, estimate.samples],
+            outputs=[warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), rays],
+            device=self._device(),
+        )
+        hits, traced = trace_batch(origin, direction, first_ray, self.tracer, estimate.bounces > 0, estimate.known, estimate.kept)
+        rays.blocked = warp_array(hits.hit)
+        if estimate.bounces > 0:
+            indirect, further = trace_indirect(estimate, paths_of_hits(hits, direction), count, first, self.tracer)
+            rays.indirect = warp_array(indirect, wp.vec3)
+            traced += further
+        wp.launch(
+            sum_samples,
+            dim=last - first,
+            inputs=[first, estimate.points, estimate.samples, rays, estimate.bounces],
+            outputs=[estimate.sums],
+            device=self._device(),
+        )
+        return traced
+
+    def _device(self) -> Any:
+        return warp_device(self.tracer.mesh.vertices)

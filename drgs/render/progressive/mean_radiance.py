@@ -1,0 +1,145 @@
+"""What the passes so far amount to: sums in; mean radiance, its variance and the mean G-buffer out, of the window that shows something."""
+
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from drgs.render.integrate.plan import samples_per_pass
+from drgs.render.progressive.frame_state import FrameState, GaussianView
+from drgs.render.progressive.frame_sums import SumArrays, sum_arrays
+from drgs.render.progressive.reproject import blend_history, remember
+from drgs.render.records import GBuffer, History, Radiance
+from drgs.render.visible.image_tiles import TILE, Window, tile_grid
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class WindowPlace:
+    """Where a window lies in the image; it begins at a tile's corner [pixels]."""
+
+    width: int
+    row: int
+    column: int
+    image_width: int
+    tiles_across: int
+    """Of the image."""
+
+
+@wp.struct
+class MeanMaps:
+    """Radiance as kernels see it."""
+
+    diffuse: wp.array2d[wp.vec3]
+    specular: wp.array2d[wp.vec3]
+    variance: wp.array2d[float]
+    visibility: wp.array2d[float]
+    diffuse_variance: wp.array2d[float]
+    specular_variance: wp.array2d[float]
+    indirect: wp.array2d[wp.vec3]
+    """Empty unless asked for."""
+
+
+@wp.kernel
+def mean_over_passes(
+    first: int,
+    window: WindowPlace,
+    tile_passes: wp.array[wp.int64],
+    sums: SumArrays,
+    # outputs
+    mean: MeanMaps,
+):
+    """Variance: converge.mean_variance, of passes that found a surface."""
+    i = first + wp.tid()
+    y = i / window.width
+    x = i - y * window.width
+    row = window.row + y
+    column = window.column + x
+    p = row * window.image_width + column
+    passes = float(tile_passes[(row / TILE) * window.tiles_across + column / TILE])
+    count = wp.max(passes, 1.0)
+    w = wp.max(sums.weight[p], 1.0)
+    mean.diffuse[y, x] = sums.diffuse[p] / w
+    mean.specular[y, x] = sums.specular[p] / w
+    mean.visibility[y, x] = sums.visibility[p] / w
+    if sums.indirect.shape[0] > 0:
+        mean.indirect[y, x] = sums.indirect[p] / w
+    within = sums.scatter[p]
+    of_mean = within[0]
+    if passes > 1.0:
+        luminance = sums.luminance[p] / count
+        of_mean = wp.max(sums.luminance_squared[p] / count - luminance * luminance, 0.0) / (count - 1.0)
+    mean.variance[y, x] = of_mean * (count / w) * (count / w)
+    mean.diffuse_variance[y, x] = within[1] / (w * w)
+    mean.specular_variance[y, x] = within[2] / (w * w)
+
+
+_means: WeakKeyDictionary[FrameState, Radiance] = WeakKeyDictionary()
+"""Of states that live: the picture that is shown is the next one's history."""
+
+
+def mean_radiance(state: FrameState) -> Radiance:
+    """Straight (alpha-normalised) radiance of the window, with what history adds; the variance is that of the mean of one pixel's passes."""
+    if state in _means:
+        return _means[state]
+    own = _own_samples(state)
+    height, width = own.shape
+    diffuse, specular = (own.new_empty(height, width, 3) for _ in range(2))
+    variance, visibility, diffuse_variance, specular_variance = (own.new_empty(height, width) for _ in range(4))
+    indirect = None if state.sums.indirect is None else torch.empty_like(diffuse)
+    radiance = Radiance(diffuse, specular, variance, visibility, state.samples, diffuse_variance, specular_variance, indirect)
+    inputs = [_window_place(state.window), warp_array(state.tiles.passes), sum_arrays(state.sums)]
+    launch(mean_over_passes, height * width, inputs, [_mean_maps(radiance)], warp_device(own))
+    if state.reprojected is not None:
+        blend_history(radiance, state.reprojected, mean_gbuffer(state), own)
+    _means[state] = radiance
+    return radiance
+
+
+def mean_gbuffer(state: FrameState) -> GBuffer:
+    """Of the window: the rasterised one, or the mean over passes of what rays to the mesh saw."""
+    if isinstance(state.view, GaussianView):
+        return GBuffer(**{name: state.window.crop(values) for name, values in vars(state.view.gbuffer).items()})
+    assert state.sums.surface is not None
+    weight = state.in_window(state.sums.weight)
+    coverage = weight / state.passes_in_window.clamp(min=1)
+    mean = state.in_window(state.sums.surface) / weight.clamp(min=1)[..., None]
+    depth = torch.where(coverage > 0, mean[..., 14], torch.inf)
+    normal, wo = (torch.nn.functional.normalize(mean[..., a : a + 3].contiguous(), dim=-1) for a in (3, 6))
+    return GBuffer(coverage, depth, mean[..., :3], normal, wo, mean[..., 9:12], mean[..., 12], mean[..., 13])
+
+
+def frame_history(state: FrameState) -> History | None:
+    """What the frame is worth to the next one, seen by another camera; before the first pass that of the frame before it."""
+    if state.passes == 0:
+        return state.history
+    camera = state.window.camera(state.inputs.camera)
+    return remember(mean_radiance(state), mean_gbuffer(state), camera, _own_samples(state), state.reprojected)
+
+
+def _own_samples(state: FrameState) -> Tensor:
+    """(rows, columns) behind the frame's own mean."""
+    return (state.passes_in_window * samples_per_pass(state.inputs).total).float()
+
+
+def _window_place(window: Window) -> Any:
+    place = WindowPlace()
+    place.row, place.column = window.rows.start, window.columns.start
+    place.width, place.image_width = window.columns.stop - window.columns.start, window.width
+    place.tiles_across = tile_grid(window.width, window.height)[0]
+    return place
+
+
+def _mean_maps(radiance: Radiance) -> Any:
+    maps = MeanMaps()
+    maps.diffuse, maps.specular = warp_array(radiance.diffuse, wp.vec3), warp_array(radiance.specular, wp.vec3)
+    maps.variance, maps.visibility = warp_array(radiance.variance), warp_array(radiance.visibility)
+    assert radiance.diffuse_variance is not None and radiance.specular_variance is not None
+    maps.diffuse_variance, maps.specular_variance = warp_array(radiance.diffuse_variance), warp_array(radiance.specular_variance)
+    if radiance.indirect is not None:
+        maps.indirect = warp_array(radiance.indirect, wp.vec3)
+    return maps

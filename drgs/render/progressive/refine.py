@@ -1,0 +1,161 @@
+"""More passes over a frame: refine as often as wished, look at any time.
+
+A pass adds `samples_per_pass` rays to every covered pixel and updates the running sums; passes continue the same
+low-discrepancy sequences, so n passes of k samples are as good as one of n k. With the mesh as primary
+surface each pass also looks through another place of the pixel. State is a frozen record: refining returns a new one.
+"""
+
+import time
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from drgs.render.integrate.choose_integrator import choose_integrator
+from drgs.render.integrate.integrator import IntegratorSettings
+from drgs.render.intersect.horizon import usable_horizons
+from drgs.render.intersect.ray_memory import RayMemory
+from drgs.render.intersect.trace_rays import over_slices
+from drgs.render.progressive.converge import MIN_PASSES, still_active
+from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshView, with_seconds
+from drgs.render.progressive.frame_sums import add_estimate, copy_sums
+from drgs.render.progressive.mean_radiance import mean_gbuffer
+from drgs.render.progressive.reproject import reproject
+from drgs.render.records import PrimaryPoints, RayStarts, ShadingPoints
+from drgs.render.visible.image_tiles import pixels_of_tiles, tile_of_pixels
+from drgs.render.visible.trace_primary import trace_primary_points
+from drgs.warp_torch import thread_count
+
+SLICES_A_THREAD = (2, 8)
+"""Slices of the image for each thread when passes run side by side, fewest and most: with few, some thread waits, for one slice's rays may
+cost twice another's; many are worth it where each still holds half of PIXELS_AT_ONCE."""
+PIXELS_AT_ONCE = 32768
+"""Camera rays that a thread takes together, of as many passes as that makes: Python's share of the time falls with it."""
+
+
+def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> FrameState:
+    """The frame after `passes` more passes over the tiles that still need them; the given state stays as it is.
+
+    Args:
+        consume: the given state is not needed any more, and its sums are added to instead of copied.
+    """
+    if not consume or state.passes == 0:  # sums of no pass share one zero
+        state = _with_sums_of_its_own(state)
+    while passes > 0 and bool(state.tiles.active.any()):
+        # Tiles that rested while others went on catch up first, so that passes of one tile follow each other.
+        index = int(state.tiles.passes[state.tiles.active].min())
+        chosen = state.tiles.active & (state.tiles.passes == index)
+        count = _passes_at_once(state, chosen, index, passes)
+        state = _add_pass(state, chosen, index) if count == 1 else _add_passes(state, chosen, index, count)
+        state.tiles.passes[chosen] += count
+        passes -= count
+        if state.history is not None:
+            found = reproject(state.history, mean_gbuffer(state), state.window.camera(state.inputs.camera))
+            state = replace(state, reprojected=found, history=None)
+        if state.inputs.settings.target_error is not None and index + count >= MIN_PASSES:
+            state = replace(state, tiles=replace(state.tiles, active=still_active(state, state.tiles.active)))
+    return state
+
+
+def _with_sums_of_its_own(state: FrameState) -> FrameState:
+    """What passes write to is copied; nothing else is ever written to."""
+    tiles = replace(state.tiles, passes=state.tiles.passes.clone())
+    return replace(state, sums=copy_sums(state.sums), tiles=tiles, first_rays=replace(state.first_rays))
+
+
+def _passes_at_once(state: FrameState, chosen: Tensor, index: int, passes: int) -> int:
+    """How many of the next `passes` need nobody to look between them."""
+    if isinstance(state.view, GaussianView) or index == 0 or state.sums.weight.is_cuda:
+        return 1
+    if state.inputs.settings.target_error is not None:
+        passes = min(passes, max(MIN_PASSES, 1 << index.bit_length()) - index)  # the next look
+    behind = state.tiles.passes[state.tiles.active & ~chosen]
+    return min(passes, int(behind.min()) - index) if len(behind) else passes
+
+
+def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
+    """One pass over chosen tiles; adds to the given state's sums."""
+    started = time.perf_counter()
+    whole_first_pass = index == 0 and bool((chosen == state.tiles.covered).all())
+    primary = _primary_points(state, chosen, index, whole_first_pass)
+    traced = time.perf_counter()
+    _shade_and_add(state, primary, index, state.first_rays if whole_first_pass else None)
+    if whole_first_pass and isinstance(state.view, MeshView):
+        state = replace(state, view=MeshView(first_primary_points=primary))
+    seconds = {"trace_primary": traced - started, "shade": time.perf_counter() - traced}
+    return _pay_for_horizons(with_seconds(state, seconds), primary.starts.face, len(primary.points.pixel))
+
+
+def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> FrameState:
+    """Several passes over chosen tiles of a mesh, each thread with pixels of its own: nobody waits for the others between passes."""
+    started = time.perf_counter()
+    camera, seed = state.inputs.camera, state.inputs.settings.seed
+    pixels = _pixels(state, chosen)
+
+    def work(first: int, last: int) -> tuple[int, float, Tensor | None]:
+        points, tracing, at_once = 0, 0.0, max(1, PIXELS_AT_ONCE // (last - first))
+        for round_ in range(index, index + count, at_once):
+            began = time.perf_counter()
+            together = min(at_once, index + count - round_)
+            primary = trace_primary_points(state.traced.tracer, camera, seed, round_, pixels=pixels[first:last], passes=together)
+            tracing += time.perf_counter() - began
+            _shade_and_add(state, primary, round_ if primary.round is None else primary.round, None)
+            points += len(primary.points.pixel)
+        return points, tracing, primary.starts.face
+
+    fewest, most = (slices * thread_count() for slices in SLICES_A_THREAD)
+    slices = min(max(fewest, 2 * len(pixels) * count // PIXELS_AT_ONCE), most)
+    done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // slices)))
+    traced = sum(seconds for _, seconds, _ in done) / max(1, min(thread_count(), len(done)))
+    seconds = {"trace_primary": traced, "shade": max(0.0, time.perf_counter() - started - traced)}
+    starts = torch.cat([faces for *_, faces in done if faces is not None])
+    return _pay_for_horizons(with_seconds(state, seconds), starts, sum(points for points, *_ in done))
+
+
+def _primary_points(state: FrameState, chosen: Tensor, index: int, whole_first_pass: bool) -> PrimaryPoints:
+    """What the camera sees in the chosen tiles in pass `index`."""
+    camera, view = state.inputs.camera, state.view
+    if isinstance(view, GaussianView):
+        everywhere = bool((chosen == state.tiles.covered).all())
+        return view.primary_points if everywhere else points_in_tiles(view.primary_points, chosen, camera.width, state.inputs.first_pixel)
+    if whole_first_pass and view.first_primary_points is not None:
+        return view.first_primary_points
+    return trace_primary_points(state.traced.tracer, camera, state.inputs.settings.seed, index, pixels=_pixels(state, chosen))
+
+
+def _pixels(state: FrameState, chosen: Tensor) -> Tensor:
+    """(pixel,) int32 numbers in the image of the pixels of chosen tiles."""
+    inputs = state.inputs
+    pixels = pixels_of_tiles(chosen, inputs.camera.width, inputs.height)
+    return pixels if inputs.band is None else pixels + inputs.first_pixel
+
+
+def points_in_tiles(primary: PrimaryPoints, tiles: Tensor, width: int, first_pixel: int = 0) -> PrimaryPoints:
+    """The points whose pixels lie in chosen tiles (tile,) bool of an image of this width, or of its band that begins at `first_pixel`."""
+    here = torch.nonzero(tiles[tile_of_pixels(primary.points.pixel - first_pixel, width)]).squeeze(-1)
+    points = ShadingPoints(**{name: values[here] for name, values in vars(primary.points).items()})
+    starts = primary.starts
+    face = None if starts.face is None else starts.face[here]
+    return PrimaryPoints(points, RayStarts(starts.origin_world[here], starts.surface_normal_world[here], face), primary.depth[here])
+
+
+def _shade_and_add(state: FrameState, primary: PrimaryPoints, index: int | Tensor, memory: RayMemory | None) -> None:
+    """Light of the points of pass `index`, or of several passes, added to the sums of their pixels."""
+    plan, settings, traced = state.plan, state.inputs.settings, state.traced
+    horizon = usable_horizons(traced.tracer.horizons, settings.skip_error) if settings.skip else None
+    how = IntegratorSettings(plan.counts, plan.bounces, settings.seed, plan.by_material, settings.split_indirect)
+    integrator = choose_integrator(traced.tracer)
+    light = integrator.shade(primary.points, primary.starts, traced.environment_light, how, index, memory, horizon)
+    add_estimate(state.sums, primary, light, state.inputs.first_pixel)
+
+
+def _pay_for_horizons(state: FrameState, starts: Tensor | None, points: int) -> FrameState:
+    """The search for horizons goes on as far as the rays of these points pay for it.
+
+    Args:
+        starts: (point,) faces of some of the points.
+    """
+    started, horizons = time.perf_counter(), state.traced.tracer.horizons
+    if state.inputs.settings.skip and horizons is not None:
+        horizons.pay(points * state.plan.counts.total, starts)
+    return with_seconds(state, {"horizons": time.perf_counter() - started})

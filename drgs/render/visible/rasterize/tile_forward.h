@@ -1,0 +1,78 @@
+// Blends the surfels of one 16x16 tile, front to back, 16 pixels of a row at a time.
+// Body of a Warp native function; tile_kernels.py puts constants (CHANNELS, DEPTH, PARAMETERS, ...) and simd_vector.h before it.
+//
+// in   tile, table (TileTable of tile_kernels.py)
+// out  planes: CHANNELS features, coverage, and with DEPTH: sum w z', sum w z'^2 (z' = z - depth_origin), median depth; all (plane)
+//      median_entry (plane): list position behind the median depth, -1 where none
+const int tiles_x = table.tiles_x, stride = table.stride, plane = table.plane;
+const float depth_origin = table.depth_origin;
+const int tile_x = tile % tiles_x, tile_y = tile / tiles_x;
+const int* const list_surfel = table.list_surfel.data;
+const float* const surfel_rows = table.parameters.data;
+const float* const feature_rows = table.features.data;
+float* const out = planes.data;
+const int first = table.starts.data[tile], last = table.starts.data[tile + 1];
+const v16 x_left = lane_centers() + (float)(tile_x * 16);
+
+v16 sums[CHANNELS + 1 + 3 * DEPTH][16];
+v16 transmittance[16];
+i16 median[16];
+for (int k = 0; k < CHANNELS + 1 + 3 * DEPTH; ++k)
+    for (int r = 0; r < 16; ++r) sums[k][r] = v16(0.0f);
+for (int r = 0; r < 16; ++r) { transmittance[r] = v16(1.0f); median[r] = i16(-1); }
+
+for (int entry = first; entry < last; ++entry) {
+    if (((entry - first) & 31) == 31) {  // every pixel opaque: nothing behind can be seen
+        i16 open = i16(0);
+        for (int r = 0; r < 16; ++r) open |= transmittance[r] >= MIN_TRANSMITTANCE;
+        if (!any(open)) break;
+    }
+    const int surfel = list_surfel[entry];
+    const float* const q = surfel_rows + (long)(surfel) * PARAMETERS;
+    const float* const f = feature_rows + (long)(surfel) * CHANNELS;
+    const float top = (float)((table.first_row + tile_y) * 16);
+    const int row_first = max_int(0, (int)(q[21] - top)), row_last = min_int(15, (int)(q[22] - top));
+    const v16 x = x_left - q[9];
+    const v16 dx = x_left - q[11];
+    const v16 dx2 = q[24] * dx * dx;
+    const v16 hx_row = q[0] * x, hy_row = q[3] * x, hz_row = q[6] * x;
+    for (int r = row_first; r <= row_last; ++r) {
+        const float y_pixel = top + (float)(r) + 0.5f;
+        const float y = y_pixel - q[10], dy = y_pixel - q[12];
+        const v16 hx = hx_row + (q[1] * y + q[2]);
+        const v16 hy = hy_row + (q[4] * y + q[5]);
+        const v16 hz = hz_row + (q[7] * y + q[8]);
+        const v16 h2 = hx * hx + hy * hy, hz2 = hz * hz;
+        // rho <= rho_max in the plane's branch, without dividing first
+        const v16 rho_screen = dx2 + q[24] * dy * dy;
+        i16 front = hz > 0.0f;
+        if (q[18] > 0.0f) front &= (q[15] - q[18]) * hz + q[16] * hx + q[17] * hy > 0.0f;  // nearer than the near plane
+        const i16 inside = ((h2 <= q[14] * hz2) & front) | (rho_screen <= q[14]);
+        v16 T = transmittance[r];
+        const i16 live = inside & (T >= MIN_TRANSMITTANCE);
+        if (!any(live)) continue;
+        const v16 rho_plane = select(front, h2 / (hz2 + 1e-30f), v16(1e30f));
+        const v16 rho = min16(rho_plane, rho_screen);
+        const v16 alpha = min16(v16(MAX_ALPHA), q[13] * exp_negative(0.5f * rho));
+        const v16 w = select(live, alpha * T, v16(0.0f));
+#pragma unroll
+        for (int k = 0; k < CHANNELS; ++k) sums[k][r] += w * f[k];
+        sums[CHANNELS][r] += w;
+        if (DEPTH) {
+            const v16 reach = max16(abs16(hz), sqrt16(h2) * (1.0f / DEPTH_CUTOFF)) + 1e-30f;
+            const v16 z = q[15] + (q[16] * hx + q[17] * hy) / reach;
+            const v16 z_relative = z - depth_origin;
+            sums[CHANNELS + 1][r] += w * z_relative;
+            sums[CHANNELS + 2][r] += w * z_relative * z_relative;
+            const i16 is_median = live & (T > 0.5f);
+            sums[CHANNELS + 3][r] = select(is_median, z, sums[CHANNELS + 3][r]);
+            median[r] = is_median ? i16(entry) : median[r];
+        }
+        transmittance[r] = T - w;
+    }
+}
+const long corner = (long)(tile_y) * 16 * stride + tile_x * 16;
+for (int k = 0; k < CHANNELS + 1 + 3 * DEPTH; ++k)
+    for (int r = 0; r < 16; ++r) store16(out + (long)(k) * plane + corner + (long)(r) * stride, sums[k][r]);
+if (DEPTH)
+    for (int r = 0; r < 16; ++r) *(i16u*)(median_entry.data + corner + (long)(r) * stride) = median[r];

@@ -1,0 +1,225 @@
+"""Bodies of the REST interface, but for what jobs are asked for (worker/drgs_worker/jobs/requests.py). `generate_types.py` writes them to TypeScript
+beside the stream's messages."""
+
+from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drgs.scene.edits import Edit
+from drgs_server.live.messages import BrokenEdit, Row
+from drgs_worker.jobs.capture_report import CaptureReport
+from drgs_worker.jobs.requests import (
+    BuildRequest,
+    ExportRequest,
+    JobKind,
+    RedecoupleRequest,
+    RenderRequest,
+    SimulateRequest,
+)
+from drgs_worker.store.user_names import UserName
+
+__all__ = ["BuildRequest", "ExportRequest", "RedecoupleRequest", "RenderRequest", "SimulateRequest"]
+
+JobState = Literal["queued", "running", "stalled", "done", "failed", "cancelled", "unknown"]
+"""stalled: its worker died and no other took it over yet. unknown: the queue has never heard of it, which is not done."""
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class JobInfo(_Body):
+    id: str
+    kind: JobKind
+    name: str
+    preset: str
+    """Empty where the kind has none."""
+    priority: int
+    """Lower runs first."""
+    state: JobState
+    created_at: datetime
+    finished_at: datetime | None
+    stage: str
+    """Of the build; empty before it starts."""
+    iteration: int
+    iterations: int
+    fraction: float
+    """Of the whole job, 0..1."""
+    psnr: float | None
+    eta_seconds: float | None
+    message: str
+    attempts: int
+    """How often the work was started: 1 unless a worker died or it was retried."""
+    asset_id: str | None
+    """What a build or a re-decoupling made; set when done."""
+    source_asset: str | None
+    """What a job of another kind than `build` works on."""
+    clip: str | None
+    """What a `pose` edit names to show a simulation; set when done."""
+    error: str | None
+    """A sentence, when failed."""
+    capture: CaptureReport | None
+    """What `drgs doctor` finds in the capture of a build; there soon after it began."""
+    preview_version: int
+    """Rises with each new preview picture; 0 while there is none. Use it to get round the browser's cache."""
+
+
+class JobList(_Body):
+    jobs: list[JobInfo]
+    """Newest first."""
+    total: int
+    workers_alive: int
+
+
+class JobFile(_Body):
+    name: str
+    bytes: int
+    media_type: str
+
+
+class JobFileList(_Body):
+    files: list[JobFile]
+    """By name; complete once the job is done."""
+
+
+class AssetInfo(_Body):
+    id: str
+    name: str
+    created_at: datetime
+    bytes: int
+    source: str
+    """build, upload or session."""
+    surfel_count: int
+    """0 for an asset made from a mesh."""
+    vertex_count: int
+    face_count: int
+    has_thumbnail: bool
+    version: int
+    """1, or one more than the parent's."""
+    parent_id: str | None
+    """The version that this one was made of."""
+    edits: list[Edit]
+    """What was done to the parent."""
+    deleted_at: datetime | None
+    """Since when it can be brought back, for a while."""
+
+
+class AssetList(_Body):
+    assets: list[AssetInfo]
+    """Newest first."""
+    total: int
+
+
+class TrainingView(_Body):
+    """One camera of the capture that an asset was built from."""
+
+    name: str
+    """Of the photograph's file, without its ending."""
+    width: int
+    """Pixels of the photograph as the build saw it."""
+    height: int
+    world_from_camera: tuple[Row, Row, Row, Row]
+    """OpenGL camera-to-world, rows, as of a camera message."""
+    left: float
+    """This and the next three: edges of the picture on the plane at distance 1 before the camera, x to the right and y up. The picture's
+    middle need not lie on the axis."""
+    right: float
+    bottom: float
+    top: float
+
+
+class TrainingViewList(_Body):
+    views: list[TrainingView]
+    """In the order of the asset's cameras; empty for an imported mesh."""
+    has_photographs: bool
+    """False for assets that were built before photographs were kept with them."""
+
+
+class EnvironmentInfo(_Body):
+    name: str
+    """What an environment edit's `file` says."""
+    title: str
+    width: int
+    height: int
+
+
+class EnvironmentList(_Body):
+    environments: list[EnvironmentInfo]
+
+
+class SessionRequest(_Body):
+    asset: str
+
+
+class SessionInfo(_Body):
+    id: str
+    asset: str
+    asset_name: str
+    created_at: datetime
+    revision: int
+    edits: list[Edit]
+    can_undo: bool
+    can_redo: bool
+    appended: int
+    undone: list[Edit]
+    """This, `appended` and `broken` as in EditLog."""
+    broken: list[BrokenEdit]
+    viewers: int
+
+
+class SessionList(_Body):
+    sessions: list[SessionInfo]
+
+
+class EditRequest(_Body):
+    edit: Edit
+
+
+class EditsRequest(_Body):
+    edits: list[Edit]
+    revision: Annotated[int, Field(ge=0)] | None = None
+    """Of the log that they are meant for: refused once there is a newer one. Absent: whatever is in force goes."""
+
+
+class WeightsInfo(_Body):
+    file: str
+    """What a selection's `weights_file` says."""
+    vertices: int
+
+
+class SnapshotInfo(_Body):
+    name: str
+    created_at: datetime
+    revision: int
+    """Of the log when it was taken."""
+    edits: list[Edit]
+
+
+class SnapshotList(_Body):
+    snapshots: list[SnapshotInfo]
+    """Oldest first."""
+
+
+class SaveRequest(_Body):
+    name: UserName | None = None
+    """Of the new version; the asset's name when absent."""
+
+
+class TokenRequest(_Body):
+    token: Annotated[str, Field(max_length=200)]
+
+
+class Health(_Body):
+    status: Literal["ok"] = "ok"
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem details; `detail` is a sentence a user can act on."""
+
+    model_config = ConfigDict(json_schema_serialization_defaults_required=True)
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str

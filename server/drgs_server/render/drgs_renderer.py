@@ -1,0 +1,303 @@
+"""The renderer of the service: drgs' own progressive frames, with everything kept that a change leaves as it was.
+
+What an edit makes old is drgs/render/progressive/invalidate.py's table; frames are handed on from picture to picture, so that a new environment keeps
+what the camera sees, a new exposure all samples, and a moving camera what its last picture showed of the same places.
+
+Imported only on the render thread, and torch only inside functions: the API process must start fast.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drgs.maths.color_numpy import linear_from_srgb
+from drgs.scene.edits import Edit
+from drgs_server.live.messages import CameraMessage, Settings
+from drgs_server.render.channels import channel_pixels, linear_channel
+from drgs_server.render.environment_memory import EnvironmentMemory
+from drgs_server.render.interface import (
+    AbstractLoadedAsset,
+    AbstractPicture,
+    AbstractPose,
+    AbstractRenderer,
+    AbstractStill,
+    Bounds,
+    Explanation,
+    LinearPixels,
+    Picked,
+    Pixels,
+    view_of_bounds,
+)
+from drgs_server.render.still import SLICE_SECONDS, Still, SurfelStill
+from drgs_server.render.surfel_picture import SurfelPicture
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from drgs.render.intersect.tracer import AbstractTracer
+    from drgs.render.progressive.frame_state import FrameState
+    from drgs.scene.asset import Asset
+    from drgs.scene.environment import Environment
+    from drgs.scene.posed_scene import PosedScene
+
+SAMPLES_PER_PASS = 4
+"""Rays a pixel of the first, quick picture: two cosine, one GGX, one towards the environment."""
+REFINE_SECONDS = 0.03
+"""A refinement lasts about this long, so that a new input need not wait; never less than one pass."""
+CHANNEL_SAMPLES = 32
+"""Behind a picture of albedo, normals ...: passes are its antialiasing."""
+
+LIGHT_CHANNELS = ("final", "visibility", "indirect", "variance")
+"""Channels of Picture that are summed over rays; the others are known once the surface is."""
+
+
+class DrgsRenderer(AbstractRenderer):
+    """Final."""
+
+    def __init__(self, device: str = "auto") -> None:
+        self._device = device
+        self._light = EnvironmentMemory()
+
+    def load(self, folder: Path, environments: Path) -> "LoadedAsset":
+        from drgs.scene.asset import load_asset
+        from drgs.warp_torch import device_from_name
+
+        return LoadedAsset(load_asset(folder, device_from_name(self._device)), environments, self._light)
+
+    def environment_bytes(self) -> int:
+        return self._light.bytes()
+
+    def forget_environments(self) -> None:
+        self._light.forget_unused()
+
+    def prepare(self) -> None:
+        from drgs.deform import pose_scene  # noqa: F401
+        from drgs.render import render_frame  # noqa: F401
+        from drgs.scene import asset  # noqa: F401
+
+
+class LoadedAsset(AbstractLoadedAsset):
+    """Final."""
+
+    def __init__(self, asset: "Asset", environments: Path, light: EnvironmentMemory | None = None) -> None:
+        self.asset = asset
+        self._environments = environments
+        self._light = light or EnvironmentMemory()
+        low, high = asset.mesh.vertices.amin(0).tolist(), asset.mesh.vertices.amax(0).tolist()
+        self.bounds = Bounds(tuple(low), tuple(high))
+        self.start_view = view_of_bounds(self.bounds)
+
+    def pose(self, edits: Sequence[Edit], previous: AbstractPose | None, go_on: Callable[[], None] | None = None) -> "Pose":
+        from drgs.deform.pose_scene import pose_scene
+        from drgs.render.progressive.start_frame import tracer_of
+
+        scene = pose_scene(self.asset, edits, self._environments, environments=self._environment, confine=True, go_on=go_on)
+        before = (previous.scene, previous.tracer) if isinstance(previous, Pose) else None
+        return Pose(self.asset, scene, tracer_of(scene, before))
+
+    def keep(self, edits: Sequence[Edit], path: Path) -> None:
+        from drgs.deform.keep_pose import save_pose
+
+        save_pose(self.asset, edits, path, self._environments)
+
+    def recall(self, edits: Sequence[Edit], path: Path) -> bool:
+        from drgs.deform.keep_pose import recall_pose
+
+        return recall_pose(self.asset, edits, path, self._environments) > 0
+
+    def _environment(self, name: str) -> "Environment":
+        return self._light.get(self._environments / name, self.asset.mesh.vertices.device)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose(AbstractPose):
+    """Final."""
+
+    asset: "Asset"
+    scene: "PosedScene"
+    tracer: "AbstractTracer"
+
+    def vertex_at(self, position_world: "Tensor") -> int:
+        """Selections refer to the object at rest, whose vertices have the numbers of the moved ones."""
+        return int((self.scene.mesh.vertices - position_world).square().sum(-1).argmin())
+
+    def region_of(self, vertex: int) -> int:
+        return int(self._regions[vertex])
+
+    @cached_property
+    def _under_white_sky(self) -> "PosedScene":
+        """Where every direction is asked about: under the true sky rays towards black texels are not."""
+        import torch
+
+        from drgs.scene.environment import Environment
+
+        white = Environment(torch.ones(8, 16, 3, device=self.scene.mesh.vertices.device))
+        return replace(self.scene, environment=white, environment_rotation_degrees=0.0, environment_intensity=1.0)
+
+    @cached_property
+    def _regions(self) -> "Tensor":
+        from drgs.scene.select_vertices import mesh_regions
+
+        return mesh_regions(self.asset.mesh)
+
+    def begin(
+        self, camera: CameraMessage, settings: Settings, width: int, height: int, previous: AbstractPicture | None
+    ) -> AbstractPicture:
+        from drgs.render.progressive.start_frame import start_frame
+
+        if isinstance(previous, SurfelPicture):
+            previous = previous.before
+        known = previous if isinstance(previous, Picture) else None
+        if settings.channel == "surfels":
+            maps = settings.model_copy(update={"channel": "depth"})
+            return SurfelPicture(self.scene, _camera(camera, width, height), known, lambda: self.begin(camera, maps, width, height, known))
+        before = None if known is None else known.state
+        state = start_frame(
+            self._scene_of(settings), _camera(camera, width, height), _render_settings(settings), self.tracer, previous=before
+        )
+        return Picture(self, state, settings, known if state.computed_parts == () else None)
+
+    def still(self, camera: CameraMessage, settings: Settings, width: int, height: int, linear: bool) -> AbstractStill:
+        from drgs.render.render_bands import render_bands
+
+        seen = _camera(camera, width, height)
+        if settings.channel == "surfels":
+            return SurfelStill(self.scene, seen)
+        primary = "gaussians" if self.scene.surfels is not None else "mesh"
+        rendered = replace(_render_settings(settings), samples_per_pixel=_samples_wanted(settings, primary))
+        bands = render_bands(self._scene_of(settings), seen, rendered, self.tracer, SLICE_SECONDS)
+        return Still(bands, height, width, settings, linear)
+
+    def _scene_of(self, settings: Settings) -> "PosedScene":
+        """What a picture of this channel is made of."""
+        return self._under_white_sky if settings.channel == "visibility" else self.scene
+
+
+class Picture(AbstractPicture):
+    """Final. Wraps the frozen states of drgs.render.progressive."""
+
+    def __init__(self, pose: Pose, state: "FrameState", settings: Settings, continued: "Picture | None" = None) -> None:
+        """
+        Args:
+            continued: the picture whose sums go on: how many passes fit into a refinement is known of it.
+        """
+        self.pose = pose
+        self.state = state
+        self.width, self.height = state.inputs.camera.width, state.inputs.camera.height
+        self._settings = settings
+        self._passes_at_once: int = 1 if continued is None else continued._passes_at_once
+        self._samples_a_pass = _samples_a_pass(state)
+        self.notes = tuple(f"{skip.what} left out: {skip.why}" for skip in state.plan.skips)
+
+    @property
+    def samples(self) -> int:  # type: ignore[override]
+        return self.state.samples
+
+    @property
+    def samples_target(self) -> int:  # type: ignore[override]
+        return max(_samples_wanted(self._settings, self.state.inputs.primary), self._samples_a_pass)
+
+    def refine(self) -> None:
+        """Add samples for about REFINE_SECONDS."""
+        from drgs.render.progressive.refine import refine_frame
+
+        if self.samples >= self.samples_target:
+            return
+        left = -(-(self.samples_target - self.samples) // self._samples_a_pass)
+        passes = min(self._passes_at_once, left)
+        start = time.perf_counter()
+        self.state = refine_frame(self.state, passes)
+        seconds = (time.perf_counter() - start) / passes
+        self._passes_at_once = max(1, min(int(REFINE_SECONDS / max(seconds, 1e-4)), 2 * self._passes_at_once))
+
+    def resolve(self) -> Pixels:
+        from drgs.render.film.resolve_frame import resolve_frame
+
+        return channel_pixels(resolve_frame(self.state), self._settings)
+
+    def linear(self) -> LinearPixels:
+        return linear_channel(self.state, self._settings.channel).cpu().numpy()
+
+    def pick(self, x: float, y: float) -> Picked | None:
+        from drgs.render.film.resolve_frame import resolve_frame
+
+        maps = resolve_frame(self.state).gbuffer
+        column, row = min(int(x * self.width), self.width - 1), min(int(y * self.height), self.height - 1)
+        if float(maps.coverage[row, column]) < 0.5:
+            return None
+        vertex = self.pose.vertex_at(maps.position_world[row, column])
+        return Picked(
+            position=tuple(maps.position_world[row, column].tolist()),
+            normal=tuple(maps.normal_world[row, column].tolist()),
+            albedo=tuple(maps.albedo[row, column].clamp(0, 1).tolist()),
+            roughness=float(maps.roughness[row, column]),
+            metallic=float(maps.metallic[row, column]),
+            region=self.pose.region_of(vertex),
+            rest=tuple(self.pose.asset.mesh.vertices[vertex].tolist()),
+        )
+
+    def explain(self) -> Explanation:
+        from drgs.render.film.resolve_frame import resolve_frame
+
+        spent = resolve_frame(self.state).metadata["milliseconds"]
+        skips = tuple((skip.what, skip.why, skip.bound) for skip in self.state.plan.skips)
+        return Explanation({step: value / 1000 for step, value in spent.items()}, skips)
+
+
+def _samples_wanted(settings: Settings, primary: str) -> int:
+    """Rays a pixel behind a finished picture."""
+    if settings.channel in LIGHT_CHANNELS:
+        return settings.spp_target
+    # Maps of Gaussians are exact from the first pass on.
+    return 1 if primary == "gaussians" else min(CHANNEL_SAMPLES, settings.spp_target)
+
+
+def _samples_a_pass(state: "FrameState") -> int:
+    from drgs.render.integrate.plan import samples_per_pass
+
+    return samples_per_pass(state.inputs).total
+
+
+def _camera(message: CameraMessage, width: int, height: int):
+    import torch
+
+    from drgs.scene.camera import camera_from_opengl
+
+    focal = height / 2 / np.tan(np.radians(message.fov_y_degrees) / 2)
+    # Rounding may change the aspect of a reduced picture by a pixel: the full one's horizontal angle is kept.
+    focal_x = focal * (width / height) * (message.height / message.width)
+    intrinsics = torch.tensor([[focal_x, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return camera_from_opengl(torch.tensor(message.world_from_camera, dtype=torch.float64), intrinsics, width, height)
+
+
+def _bounces(settings: Settings) -> int:
+    if settings.channel == "indirect":
+        return max(1, settings.bounces)  # with none there would be nothing to see
+    return settings.bounces if settings.channel in ("final", "variance") else 0
+
+
+def _render_settings(settings: Settings):
+    from drgs.render.records import RenderSettings, SampleCounts
+
+    background: Any = settings.background
+    channel = settings.channel
+    if channel != "final":
+        background = "transparent"
+    elif isinstance(background, tuple):
+        background = tuple(linear_from_srgb(np.clip(background, 0, 1)).tolist())
+    return RenderSettings(
+        samples_per_pixel=settings.spp_target,
+        samples_per_pass=SAMPLES_PER_PASS,
+        counts=SampleCounts(SAMPLES_PER_PASS, 0, 0) if channel == "visibility" else None,
+        bounces=_bounces(settings),
+        split_indirect=channel == "indirect",
+        denoise="svgf" if settings.denoise and channel == "final" else "none",
+        exposure=settings.exposure_stops,
+        tone_curve=settings.tone_curve,
+        background=background,
+    )

@@ -1,0 +1,99 @@
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from drgs.convert.export_asset import display_sh, export_asset
+from drgs.convert.import_mesh import import_mesh
+from drgs.exchange.exr import decode_environment
+from drgs.exchange.gaussian_ply import decode_gaussian_ply
+from drgs.exchange.ply import parse_ply
+from drgs.maths.color import srgb_from_linear
+from drgs.maths.spherical_harmonics import evaluate_sh
+from drgs.scene.asset import Asset
+from drgs.scene.environment import Environment
+from drgs.scene.gaussians import Gaussians
+from drgs.scene.mesh import TriangleMesh
+
+
+def ball_asset() -> Asset:
+    shape = trimesh.creation.icosphere(3)
+    vertices = torch.tensor(np.asarray(shape.vertices), dtype=torch.float32)
+    albedo, smooth = 0.1 + 0.8 * (vertices + 1) / 2, (vertices[:, 2] + 1) / 2
+    mesh = TriangleMesh(
+        vertices + torch.tensor([0, 0, 2.0]), torch.tensor(np.asarray(shape.faces), dtype=torch.int32), vertices, albedo, smooth, 1 - smooth
+    )
+    random = torch.Generator().manual_seed(0)
+    n = 30
+    gaussians = Gaussians(
+        torch.randn(n, 3, generator=random), torch.randn(n, 2, generator=random) - 3, torch.randn(n, 4, generator=random),
+        torch.randn(n, generator=random), 0.1 * torch.randn(n, 16, 3, generator=random), torch.rand(n, 3, generator=random),
+        torch.rand(n, generator=random), torch.rand(n, generator=random),
+    )  # fmt: skip
+    return Asset(gaussians, mesh, None, Environment(torch.rand(4, 8, 3, generator=random)), meters_per_unit=0.5)
+
+
+def test_an_exported_glb_comes_back_with_its_materials_upright_and_in_metres(tmp_path):
+    asset = ball_asset()
+    export_asset(asset, tmp_path / "a.glb", "glb")
+    mesh = import_mesh(tmp_path / "a.glb").mesh
+    distance, original = torch.cdist(mesh.vertices, 0.5 * asset.mesh.vertices, compute_mode="donot_use_mm_for_euclid_dist").min(
+        1
+    )  # unwrapping reorders them
+    assert len(mesh.vertices) == len(asset.mesh.vertices) and distance.max() < 1e-6
+    assert torch.equal(original[mesh.faces.long()], asset.mesh.faces.long())
+    assert torch.allclose(mesh.normals, asset.mesh.normals[original], atol=1e-5)
+    for name in ("albedo", "roughness", "metallic"):
+        assert (getattr(mesh, name) - getattr(asset.mesh, name)[original]).abs().max() < 0.03, name
+
+
+def test_a_gaussian_ply_keeps_shape_and_materials_and_shows_srgb_colours(tmp_path):
+    asset = ball_asset()
+    export_asset(asset, tmp_path / "a.ply", "ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    read = decode_gaussian_ply(data)
+    for name in ("centers", "log_scales", "quats_wxyz", "opacity_logits", "albedo", "roughness", "metallic"):
+        assert np.array_equal(read[name], getattr(asset.gaussians, name)), name
+    assert "scale_2" not in parse_ply(data).elements["vertex"].scalars
+    direction = torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
+    shown = evaluate_sh(torch.from_numpy(read["sh"]), direction) + 0.5
+    wanted = srgb_from_linear((evaluate_sh(asset.gaussians.sh, direction) + 0.5).clamp(0, 1))
+    assert (shown - wanted).abs().max() < 0.05 and (shown - wanted).abs().mean() < 0.01
+
+
+def test_a_colour_that_is_the_same_from_everywhere_is_converted_exactly():
+    sh = torch.zeros(2, 16, 3, dtype=torch.float64)
+    found = display_sh(sh)
+    assert torch.allclose(found[:, 0] * 0.28209479177387814 + 0.5, srgb_from_linear(torch.tensor(0.5, dtype=torch.float64)))
+    assert torch.allclose(found[:, 1:], torch.zeros(1, dtype=torch.float64), atol=1e-12)
+
+
+def test_the_third_scale_is_there_for_3dgs_viewers_only(tmp_path):
+    export_asset(ball_asset(), tmp_path / "a.ply", "ply3")
+    assert (parse_ply((tmp_path / "a.ply").read_bytes()).elements["vertex"].scalars["scale_2"] < -8).all()
+
+
+def test_the_environment_is_exported_bit_for_bit(tmp_path):
+    asset = ball_asset()
+    export_asset(asset, tmp_path / "sub" / "env.exr", "env")
+    assert np.array_equal(decode_environment((tmp_path / "sub" / "env.exr").read_bytes()), asset.environment.radiance)
+
+
+def test_what_cannot_be_exported_is_refused_with_a_sentence_and_leaves_nothing(tmp_path, monkeypatch):
+    asset = ball_asset()
+    (tmp_path / "old.usd").write_text("kept")
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(ValueError, match="needs the package usd-core"):
+        export_asset(asset, tmp_path / "old.usd", "usd")
+    with pytest.raises(ValueError, match="expected a name ending in"):
+        export_asset(asset, tmp_path / "a.txt", "usd")
+    with pytest.raises(ValueError, match="needs Gaussians"):
+        export_asset(replace(asset, gaussians=None), tmp_path / "a.ply", "ply")
+    with pytest.raises(ValueError, match="format 'fbx' is unknown; expected glb, ply, ply3, usd, env"):
+        export_asset(asset, tmp_path / "a.fbx", "fbx")  # pyright: ignore
+    with pytest.raises(ValueError, match="is a folder"):
+        export_asset(asset, tmp_path, "glb")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["old.usd"] and (tmp_path / "old.usd").read_text() == "kept"

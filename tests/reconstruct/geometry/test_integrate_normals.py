@@ -1,0 +1,74 @@
+"""Positions from normals: a wrong sphere becomes the right one, by its normals and the outlines of its masks."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, integrate_normals
+from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outline, outline_residuals
+from drgs.reconstruct.geometry.mesh_edges import mesh_edges
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.scene.camera import Camera
+from drgs.scene.mesh import TriangleMesh, vertex_normals
+from tests.render.closed_form_scenes import front_camera, sphere_mesh
+
+SIZE = 96
+
+
+def views_of_a_unit_sphere(count: int = 12) -> tuple[tuple[Camera, ...], list[MaskOutline | None]]:
+    """Around it, with the outline that it has in each."""
+    base = front_camera(SIZE, 4.0, 0.7)
+    radius = float(base.intrinsics[0, 0]) / math.sqrt(15)
+    fine = (torch.arange(SIZE * 8) + 0.5) / 8 - SIZE / 2
+    mask = torch.nn.functional.avg_pool2d((fine[:, None] ** 2 + fine**2 < radius**2).float()[None, None], 8)[0, 0]
+    cameras = []
+    for k in range(count):
+        a, b = 2 * math.pi * k / count, 0.6 * math.sin(2.4 * k)
+        about_z = torch.tensor([[math.cos(a), -math.sin(a), 0, 0], [math.sin(a), math.cos(a), 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        about_x = torch.tensor([[1, 0, 0, 0], [0, math.cos(b), -math.sin(b), 0], [0, math.sin(b), math.cos(b), 0], [0, 0, 0, 1]])
+        cameras.append(dataclasses.replace(base, camera_from_world=base.camera_from_world @ (about_x @ about_z).float()))
+    return tuple(cameras), [mask_outline(mask)] * count
+
+
+def solved(mesh: TriangleMesh, wanted: torch.Tensor, settings: IntegrationSettings, rounds: int = 4) -> torch.Tensor:
+    cameras, outlines = views_of_a_unit_sphere()
+    edges = mesh_edges(mesh.faces)
+    for _ in range(rounds):
+        residuals = outline_residuals(edges, build_tracer(mesh), cameras, outlines)
+        vertices = integrate_normals(mesh.vertices, mesh.faces, wanted, edges, residuals, settings)
+        mesh = dataclasses.replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces))
+    return mesh.vertices
+
+
+def test_a_sphere_that_is_too_small_and_bumpy_becomes_the_sphere_of_its_normals_and_masks():
+    true = sphere_mesh(subdivisions=4)
+    bumps = 0.02 * torch.sin(9 * true.vertices).prod(1, keepdim=True)
+    wrong = dataclasses.replace(true, vertices=true.vertices * (0.96 + bumps))
+    radii = solved(wrong, true.normals, IntegrationSettings()).norm(dim=1)
+    assert abs(float(radii.mean()) - 1) < 2e-3 and float(radii.std()) < 0.2 * float((0.96 + bumps).std())
+
+
+def test_the_true_sphere_stays_where_it_is():
+    true = sphere_mesh(subdivisions=4)
+    assert float((solved(true, true.normals, IntegrationSettings()) - true.vertices).norm(dim=1).max()) < 4e-3
+
+
+@pytest.mark.parametrize("anchor", [1e-3, 1e3])
+def test_the_anchor_holds_what_nothing_pulls(anchor: float):
+    true = sphere_mesh(subdivisions=3)
+    shrunk = dataclasses.replace(true, vertices=0.97 * true.vertices)
+    moved = (solved(shrunk, true.normals, IntegrationSettings(anchor=anchor), rounds=1) - shrunk.vertices).norm(dim=1)
+    assert (float(moved.mean()) > 0.015) == (anchor < 1)
+
+
+def test_a_mesh_of_any_size_is_moved_in_proportion():
+    true = sphere_mesh(subdivisions=3)
+    bumpy = true.vertices * (1 + 0.02 * torch.sin(9 * true.vertices).prod(1, keepdim=True))
+    edges = mesh_edges(true.faces)
+    none = outline_residuals(edges, build_tracer(true), (), [])
+    results = [
+        integrate_normals(scale * bumpy, true.faces, true.normals, edges, none, IntegrationSettings()) / scale for scale in (1.0, 1e3)
+    ]
+    torch.testing.assert_close(results[0], results[1], atol=1e-4, rtol=0)

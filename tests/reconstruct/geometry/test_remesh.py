@@ -1,0 +1,47 @@
+"""Meshing anew: the surface stays, its triangles get even, folds go, and what vertices carry arrives."""
+
+import pytest
+import torch
+
+from drgs.reconstruct.geometry.extract_mesh import MeshSettings
+from drgs.reconstruct.geometry.extract_mesh.clean_mesh import is_watertight
+from drgs.reconstruct.geometry.remesh import remesh
+from tests.render.closed_form_scenes import sphere_mesh
+
+SETTINGS = MeshSettings(resolution=48, face_limit=4000, smoothing_passes=0)
+
+
+def smallest_angles(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    """(face,) [degrees]"""
+    corners = vertices[faces.long()]
+    to_next = torch.nn.functional.normalize(corners.roll(-1, 1) - corners, dim=-1)
+    to_last = torch.nn.functional.normalize(corners.roll(1, 1) - corners, dim=-1)
+    return torch.rad2deg(torch.acos((to_next * to_last).sum(-1).clamp(-1, 1))).amin(1)
+
+
+def test_a_sphere_stays_and_linear_values_arrive():
+    old = sphere_mesh(subdivisions=4)
+    new = remesh(old.vertices, old.faces, SETTINGS)
+    assert is_watertight(len(new.vertices), new.faces.long().numpy()) and len(new.faces) <= SETTINGS.face_limit
+    assert float((new.vertices.norm(dim=1) - 1).abs().max()) < 2e-3
+    assert float((new.carried(old.vertices) - new.vertices).norm(dim=1).max()) < 2e-3
+    assert torch.allclose(new.weights.sum(1), torch.ones(len(new.vertices)))
+
+
+def test_faces_that_were_pushed_through_the_surface_are_gone():
+    old = sphere_mesh(subdivisions=4)
+    folded, faces = old.vertices.clone(), old.faces
+    one = int(faces[0, 0])
+    folded[one] = -1.3 * folded[one]  # a spike from here out of the other side
+    assert float(smallest_angles(folded, faces).min()) < 5.0
+    new = remesh(folded, faces, SETTINGS)
+    assert is_watertight(len(new.vertices), new.faces.long().numpy())
+    assert float(new.vertices.norm(dim=1).max()) < 1.005
+    whole = (new.vertices @ old.vertices[one]).abs() < 0.9  # but for where it begins and came out
+    assert float((new.vertices[whole].norm(dim=1) - 1).abs().median()) < 2e-3
+
+
+def test_a_surface_that_encloses_nothing_is_refused():
+    flat = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    with pytest.raises(ValueError, match="encloses nothing"):
+        remesh(flat, torch.tensor([[0, 1, 2]], dtype=torch.int32), SETTINGS)

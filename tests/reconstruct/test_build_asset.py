@@ -1,0 +1,295 @@
+"""From a capture to an asset on a tiny preset: what is written, how it stops and resumes, and what is refused."""
+
+import dataclasses
+import io
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import simplejpeg
+import torch
+from PIL import Image
+
+from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photograph
+from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, kept_photographs
+from drgs.reconstruct.fit.densify import DensifySettings
+from drgs.reconstruct.fit.fit_gaussians import FitSettings
+from drgs.reconstruct.fit.fit_materials import MaterialSettings
+from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings
+from drgs.reconstruct.fit.surfel_parameters import parameters_from_gaussians
+from drgs.reconstruct.geometry.bind_gaussians import points_from_binding
+from drgs.reconstruct.geometry.extract_mesh import MeshSettings
+from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen
+from drgs.reconstruct.report_progress import encode_preview
+from drgs.reconstruct.stages import stage_two_preview
+from drgs.render.records import SampleCounts
+from drgs.scene.asset import Asset, load_asset, load_photographs
+from drgs.scene.views import Views
+from tests.reconstruct.surfel_spheres import joined, surfel_sphere
+from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
+from tests.render.closed_form_scenes import front_camera
+
+TINY = Preset(
+    points=600,
+    image_side=72,
+    fit=FitSettings(iterations=20, densify=DensifySettings(every=5, budget=700)),
+    mesh=MeshSettings(resolution=48, face_limit=2000),
+    materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
+    mesh_surfels=MeshFitSettings(iterations=6),
+)
+SETTINGS = BuildSettings(preset="tiny", device="cpu")
+
+
+@pytest.fixture(autouse=True)
+def _tiny_preset(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setitem(PRESETS, "other", TINY)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_nerf_synthetic(tmp_path_factory.mktemp("capture"))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Build:
+    asset: Asset
+    path: Path
+    progress: list[Progress]
+
+
+@pytest.fixture(scope="module")
+def build(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Build:
+    """One build, never stopped."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", TINY)
+        progress: list[Progress] = []
+        out = tmp_path_factory.mktemp("built") / "sphere"
+        return Build(build_asset(capture, out, SETTINGS, progress.append), out, progress)
+
+
+def stop_when(stage: str, progress: list[Progress], after: int = 1):
+    """should_stop that says yes from the `after`-th report of a stage on."""
+    return lambda: sum(p.stage == stage for p in progress) >= after
+
+
+def asset_tensors(asset: Asset) -> dict[str, torch.Tensor]:
+    parts = {"gaussians": asset.gaussians, "mesh": asset.mesh, "binding": asset.binding, "environment": asset.environment}
+    return {f"{part}.{f.name}": getattr(record, f.name) for part, record in parts.items() for f in dataclasses.fields(record)}
+
+
+def test_a_build_makes_an_asset_that_loads_with_the_same_numbers(build: Build):
+    loaded = asset_tensors(load_asset(build.path))
+    for name, value in asset_tensors(build.asset).items():
+        assert torch.equal(loaded[name], value), name
+    assert (build.path / "thumb.jpg").read_bytes()[:2] == b"\xff\xd8"
+    assert len(load_asset(build.path).cameras) == len(sphere_views())
+
+
+def test_the_photographs_of_the_capture_are_kept_with_the_asset(build: Build):
+    photographs = load_photographs(build.path)
+    assert photographs is not None
+    check_photographs(photographs, len(build.asset.cameras), "the asset")
+    for number, view in enumerate(sphere_views(square=True)):
+        kept = Image.open(io.BytesIO(read_photograph(build.path / PHOTOGRAPHS, number)))
+        reduced = np.asarray(Image.fromarray(view.rgba).resize(kept.size, Image.Resampling.BOX), float)
+        difference = np.abs(np.asarray(kept.convert("RGBA"), float) - reduced)
+        assert max(kept.size) == TINY.image_side and difference[..., 3].mean() < 4, view.name
+        assert difference[..., :3][reduced[..., 3] == 255].mean() < 8, view.name
+
+
+def test_a_capture_without_masks_keeps_whole_photographs():
+    views = Views((), torch.zeros(1, 8, 8, 3, dtype=torch.uint8), torch.zeros(1, 8, 8, dtype=torch.uint8), None, None, False, "nerfstudio")
+    for has_masks, bands in ((True, ("R", "G", "B", "A")), (False, ("R", "G", "B"))):
+        packed = kept_photographs(dataclasses.replace(views, has_masks=has_masks))
+        picture = zipfile.ZipFile(io.BytesIO(packed)).read("0000.webp")
+        assert Image.open(io.BytesIO(picture)).getbands() == bands
+
+
+def test_the_mesh_is_the_sphere_and_its_vertices_carry_materials(build: Build):
+    mesh = build.asset.mesh
+    distance = (mesh.vertices - torch.tensor(SPHERE_CENTER, dtype=torch.float32)).norm(dim=-1) / SPHERE_RADIUS
+    # So short a fit leaves holes, behind which the fusion finds inner sheets; the outside is the sphere.
+    assert 0.95 < float(distance.quantile(0.9)) < 1.1
+    for name in ("albedo", "roughness", "metallic"):
+        value = getattr(mesh, name)
+        assert float(value.min()) >= 0 and float(value.max()) <= 1, name
+    assert float(mesh.albedo.std()) > 0.02  # not the grey that a fresh mesh has
+    assert len(build.asset.binding.face) == len(build.asset.gaussians.centers)
+    assert float(build.asset.environment.radiance.min()) > 0
+
+
+def test_provenance_says_how_the_asset_came_about(build: Build, capture: Path):
+    facts = load_asset(build.path).provenance
+    assert (facts["preset"], facts["seed"], facts["device"], facts["source"], facts["dataset"]) == (
+        "tiny",
+        0,
+        "cpu",
+        "nerf-synthetic",
+        capture.name,
+    )
+    assert set(facts["seconds"]) >= {"read", "fit", "mesh", "materials"} and all(s >= 0 for s in facts["seconds"].values())
+
+
+def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
+    fractions = [p.fraction for p in build.progress]
+    assert fractions == sorted(fractions) and fractions[0] == 0.0 and fractions[-1] == pytest.approx(1.0)
+    stages = list(dict.fromkeys(p.stage for p in build.progress))
+    assert stages == ["read", "fit", "mesh", "materials", "pack"]
+    last_fit = [p for p in build.progress if p.stage == "fit"][-1]
+    assert (last_fit.iteration, last_fit.iterations) == (20, 20) and last_fit.psnr > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["fit", "mesh", "materials"])
+def test_a_stopped_build_leaves_a_checkpoint_and_resumes_to_the_same_asset(build: Build, capture: Path, tmp_path: Path, stage: str):
+    progress: list[Progress] = []
+    out = tmp_path / "sphere"
+    with pytest.raises(BuildStopped):
+        build_asset(capture, out, SETTINGS, progress.append, stop_when(stage, progress))
+    assert not out.exists()
+    checkpoint = "stage2.safetensors" if stage == "materials" else "stage1.safetensors"
+    assert (Path(f"{out}.build") / checkpoint).is_file()
+    resumed = asset_tensors(build_asset(capture, out, dataclasses.replace(SETTINGS, resume=True)))
+    for name, value in asset_tensors(build.asset).items():
+        if stage == "materials" and not name.startswith(("mesh.vertices", "mesh.faces")):
+            # Resuming stage 2 refreshes the radiance that rays meet, earlier than the build that ran through did.
+            assert float((resumed[name].float() - value.float()).abs().median()) < 1e-3, name
+        else:
+            assert torch.equal(resumed[name], value), name
+    assert load_asset(out).gaussians is not None
+
+
+@pytest.mark.slow
+def test_bound_to_the_mesh_a_build_goes_on_from_the_fit_of_particles_and_resumes_to_the_same_bits(
+    build: Build, capture: Path, tmp_path: Path
+):
+    out = tmp_path / "sphere"
+    shutil.copytree(f"{build.path}.build", f"{out}.build")
+    on_mesh = dataclasses.replace(SETTINGS, binding="mesh", resume=True)
+    progress: list[Progress] = []
+    with pytest.raises(BuildStopped):  # asked after the mesh, then before each step of the fine-tuning
+        build_asset(capture, out, on_mesh, progress.append, iter([False, False, False, True]).__next__)
+    assert "fit" not in {p.stage for p in progress} and (Path(f"{out}.build") / "mesh_surfels.safetensors").is_file()
+    progress.clear()
+    asset = build_asset(capture, out, on_mesh, progress.append)
+    fractions = [p.fraction for p in progress]
+    assert fractions == sorted(fractions) and {"bind", "materials"} <= {p.stage for p in progress}
+    mesh, gaussians, binding = asset.mesh, asset.gaussians, asset.binding
+    assert len(mesh.faces) <= TINY.fit.densify.budget and len(binding.face.unique()) == len(binding.face) == len(gaussians.centers)
+    assert torch.allclose(points_from_binding(binding, mesh.vertices, mesh.faces), gaussians.centers, atol=1e-6)
+    assert asset.provenance["binding"] == "mesh" and build.asset.provenance["binding"] == "particles"
+    # Without a stop, from the same stage 1, to another place.
+    shutil.copytree(f"{build.path}.build", tmp_path / "b.build")
+    through = asset_tensors(build_asset(capture, tmp_path / "b", on_mesh))
+    for name, value in asset_tensors(asset).items():
+        assert torch.equal(through[name], value), name
+    # The particles' checkpoints are as they were.
+    particles = asset_tensors(build_asset(capture, out, dataclasses.replace(SETTINGS, resume=True)))
+    for name, value in asset_tensors(build.asset).items():
+        assert torch.equal(particles[name], value), name
+
+
+@pytest.mark.slow
+def test_stopping_before_anything_is_fitted_can_be_resumed(capture: Path, tmp_path: Path):
+    with pytest.raises(BuildStopped):
+        build_asset(capture, tmp_path / "a", SETTINGS, should_stop=lambda: True)
+    assert (tmp_path / "a.build" / "stage1.safetensors").is_file()
+
+
+@pytest.fixture(scope="module")
+def stopped(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """OUT of a build that stopped at once."""
+    out = tmp_path_factory.mktemp("stopped") / "a"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", TINY)
+        with pytest.raises(BuildStopped):
+            build_asset(capture, out, SETTINGS, should_stop=lambda: True)
+    return out
+
+
+def copy_of(stopped: Path, folder: Path) -> Path:
+    shutil.copytree(f"{stopped}.build", folder / "a.build")
+    return folder / "a"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("change", [{"preset": "other"}, {"seed": 9}])
+def test_the_checkpoint_of_another_build_is_refused(capture: Path, stopped: Path, tmp_path: Path, change: dict):
+    out = copy_of(stopped, tmp_path)
+    with pytest.raises(ValueError, match=r"is of another build .* delete its folder or choose another OUT"):
+        build_asset(capture, out, dataclasses.replace(SETTINGS, resume=True, **change))
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_the_checkpoint_of_another_capture_is_refused(stopped: Path, tmp_path: Path):
+    fewer = write_nerf_synthetic(tmp_path / "fewer", sphere_views(20, square=True))
+    with pytest.raises(ValueError, match="is of another build"):
+        build_asset(fewer, copy_of(stopped, tmp_path), dataclasses.replace(SETTINGS, resume=True))
+
+
+@pytest.mark.slow
+def test_a_damaged_checkpoint_is_refused_on_resume_and_ignored_without(capture: Path, stopped: Path, tmp_path: Path):
+    out = copy_of(stopped, tmp_path)
+    path = Path(f"{out}.build") / "stage1.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"checkpoint stage1\.safetensors is damaged"):
+        build_asset(capture, out, dataclasses.replace(SETTINGS, resume=True))
+    with pytest.raises(BuildStopped):  # a fresh build starts
+        build_asset(capture, out, SETTINGS, should_stop=lambda: True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        (BuildSettings(preset="best"), "preset 'best' is unknown; expected one of draft, fast, full"),
+        (BuildSettings(binding="ropes"), "binding 'ropes' is unknown; expected one of particles, mesh"),
+        (BuildSettings(device="tpu"), "device 'tpu' is unknown"),
+    ],
+)
+def test_unknown_settings_are_refused_before_anything_is_read(tmp_path: Path, settings: BuildSettings, sentence: str):
+    with pytest.raises(ValueError, match=sentence):
+        build_asset(tmp_path / "no such capture", tmp_path / "out", settings)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_no_capture_is_refused(tmp_path: Path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="not a capture"):
+        build_asset(tmp_path / "empty", tmp_path / "out", SETTINGS)
+
+
+def test_surfels_that_no_camera_sees_are_dropped():
+    outer, inner = surfel_sphere(1200, opacity=0.99, overlap=2.0), surfel_sphere(50, radius=0.4, opacity=0.99)
+    # One camera sees the front of the outer sphere; what is inside and behind hides.
+    kept = drop_unseen(joined(outer, inner), (front_camera(64),), radius=1.0)
+    distance = kept.centers.norm(dim=-1)
+    assert float(distance.min()) > 0.9
+    assert float(kept.centers[:, 1].median()) < 0 and 400 < len(kept.centers) < 900
+    assert len(kept.sh) == len(kept.albedo) == len(kept.centers)
+
+
+def test_a_preview_is_a_jpeg_of_the_picture_on_grey():
+    radiance = torch.full((16, 24, 3), 0.5, requires_grad=True)
+    coverage = torch.zeros(16, 24)
+    coverage[:, 12:] = 1.0
+    image = simplejpeg.decode_jpeg(encode_preview(radiance, coverage))
+    assert image.shape == (16, 24, 3)
+    assert abs(int(image[8, 2, 0]) - 51) < 4 and abs(int(image[8, 20, 0]) - 188) < 4
+
+
+def test_the_thumbnail_of_a_tiny_object_is_that_of_a_large_one():
+    pictures = []
+    for scale in (1.0, 1e-3):
+        camera = front_camera(64, distance=4.0)
+        pose = camera.camera_from_world.clone()
+        pose[:3, 3] *= scale
+        surfels = surfel_sphere(800, radius=scale, radiance=(0.6, 0.3, 0.1))
+        parameters = parameters_from_gaussians(surfels) | {"sh": surfels.sh}
+        jpeg = stage_two_preview(parameters, (dataclasses.replace(camera, camera_from_world=pose),), radius=scale)
+        pictures.append(simplejpeg.decode_jpeg(jpeg).astype(int))
+    assert np.abs(pictures[0][32, 32] - pictures[0][1, 1]).max() > 50  # the object stands out
+    assert np.abs(pictures[1] - pictures[0]).max() <= 4

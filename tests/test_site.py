@@ -1,0 +1,47 @@
+"""The documents build as a site, strictly and from what is here: every page in the menu, every link and every name of the API found."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr + result.stdout
+    return folder
+
+
+@pytest.mark.slow
+def test_the_readme_is_the_first_page(site: Path):
+    page = (site / "index.html").read_text()
+    assert "Two commands" in page and 'href="protocol.html"' in page and 'src="images/sample.jpg"' in page
+
+
+@pytest.mark.slow
+def test_every_command_is_described_as_it_describes_itself(site: Path):
+    page = (site / "commands.html").read_text()
+    assert all(f"Usage: drgs {name} " in page for name in ("build", "render", "import", "export", "simulate", "eval", "doctor", "serve"))
+
+
+def test_the_api_has_every_public_name(site: Path):
+    import drgs
+
+    described = set(re.findall(r"^::: [\w.]*?(\w+)$", (ROOT / "docs" / "api" / "library.md").read_text(), re.MULTILINE))
+    assert described | {"__version__", "Client"} == set(drgs.__all__)
+    assert "drgs_server.client.Client.open_session" in (site / "api" / "client.html").read_text()
+
+
+def test_pages_load_nothing_from_elsewhere(site: Path):
+    for path in site.rglob("*.html"):
+        loaded = re.findall(r"<(?:script|img|link)[^>]*?(?:src|href)=[\"']?(https?:[^\"' >]+)", path.read_text())
+        assert [address for address in loaded if "canonical" not in address] == [], path.name

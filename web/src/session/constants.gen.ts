@@ -1,0 +1,25 @@
+// Written by `python -m drgs_server.generate_types` from drgs/maths/constants.py and drgs/exchange/export_formats.py. Do not edit.
+
+export const F0 = 0.04;
+export const LUMINANCE_RED = 0.2126;
+export const LUMINANCE_GREEN = 0.7152;
+export const LUMINANCE_BLUE = 0.0722;
+export const SRGB_SLOPE = 12.92;
+export const SRGB_LINEAR_END = 0.0031308;
+export const SRGB_ENCODED_END = 0.04045;
+export const SRGB_SCALE = 1.055;
+export const SRGB_OFFSET = 0.055;
+export const SRGB_GAMMA = 2.4;
+export const MIDDLE_GREY = 0.18;
+
+export type DownloadFormat = "glb" | "ply" | "ply3" | "usd" | "env" | "zip";
+
+/** In the order in which they are offered. */
+export const FILE_KINDS: { format: DownloadFormat; suffix: string; title: string; description: string }[] = [
+  { format: "glb", suffix: ".glb", title: "Mesh (GLB)", description: "Mesh with metallic-roughness textures: Blender, three.js, Unreal, Unity" },
+  { format: "ply", suffix: ".ply", title: "Gaussians (2DGS PLY)", description: "2D Gaussians with the field names of 2DGS: SuperSplat" },
+  { format: "ply3", suffix: ".ply", title: "Gaussians (3DGS PLY)", description: "The same as flat ellipsoids, for viewers that want three scales" },
+  { format: "usd", suffix: ".usda", title: "Scene (USD)", description: "ParticleField surflets for OpenUSD 26" },
+  { format: "env", suffix: ".exr", title: "Light (EXR)", description: "The environment: with edits the chosen one, turned and dimmed; else the one recovered with the object" },
+  { format: "zip", suffix: ".zip", title: "Asset (ZIP)", description: "Everything, to open here or with `drgs render`" },
+];

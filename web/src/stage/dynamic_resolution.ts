@@ -1,0 +1,44 @@
+/** Dynamic resolution of the local picture while it moves: fewer pixels where pictures come too slowly, more where there is room. */
+
+/** Device pixels to draw for each CSS pixel, one way. More than two nobody sees, and each costs. */
+export const screenPixelRatio = () => Math.min(window.devicePixelRatio || 1, 2);
+
+/** Shares of `screenPixelRatio`; slow machines go down this list. */
+const SCALES = [1, 0.75, 0.55, 0.4, 0.3];
+/** The time between pictures [ms] at which steps are taken. Thirty a second are the least that feels attached to the hand. */
+const SLOW_FRAME_MS = 32;
+const AIMED_FRAME_MS = 25;
+const QUICK_FRAME_MS = 17.5;
+const FRAMES_BEFORE_STEP = 4;
+
+export class DynamicResolution {
+  private step = 0;
+  /** Running mean of the time between two moving pictures. */
+  private frameMs = AIMED_FRAME_MS;
+  private framesMeasured = 0;
+
+  /** Share of the screen's own sharpness. */
+  get scale(): number {
+    return SCALES[this.step]!;
+  }
+
+  /** Take in the time since the last moving picture; true where the scale changed. */
+  measure(elapsedMs: number): boolean {
+    this.frameMs += 0.4 * (Math.min(elapsedMs, 500) - this.frameMs);
+    if (++this.framesMeasured < FRAMES_BEFORE_STEP || (this.frameMs < SLOW_FRAME_MS && this.frameMs > QUICK_FRAME_MS)) return false;
+    // A screen shows no more than sixty a second, so how much room there is cannot be measured: try one step, at less than twice the time.
+    const next = this.frameMs <= QUICK_FRAME_MS ? Math.max(0, this.step - 1) : this.fitting();
+    this.framesMeasured = 0;
+    if (next === this.step) return false;
+    this.step = next;
+    this.frameMs = AIMED_FRAME_MS; // measure anew before the next step
+    return true;
+  }
+
+  /** The first step whose pictures should come in time: time goes with the number of pixels. */
+  private fitting(): number {
+    const wanted = this.scale * Math.sqrt(AIMED_FRAME_MS / this.frameMs);
+    const step = SCALES.findIndex((scale) => scale <= wanted * 1.05);
+    return step < 0 ? SCALES.length - 1 : step;
+  }
+}

@@ -1,0 +1,72 @@
+/** One finished picture, rendered by the server for the camera on screen; of another size than the window's, with what the camera turns round in its middle. */
+
+import { signal } from '@preact/signals';
+import * as api from '../../session/api';
+import { attempt } from '../../session/notices';
+import { MAX_SIDE } from '../../session/protocol.gen';
+import { session, settings } from '../../session/session';
+import { aimNow, viewNow } from '../../session/view';
+import { worldFromCamera } from '../../stage/camera/camera_path';
+import { download } from '../download';
+import { Choice, NumberField, Section, Switch } from '../fields';
+import { Icon } from '../icons';
+import { titleFor } from '../shortcuts';
+import { LEAST_SIDE, sizeLimit, sizeTrouble, type Size } from './still_size';
+
+const SIZES = [
+  { value: 'window', text: 'Window', size: null },
+  { value: 'hd', text: '1920×1080', size: { width: 1920, height: 1080 } },
+  { value: 'square', text: '1024²', size: { width: 1024, height: 1024 } },
+  { value: 'uhd', text: '3840×2160', size: { width: 3840, height: 2160 } },
+] as const;
+type SizeName = (typeof SIZES)[number]['value'];
+
+/** Null: that of the window. */
+const chosenSize = signal<Size | null>(null);
+const samples = signal('128');
+const format = signal<api.StillFormat>('png');
+const transparent = signal(false);
+const rendering = signal(false);
+
+const FORMATS: { value: api.StillFormat; text: string; title: string }[] = [
+  { value: 'png', text: 'PNG', title: 'As on screen: 8 bits, sRGB, with exposure and tone curve' },
+  { value: 'exr', text: 'EXR', title: 'The light itself: linear 32-bit floats without exposure or tone curve, for compositing' },
+];
+
+async function saveStill(size: Size): Promise<void> {
+  const open = session.value;
+  const view = chosenSize.value && aimNow.value ? { ...size, fov_y_degrees: aimNow.value.fov_y_degrees, world_from_camera: worldFromCamera(aimNow.value) } : viewNow.value;
+  if (!view || !open) return;
+  rendering.value = true;
+  const wanted = { ...settings.value, spp_target: Number(samples.value), ...(format.value === 'exr' && { exposure_stops: 0 }) };
+  const picture = await attempt(api.stillPicture(open.id, api.frameQuery(view, size, wanted, transparent.value), format.value));
+  rendering.value = false;
+  if (picture) download(picture, `${open.assetName}.${format.value}`);
+}
+
+export function Still() {
+  const size = chosenSize.value ?? viewNow.value ?? { width: 0, height: 0 };
+  const { width, height } = size;
+  const known = SIZES.find((preset) => (preset.size ? preset.size.width === chosenSize.value?.width && preset.size.height === chosenSize.value.height : !chosenSize.value));
+  const trouble = viewNow.value && sizeTrouble(size, Number(samples.value));
+  const choose = (name: SizeName) => (chosenSize.value = SIZES.find(({ value }) => value === name)!.size);
+  return (
+    <Section title="Picture">
+      <Choice label="Size" value={known?.value ?? null} options={[...SIZES]} onChange={choose} />
+      <div class="pair">
+        <NumberField label="Width" unit="px" value={width} min={LEAST_SIDE} max={MAX_SIDE} step={1} onEnter={(value) => (chosenSize.value = { width: Math.round(value), height })} />
+        <NumberField label="Height" unit="px" value={height} min={LEAST_SIDE} max={MAX_SIDE} step={1} onEnter={(value) => (chosenSize.value = { width, height: Math.round(value) })} />
+      </div>
+      <Choice label="Samples a pixel" value={samples.value} options={['32', '128', '512'].map((value) => ({ value, text: value }))} onChange={(value) => (samples.value = value)} />
+      <p class={trouble ? 'warning' : 'hint'}>{trouble ?? sizeLimit(Number(samples.value))}</p>
+      <Choice label="File" value={format.value} options={FORMATS} onChange={(value) => (format.value = value)} />
+      <Switch label="Transparent background" title="With alpha; in an EXR colours are multiplied with it, as compositing programs want them" value={transparent.value} onChange={(value) => (transparent.value = value)} />
+      <div class="buttons">
+        <button class="primary" disabled={rendering.value || !viewNow.value || trouble !== null} onClick={() => void saveStill(size)}>
+          <Icon name="camera" /> {rendering.value ? 'Rendering…' : `Render ${format.value.toUpperCase()}`}
+        </button>
+      </div>
+      <p class="hint">{titleFor('still', 'What is on screen is saved at once')}.</p>
+    </Section>
+  );
+}

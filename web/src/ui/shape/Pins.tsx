@@ -1,0 +1,36 @@
+/** What a simulation holds in place: painted on the object, or one end of it. */
+
+import { size } from '../../edit/material/selection';
+import { isAnalytic } from '../../edit/shape/deform_maps';
+import { forgetPins, holdEnd, pinnedShare, pins } from '../../edit/shape/pins';
+import { chooseShapeTool, shapeTool } from '../../edit/shape/shape_tools';
+import { edits } from '../../session/edit_log';
+import { Slider, Switch } from '../fields';
+
+export function Pins() {
+  const on = shapeTool.value === 'pins';
+  const share = 100 * pinnedShare.value;
+  const held = pins.value.length === 0 ? 'Nothing is held.' : `${share < 1 ? 'Less than 1' : Math.round(share)} % of the surface is held.`;
+  return (
+    <>
+      <Switch label="Paint what stays" title="Drag over the object; Shift takes away" value={on} onChange={(next) => chooseShapeTool(next ? 'pins' : 'none')} />
+      {(on || pins.value.length > 0) && (
+        <p class="hint" role="status">
+          {on && !isAnalytic(edits.value) ? 'Painting goes on the shape at rest: remove the simulation or the handles first.' : held}
+        </p>
+      )}
+      {on && <Slider label="Brush" value={size.value} min={0.02} max={1} step={0.01} onChange={(value) => (size.value = value)} />}
+      {(on || pins.value.length > 0) && (
+        <div class="buttons">
+          <button title="Hold the highest part of the object" onClick={() => holdEnd('top')}>
+            Hold the top
+          </button>
+          <button title="Hold the lowest part of the object" onClick={() => holdEnd('foot')}>
+            Hold the foot
+          </button>
+          {pins.value.length > 0 && <button onClick={forgetPins}>Hold nothing</button>}
+        </div>
+      )}
+    </>
+  );
+}

@@ -1,0 +1,21 @@
+import { expect, test } from 'vitest';
+import { DynamicResolution } from '../../src/stage/dynamic_resolution';
+
+/** Milliseconds between pictures of a machine that needs `fullMs` for a sharp one, after it has drawn for a while. */
+function settledMs(fullMs: number): number {
+  const pace = new DynamicResolution();
+  for (let frame = 0; frame < 200; frame++) pace.measure(Math.max(1000 / 60, fullMs * pace.scale ** 2));
+  return Math.max(1000 / 60, fullMs * pace.scale ** 2);
+}
+
+test('a machine that can draw thirty pictures a second at some sharpness does', () => {
+  for (let fullMs = 2; fullMs < 350; fullMs *= 1.07) expect(settledMs(fullMs), `${fullMs} ms a sharp picture`).toBeLessThan(1000 / 30);
+});
+
+test('a quick machine draws sharp pictures, and comes back to them after a hitch', () => {
+  const pace = new DynamicResolution();
+  for (let frame = 0; frame < 10; frame++) pace.measure(400);
+  expect(pace.scale).toBeLessThan(1);
+  for (let frame = 0; frame < 200; frame++) pace.measure(1000 / 60);
+  expect(pace.scale).toBe(1);
+});

@@ -1,0 +1,217 @@
+"""`python -m drgs_worker.jobs.file_tool`: read or write one untrusted file in a process of its own, with bounded memory.
+
+The server calls it (`run_file_tool`), so that a decoder that crashes or swallows memory takes no server down.
+Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full. Commands:
+    asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
+    environment SOURCE OUT      EXR or Radiance HDR -> EXR
+    export ASSET OUT FORMAT [EDITS ENVIRONMENTS N]      asset folder, with the edits put into it -> ply, ply3, glb, usd, env, or zip (the asset itself)
+    version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
+"""
+
+import asyncio
+import errno
+import resource
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drgs.maths.constants import MIDDLE_GREY
+from drgs_worker.jobs.start_view import FOV_Y_DEGREES, start_view
+from drgs_worker.store import disk_full
+
+if TYPE_CHECKING:
+    from drgs.scene.asset import Asset
+
+THUMBNAIL_SIDE = 256
+"""Pixels."""
+MEMORY_BYTES = 16 << 30
+"""Of address space; torch alone reserves a few GiB."""
+TIMEOUT_SECONDS = 300
+FULL_EXIT_CODE = 3
+"""There was no room to write the result."""
+TOOL_BYTES = 512 << 20
+"""Of a tool that has loaded torch and its kernels, without anything to work on."""
+COPIES = 4
+"""Of a file's bytes that reading it takes, about."""
+ENVIRONMENT_BYTES = 96 << 20
+"""Of the tool while it reads an environment, for which it needs no torch, without any pixels."""
+PIXEL_BYTES = 36
+"""Of a pixel of an environment: read, looked at, and written."""
+MOST_ENVIRONMENT_PIXELS = 8192 * 4096
+"""Of an environment that a service takes: 1.2 GiB while it is read, and 400 MB in memory while something is lit by it."""
+HEAD_BYTES = 1 << 16
+
+
+class FileToolError(ValueError):
+    """The input is wrong; the text is a sentence."""
+
+
+def file_tool_bytes(source: Path) -> int:
+    """Memory that the tool takes to work on a file or a folder, estimated: what it is written in, and a few copies of what the source holds."""
+    if source.suffix in (".exr", ".hdr"):
+        width, height = _claimed_size(source) or (0, 0)
+        return ENVIRONMENT_BYTES + PIXEL_BYTES * min(max(width * height, 0), MOST_ENVIRONMENT_PIXELS)
+    size = source.stat().st_size if source.is_file() else sum(path.stat().st_size for path in source.rglob("*") if path.is_file())
+    return TOOL_BYTES + COPIES * size
+
+
+def _claimed_size(picture: Path) -> tuple[int, int] | None:
+    from drgs.exchange.exr import picture_size
+
+    with picture.open("rb") as file:
+        return picture_size(file.read(HEAD_BYTES))
+
+
+async def run_file_tool(*arguments: str) -> None:
+    """Run the tool and wait.
+
+    Raises:
+        FileToolError: with the tool's own sentence, or one that says that it crashed or took too long.
+        OSError: the disk is full.
+    """
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-P",
+        "-m",
+        "drgs_worker.jobs.file_tool",
+        *arguments,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        _, errors = await asyncio.wait_for(process.communicate(), TIMEOUT_SECONDS)
+    except TimeoutError as error:
+        raise FileToolError(f"The file took more than {TIMEOUT_SECONDS} s to read; it is too large or damaged.") from error
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    if process.returncode == FULL_EXIT_CODE:
+        raise OSError(errno.ENOSPC, disk_full.SENTENCE)
+    if process.returncode == 2:
+        raise FileToolError(errors.decode(errors="replace").strip().splitlines()[-1][:1000])
+    if process.returncode != 0:
+        raise FileToolError("The file could not be read; it is damaged, or too large for this machine's memory.")
+
+
+def make_asset(source: Path, out: Path) -> None:
+    """A zipped asset is read and written anew, so that nothing else of the archive arrives."""
+    from drgs.convert.import_mesh import import_mesh
+    from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs
+    from drgs.scene.asset import load_asset, load_photographs, save_asset
+    from drgs.scene.mesh import refuse_unusable
+
+    if source.suffix != ".zip":
+        asset, photographs = import_mesh(source), None
+    else:
+        asset, photographs = load_asset(source), load_photographs(source)
+        refuse_unusable(asset.mesh, f"{source}: mesh.glb")
+        if photographs is not None:
+            check_photographs(photographs, len(asset.cameras), f"{source}: {PHOTOGRAPHS}")
+    save_asset(asset, out, thumbnail(asset), photographs)
+
+
+def thumbnail(asset: "Asset") -> bytes:
+    """A small picture of an asset under its own light, over grey."""
+    import numpy as np
+    import simplejpeg
+    import torch
+
+    from drgs.deform.pose_scene import pose_scene
+    from drgs.render.records import RenderSettings
+    from drgs.render.render_frame import render_frame
+    from drgs.scene.camera import camera_from_opengl
+
+    low, high = asset.mesh.vertices.amin(0).tolist(), asset.mesh.vertices.amax(0).tolist()
+    focal = THUMBNAIL_SIDE / 2 / np.tan(np.radians(FOV_Y_DEGREES) / 2)
+    intrinsics = torch.tensor([[focal, 0, THUMBNAIL_SIDE / 2], [0, focal, THUMBNAIL_SIDE / 2], [0, 0, 1]])
+    camera = camera_from_opengl(torch.from_numpy(start_view(low, high)), intrinsics, THUMBNAIL_SIDE, THUMBNAIL_SIDE)
+    settings = RenderSettings(samples_per_pixel=64, background=(MIDDLE_GREY, MIDDLE_GREY, MIDDLE_GREY))
+    rgba = render_frame(pose_scene(asset, []), camera, settings).rgba_srgb
+    pixels = (rgba[..., :3].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    return simplejpeg.encode_jpeg(np.ascontiguousarray(pixels), quality=85, colorspace="RGB")
+
+
+def make_version(asset_folder: Path, out: Path, edits: Path, environments: Path, version: int) -> None:
+    from drgs.scene.asset import load_photographs, save_asset
+
+    made = edited_asset(asset_folder, edits, environments, version)
+    save_asset(made, out, thumbnail(made), load_photographs(asset_folder))
+
+
+def edited_asset(asset_folder: Path, edits: Path, environments: Path, version: int) -> "Asset":
+    from drgs.convert.bake_edits import bake_edits
+    from drgs.scene.asset import load_asset
+    from drgs.scene.edits import load_edits
+
+    return bake_edits(load_asset(asset_folder), load_edits(edits), environments, version)
+
+
+def make_environment(source: Path, out: Path) -> None:
+    from drgs.exchange.exr import decode_environment, encode_environment
+
+    width, height = _claimed_size(source) or (0, 0)
+    if width * height > MOST_ENVIRONMENT_PIXELS:
+        raise ValueError(f"{source}: is {width}x{height}; a service takes environments of at most 8192x4096: make it smaller")
+    out.write_bytes(encode_environment(decode_environment(source.read_bytes(), source.name)))
+
+
+def export(asset_folder: Path, out: Path, format: Any) -> None:
+    from drgs.scene.asset import load_asset
+
+    picture = asset_folder / "thumb.jpg"
+    write_export(load_asset(asset_folder), asset_folder, out, format, lambda: picture.read_bytes() if picture.exists() else None)
+
+
+def export_edited(asset_folder: Path, out: Path, format: Any, edits: Path, environments: Path, version: int) -> None:
+    made = edited_asset(asset_folder, edits, environments, version)
+    write_export(made, asset_folder, out, format, lambda: thumbnail(made))
+
+
+def write_export(asset: "Asset", source: Path, out: Path, format: Any, picture: Callable[[], bytes | None]) -> None:
+    """`picture` is asked for where the format keeps one; photographs are those of the folder `source`."""
+    if format == "zip":
+        from drgs.scene.asset import load_photographs, save_asset
+
+        save_asset(asset, out, picture(), load_photographs(source))
+    else:
+        from drgs.convert.export_asset import export_asset
+
+        export_asset(asset, out, format)
+
+
+def main(arguments: list[str]) -> int:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    try:
+        match arguments:
+            case ["asset", source, out]:
+                make_asset(Path(source), Path(out))
+            case ["environment", source, out]:
+                make_environment(Path(source), Path(out))
+            case ["export", asset, out, format]:
+                export(Path(asset), Path(out), format)
+            case ["export", asset, out, format, edits, environments, version]:
+                export_edited(Path(asset), Path(out), format, Path(edits), Path(environments), int(version))
+            case ["version", asset, out, edits, environments, version]:
+                make_version(Path(asset), Path(out), Path(edits), Path(environments), int(version))
+            case _:
+                raise ValueError(f"expected asset, environment, export or version with their arguments; found {arguments}")
+    except RecursionError:
+        print("the file is nested deeper than is read here", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print(f"the file needs more memory than the {MEMORY_BYTES >> 30} GiB that reading one may take", file=sys.stderr)
+        return 2
+    except Exception as error:
+        print(str(error).replace("\n", " "), file=sys.stderr)
+        if disk_full.is_disk_full(error):
+            return FULL_EXIT_CODE
+        if not isinstance(error, ValueError | OSError):
+            raise
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

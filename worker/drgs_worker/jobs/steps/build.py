@@ -1,0 +1,96 @@
+"""Builds and re-decouplings: the builder's stages, each a durable step, then the asset's move to its place."""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from drgs.reconstruct.progress import STAGE_SHARES
+from drgs_worker.jobs.builders import BuildRequest
+from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
+from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
+from drgs_worker.store.artifacts import fetch_capture, refresh_job
+from drgs_worker.store.register_asset import register_asset
+
+KEPT_CHECKPOINTS = {
+    "particles": ("stage1.safetensors", "mesh.safetensors"),
+    "mesh": ("stage1.safetensors", "mesh.safetensors", "mesh_surfels.safetensors"),
+}
+"""Of a finished build of either binding: what a re-decoupling starts from."""
+
+
+class BuildRun(AbstractJobRun):
+    """Final. One generator runs through the stages, so that a build that nothing disturbs reads its capture once."""
+
+    def __init__(self, job: JobContext) -> None:
+        self._job = job
+        self._stages: Iterator[str] | None = None
+        self._binding: str = job.parameters.get("binding", "particles")
+        self.steps: tuple[str, ...] = (*STAGE_SHARES[self._binding], "register")
+
+    def run(self, step: str) -> None:
+        job = self._job
+        if step == "register":
+            self._register()
+            return
+        request = self._request()
+        if request.out.exists():
+            return  # packed; the crash came before the step was recorded
+        if self._stages is None:
+            dataset = retry_while_unavailable(lambda: fetch_capture(job.directory, request.dataset), job.should_stop)
+            request = replace(request, dataset=dataset)
+            if not request.dataset.is_dir():
+                raise ValueError(f"The capture {request.dataset.name} is gone; it was removed after the job was made.")
+            self._stages = job.builder(request, job.progress, job.should_stop)
+        if step not in self._stages:  # runs it up to and with this stage; finished ones come from their checkpoints
+            raise ValueError(f"the builder ended before its stage {step!r}")
+
+    def _request(self) -> BuildRequest:
+        job = self._job
+        assert job.dataset is not None
+        given = job.parameters
+        return BuildRequest(job.dataset, job.folder / "asset", given["preset"], given["seed"], job.device, binding=self._binding)
+
+    def _register(self) -> None:
+        """Does nothing that was already done."""
+        job = self._job
+        built, place = job.folder / "asset", job.directory.asset(job.job_id)
+        if built.exists() and not place.exists():
+            built.rename(place)
+        retry_while_unavailable(lambda: register_asset(job.directory, job.engine, job.job_id, job.name, "build"), job.should_stop)
+        work = Path(f"{built}.build")
+        for path in work.iterdir() if work.is_dir() else ():
+            if path.name not in KEPT_CHECKPOINTS[self._binding]:
+                path.unlink()
+
+
+class RedecoupleRun(BuildRun):
+    """Final. A build that starts from another one's geometry."""
+
+    def __init__(self, job: JobContext) -> None:
+        super().__init__(job)
+        self.steps = ("copy", *self.steps)
+
+    def run(self, step: str) -> None:
+        if step == "copy":
+            self._copy()
+        else:
+            super().run(step)
+
+    def _copy(self) -> None:
+        job = self._job
+        retry_while_unavailable(lambda: refresh_job(job.directory, job.parameters["asset"]), job.should_stop)
+        source, work = job.directory.job(job.parameters["asset"]) / "asset.build", job.folder / "asset.build"
+        work.mkdir(exist_ok=True)
+        for name in KEPT_CHECKPOINTS[self._binding]:
+            if not (source / name).is_file():
+                raise ValueError("This asset's geometry was not kept by a build on this service; build it here first.")
+            draft = work / f"{name}.part"
+            shutil.copyfile(source / name, draft)
+            draft.rename(work / name)
+
+    def _request(self) -> BuildRequest:
+        job, given = self._job, self._job.parameters
+        assert job.dataset is not None
+        out = job.folder / "asset"
+        return BuildRequest(job.dataset, out, given["built_preset"], given["built_seed"], job.device, given["preset"], self._binding)

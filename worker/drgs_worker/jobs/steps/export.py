@@ -1,0 +1,56 @@
+"""Exports: files for other programs, each written by the file tool in a process of its own."""
+
+import os
+import subprocess
+import sys
+
+from drgs.exchange.export_formats import FILE_KINDS
+from drgs.reconstruct.progress import Progress
+from drgs_worker.jobs.progress import JobStopped
+from drgs_worker.jobs.requests import ExportRequest
+from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
+
+POLL_SECONDS = 0.2
+
+
+class ExportRun(AbstractJobRun):
+    """Final."""
+
+    def __init__(self, job: JobContext) -> None:
+        self._job = job
+        self._asked = ExportRequest.model_validate(job.parameters)
+        self._formats = {f"export {format}": format for format in self._asked.formats}
+        self.steps = tuple(self._formats)
+
+    def run(self, step: str) -> None:
+        job, format = self._job, self._formats[step]
+        job.files.mkdir(exist_ok=True)
+        out = job.files / f"asset-{format}{FILE_KINDS[format].suffix}"
+        draft = out.with_name(f"draft-{out.name}")
+        source = job.fetch_asset(self._asked.asset)
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "drgs_worker.jobs.file_tool", "export", str(source), str(draft), format],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            while process.poll() is None:
+                if job.should_stop():
+                    raise JobStopped
+                try:
+                    process.wait(POLL_SECONDS)
+                except subprocess.TimeoutExpired:
+                    continue
+        finally:
+            if process.poll() is None:
+                process.kill()
+            _, errors = process.communicate()
+            if process.returncode != 0:
+                draft.unlink(missing_ok=True)
+        if process.returncode != 0:
+            lines = errors.strip().splitlines()
+            raise ValueError(lines[-1][:1000] if process.returncode == 2 and lines else f"writing {format} failed: {errors[-500:]}")
+        os.replace(draft, out)
+        done = self.steps.index(step) + 1
+        job.progress(Progress("export", done, len(self.steps), done / len(self.steps), message=out.name))
