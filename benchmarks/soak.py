@@ -163,19 +163,12 @@ async def _send(client: Client, session: str, messages: list[dict]) -> tuple[lis
 
 
 def _replayed(folder: Path, session: str) -> tuple[int, tuple]:
-    from sqlalchemy import select
-    from sqlalchemy.orm import Session
-
-    from drgs_server.live.edit_log import EditLog
-    from drgs_server.live.sessions import _change_of
+    from drgs_server.live.session_store import SessionStore
+    from drgs_server.settings import Limits
     from drgs_worker.store.data_directory import open_data_directory
-    from drgs_worker.store.database import SessionEventRow, open_database
+    from drgs_worker.store.database import open_database
 
-    engine, log = open_database(open_data_directory(folder / "data")), EditLog()
-    with Session(engine) as database:
-        for event in database.scalars(
-            select(SessionEventRow).where(SessionEventRow.session_id == session).order_by(SessionEventRow.revision)
-        ):
-            log = log.after(event.kind, _change_of(event))  # type: ignore[arg-type]
+    engine = open_database(open_data_directory(folder / "data"))
+    log = SessionStore(engine, Limits()).read(session).log
     engine.dispose()
     return log.revision, log.done

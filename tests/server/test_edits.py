@@ -188,7 +188,7 @@ def test_many_edits_undone_and_redone_end_as_their_replay_does(service: Service)
             request = ChangeRequest("edit", chooser.choice(EDITS)) if takes_edit else ChangeRequest(kind)  # type: ignore[arg-type]
             await sessions.apply(session, request)
         assert session.log.revision == 600
-        assert sessions._replay(session_id).log == session.log
+        assert sessions._store.read(session_id).log == session.log
 
     service.client.portal.call(soak)
 

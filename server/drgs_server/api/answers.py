@@ -9,7 +9,7 @@ from sqlalchemy import Row, func
 from drgs.reconstruct.progress import TOLD
 from drgs.scene.edits import parse_edits
 from drgs_server.api.rest_records import AssetInfo, JobInfo, SessionInfo, SnapshotInfo
-from drgs_server.live.sessions import LiveSession
+from drgs_server.live.live_session import LiveSession
 from drgs_worker.jobs.capture_report import CaptureReport
 from drgs_worker.jobs.queue import JobStatus
 from drgs_worker.store.database import AssetRow, JobRow, SnapshotRow

@@ -25,7 +25,7 @@ from drgs_server.api.rest_records import AssetInfo, AssetList, EnvironmentInfo, 
 from drgs_server.api.uploads import receive_upload
 from drgs_server.api.while_connected import while_connected
 from drgs_server.live.admission import Caller
-from drgs_server.live.sessions import LiveSession
+from drgs_server.live.live_session import LiveSession
 from drgs_worker.jobs.file_tool import FileToolError, file_tool_bytes, run_file_tool
 from drgs_worker.store.artifact_store import ArtifactError
 from drgs_worker.store.artifacts import fetch_asset, fetch_edit_files, remove_deleted_elsewhere, unshare_artifact

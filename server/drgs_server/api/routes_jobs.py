@@ -188,7 +188,7 @@ def _check_render(context: ServerContext, asked: RenderRequest) -> None:
             raise ProblemError(422, f"No environment is called {name!r}; GET /api/environments lists them.")
     for variant in asked.variants:
         for edit in variant.edits:
-            context.sessions.check_edit(edit)
+            context.sessions.references.check(edit)
     if asked.clip is not None and not has_clip(context.directory, asked.clip):
         raise ProblemError(422, f"There is no clip {asked.clip}; a simulate job that is done names its clip.")
 

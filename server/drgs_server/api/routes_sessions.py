@@ -29,8 +29,8 @@ from drgs_server.api.routes_assets import save_version, write_export
 from drgs_server.api.while_connected import while_connected
 from drgs_server.live.admission import Caller
 from drgs_server.live.edit_log import ChangeRequest
+from drgs_server.live.live_session import LiveSession
 from drgs_server.live.messages import MAX_SIDE, MAX_STILL_PIXELS, MAX_STILL_SAMPLES, CameraMessage, Channel, EditLog, Settings, StartView
-from drgs_server.live.sessions import LiveSession
 from drgs_server.render.encode import encode_exr_still, encode_jpeg, encode_png
 from drgs_server.render.interface import LINEAR_CHANNELS, LinearPixels, Pixels
 from drgs_worker.store.user_names import UserName

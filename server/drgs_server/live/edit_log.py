@@ -66,6 +66,13 @@ class ChangeRequest:
     revision: int | None = None
     """Of the log that it is meant for; None for whichever there is."""
 
+    @property
+    def edits(self) -> Sequence[Edit]:
+        """Those that it brings."""
+        if isinstance(self.change, Splice):
+            return self.change.edits
+        return self.change if isinstance(self.change, Sequence) else [self.change] if self.change is not None else []
+
     def continues(self, before: "ChangeRequest") -> bool:
         """Whether it is the same step of undo as the request just before it."""
         return self.kind in ("edit", "splice") and self.gesture is not None and (self.kind, self.gesture) == (before.kind, before.gesture)

@@ -14,6 +14,7 @@ from drgs_server.api.context import ServerContext, caller_of
 from drgs_server.api.problems import MOST_PLACE, ProblemError
 from drgs_server.live import messages
 from drgs_server.live.edit_log import ChangeQueue, ChangeRequest, Splice
+from drgs_server.live.live_session import LiveSession, Overtaken
 from drgs_server.live.messages import (
     CLOSE_POLICY,
     CLOSE_TRY_AGAIN,
@@ -45,7 +46,7 @@ from drgs_server.live.messages import (
     unpack_frame,
 )
 from drgs_server.live.outbox import Outbox
-from drgs_server.live.sessions import AssetGone, LiveSession, Overtaken
+from drgs_server.live.session_store import AssetGone
 from drgs_server.live.viewer import Viewer
 
 HELLO_SECONDS = 20.0
