@@ -4,33 +4,21 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-import trimesh
 
 from drgs.convert.bake_edits import bake_edits
 from drgs.deform.pose_scene import pose_scene
 from drgs.scene.asset import Asset, load_asset, save_asset
 from drgs.scene.edits import parse_edits
-from drgs.scene.environment import Environment
 from drgs.scene.gaussians import surfel_tangents
-from drgs.scene.mesh import TriangleMesh, vertex_normals
 from tests.reconstruct.surfel_spheres import surfel_sphere
-
-
-def material(**values: object) -> dict:
-    return {"op": "material", "select": {"all": True}, "set": values, "mode": "absolute"}
+from tests.scene.grey_cube import grey_cube, material
 
 
 @pytest.fixture(scope="module")
 def cube() -> Asset:
-    box = trimesh.creation.box((1.0, 1.0, 1.0)).subdivide()
-    vertices = torch.tensor(np.array(box.vertices), dtype=torch.float32)
-    faces = torch.tensor(np.array(box.faces), dtype=torch.int32)
-    grey = torch.full((len(vertices),), 0.5)
-    mesh = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), grey[:, None].repeat(1, 3), grey, torch.zeros_like(grey))
-    return Asset(None, mesh, None, Environment(torch.ones(8, 16, 3)))
+    return grey_cube()
 
 
 def test_a_version_looks_at_rest_as_its_edits_made_the_asset(tmp_path: Path, cube: Asset) -> None:

@@ -6,15 +6,12 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-import torch
-import trimesh
 from PIL import Image
 
 from drgs.deform.clip import open_clip
 from drgs.exchange.exr import encode_environment
 from drgs.reconstruct.progress import Progress
 from drgs.scene.asset import Asset, save_asset
-from drgs.scene.environment import Environment
 from drgs_worker.jobs.progress import JobStopped
 from drgs_worker.jobs.start_view import turntable_view
 from drgs_worker.jobs.steps.build import RedecoupleRun
@@ -23,25 +20,15 @@ from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
 from drgs_worker.jobs.steps.render import RenderRun
 from drgs_worker.jobs.steps.simulate import SimulateRun
 from drgs_worker.store.data_directory import open_data_directory
+from tests.scene.grey_cube import grey_cube, material
 
 ASSET, JOB = "a" * 32, "b" * 32
 SMALL = {"kind": "render", "asset": ASSET, "width": 32, "height": 24, "spp": 4, "denoise": False}
 
 
-def material(**values: object) -> dict:
-    return {"op": "material", "select": {"all": True}, "set": values, "mode": "absolute"}
-
-
 @pytest.fixture(scope="module")
 def cube() -> Asset:
-    from drgs.scene.mesh import TriangleMesh, vertex_normals
-
-    box = trimesh.creation.box((1.0, 1.0, 1.0)).subdivide()
-    vertices = torch.tensor(np.array(box.vertices), dtype=torch.float32)
-    faces = torch.tensor(np.array(box.faces), dtype=torch.int32)
-    grey = torch.full((len(vertices),), 0.5)
-    mesh = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), grey[:, None].repeat(1, 3), grey, torch.zeros_like(grey))
-    return Asset(None, mesh, None, Environment(torch.ones(8, 16, 3)))
+    return grey_cube()
 
 
 @pytest.fixture

@@ -20,11 +20,12 @@ from drgs.render.integrate.environment_table import build_environment_table
 from drgs.render.integrate.integrate_samples import integrate_samples
 from drgs.render.integrate.sample_rays import sample_rays
 from drgs.render.intersect.trace_rays import build_tracer
-from drgs.render.records import Rays, SampleCounts, ShadingPoints
+from drgs.render.records import SampleCounts
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
+from tests.reconstruct.fit.convex_rays import assert_only_the_sky_is_seen, rays_of_convex
 from tests.reconstruct.surfel_spheres import surfel_sphere
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
 from tests.render.closed_form_scenes import front_camera, sphere_mesh
@@ -158,22 +159,9 @@ def test_shading_points_lie_on_their_pixels_ray_in_the_surface():
 
 def test_on_a_convex_surface_rays_above_it_see_the_sky_and_others_bring_nothing():
     mesh = sphere_mesh(subdivisions=3)
-    normal = mesh.normals[::7].contiguous()
-    count = len(normal)
-    half = torch.full((count,), 0.5)
-    points = ShadingPoints(
-        mesh.vertices[::7].contiguous(), normal, normal, half[:, None].expand(count, 3), half, half, torch.arange(count).int()
-    )
-    directions = torch.nn.functional.normalize(torch.randn(count, 12, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
-    weight = torch.ones(count, 12)
-    weight[:, 0] = 0.0
+    points, rays = rays_of_convex(mesh)
     light = build_incident_light("mesh", mesh, surfel_sphere(300))
-    transmittance, hit_radiance = trace_samples(points, Rays(points.position_world, directions, weight), light, build_tracer(mesh))
-    height = (directions * normal[:, None]).sum(-1)
-    assert float(transmittance[:, 0].max()) == 0.0
-    assert float(transmittance[:, 1:][height[:, 1:] > 0.15].min()) == 1.0
-    assert float(transmittance[:, 1:][height[:, 1:] < -0.15].max()) == 0.0
-    assert float(hit_radiance.abs().max()) == 0.0
+    assert_only_the_sky_is_seen(points, rays, *trace_samples(points, rays, light, build_tracer(mesh)))
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,9 @@ from drgs.reconstruct.fit.fit_mesh_materials import (
 from drgs.reconstruct.fit.fit_surface import SurfaceSettings, mesh_from_surface_fit, start_surface
 from drgs.reconstruct.fit.split_sum import filter_environment
 from drgs.render.intersect.trace_rays import build_tracer
-from drgs.render.records import Rays, SampleCounts, ShadingPoints
+from drgs.render.records import SampleCounts
 from drgs.scene.views import Views
+from tests.reconstruct.fit.convex_rays import assert_only_the_sky_is_seen, rays_of_convex
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
 from tests.reconstruct.surfel_spheres import surfel_sphere
 from tests.reconstruct.tiny_capture import SPHERE_RADIUS
@@ -28,23 +29,9 @@ from tests.render.closed_form_scenes import sphere_mesh
 
 def test_on_a_convex_surface_rays_above_it_see_the_sky_and_others_bring_nothing():
     mesh = sphere_mesh(subdivisions=3)
-    normal = mesh.normals[::7].contiguous()
-    count = len(normal)
-    half = torch.full((count,), 0.5)
-    points = ShadingPoints(
-        mesh.vertices[::7].contiguous(), normal, normal, half[:, None].expand(count, 3), half, half, torch.arange(count).int()
-    )
-    directions = torch.nn.functional.normalize(torch.randn(count, 12, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
-    weight = torch.ones(count, 12)
-    weight[:, 0] = 0.0
-    tracer = build_tracer(mesh)
-    light = IncidentLight(tracer, torch.ones_like(mesh.vertices), filter_environment(torch.ones(128, 256, 3)))
-    transmittance, hit_radiance = traced_light(light, points, normal, Rays(points.position_world, directions, weight))
-    height = (directions * normal[:, None]).sum(-1)
-    assert float(transmittance[:, 0].max()) == 0.0
-    assert float(transmittance[:, 1:][height[:, 1:] > 0.15].min()) == 1.0
-    assert float(transmittance[:, 1:][height[:, 1:] < -0.15].max()) == 0.0
-    assert float(hit_radiance.abs().max()) == 0.0
+    points, rays = rays_of_convex(mesh)
+    light = IncidentLight(build_tracer(mesh), torch.ones_like(mesh.vertices), filter_environment(torch.ones(128, 256, 3)))
+    assert_only_the_sky_is_seen(points, rays, *traced_light(light, points, points.normal_world, rays))
 
 
 def test_the_gradient_of_crossed_halves_does_not_lean_towards_low_variance():
