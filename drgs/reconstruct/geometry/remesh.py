@@ -48,9 +48,14 @@ def remesh(vertices: Tensor, faces: Tensor, settings: MeshSettings) -> Remeshed:
         vertices: (vertex, 3). faces: (face, 3). settings: its resolution counts cells along the longest side.
 
     Raises:
-        ValueError: the mesh encloses nothing at this resolution.
+        ValueError: a vertex is not finite, or the mesh encloses nothing at this resolution.
     """
     old = vertices.detach().cpu().double().numpy()
+    lost = np.flatnonzero(~np.isfinite(old).all(1))
+    if len(lost):
+        raise ValueError(
+            f"{len(lost)} of {len(old)} vertices of the mesh are not finite, the first is number {lost[0]}; expected finite coordinates"
+        )
     triangles = faces.cpu().numpy().astype(np.int64)
     low, high = old.min(0), old.max(0)
     cell = float((high - low).max()) / settings.resolution

@@ -45,3 +45,12 @@ def test_a_surface_that_encloses_nothing_is_refused():
     flat = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     with pytest.raises(ValueError, match="encloses nothing"):
         remesh(flat, torch.tensor([[0, 1, 2]], dtype=torch.int32), SETTINGS)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_vertices_that_are_not_finite_are_refused(value: float):
+    mesh = sphere_mesh(subdivisions=2)
+    torn = mesh.vertices.clone()
+    torn[[3, 7], 1] = value
+    with pytest.raises(ValueError, match=rf"^2 of {len(torn)} vertices .* not finite, the first is number 3; expected"):
+        remesh(torn, mesh.faces, SETTINGS)
