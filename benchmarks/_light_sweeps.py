@@ -26,7 +26,7 @@ from drgs.render.progressive.refine import refine_frame
 from drgs.render.progressive.start_frame import start_frame
 from drgs.render.records import DenoiseMethod, RayStarts, RenderSettings, SampleCounts, ShadedPoints, ShadingPoints
 from drgs.render.visible.rasterize import RasterSettings, rasterize
-from drgs.render.visible.rasterize.gbuffer import near_plane
+from drgs.render.visible.rasterize.near_plane import near_plane_of
 from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import surfel_tangents
@@ -339,7 +339,7 @@ def surfel_rows(count: int, size: int) -> list[Row]:
         )
     for case, (surfels, seen_by) in cases.items():
         shown = (crosses(surfels) > 0).nonzero().squeeze(-1)  # the kernel drops surfels without area, the twin knows no such rule
-        settings = RasterSettings(near=near_plane(surfels.centers))
+        settings = RasterSettings(near=near_plane_of(surfels.centers))
         found = rasterize(surfels.centers, surfels.tangents, surfels.opacities, surfels.materials.albedo, seen_by, settings)
         centers, tangents = surfels.centers[shown].double(), surfels.tangents[shown].double()
         opacities, albedo = surfels.opacities[shown].double(), surfels.materials.albedo[shown].double()

@@ -32,7 +32,7 @@ from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.metrics import picture_figures, score_renders, truth_folders
 from drgs.maths.color import srgb_from_linear
 from drgs.reconstruct.build_asset import PRESETS, BuildSettings, build_asset, build_stages
-from drgs.reconstruct.capture.initial_points import initial_points, near_plane
+from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import load_cameras, load_views
 from drgs.reconstruct.checkpoints import read_tensors
 from drgs.reconstruct.fit.environment_pyramid import environment_table
@@ -44,6 +44,7 @@ from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.stages import CHECKPOINTS, read_geometry
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
+from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.asset import Asset
 from drgs.scene.edits import DeformEdit, Edit, parse_edits
 from drgs.scene.gaussians import surfel_tangents

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from drgs.reconstruct.capture.find_masks import find_masks
-from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points, near_plane
+from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
@@ -29,6 +29,7 @@ from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen, mesh_from_gaussians
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.report_progress import BuildReporter, encode_preview
+from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.camera import Camera, scaled_camera
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh

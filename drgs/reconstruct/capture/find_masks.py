@@ -13,10 +13,11 @@ from dataclasses import replace
 
 import torch
 
-from drgs.reconstruct.capture.initial_points import InitialPoints, near_plane
+from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
 from drgs.reconstruct.fit.fit_loop import FitReport
 from drgs.render.visible.rasterize import RasterSettings, rasterize
+from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.camera import scaled_camera
 from drgs.scene.gaussians import Gaussians, surfel_tangents
 from drgs.scene.views import Views

@@ -23,9 +23,6 @@ FEWEST_SPARSE_POINTS = 100
 SMALLEST_MASK_AGREEMENT = 0.9
 """Share of the views that see a sparse point in which it must lie on the mask."""
 
-NEAR_SHARE = 0.01
-"""Of the object's radius: surfels nearer to a camera than this are not drawn."""
-
 
 @dataclass(frozen=True, eq=False)
 class InitialPoints:
@@ -43,11 +40,6 @@ class InitialPoints:
     """sparse, hull, sparse+hull or random."""
     hull_vertices: Float[Tensor, "vertex 3"] | None
     hull_faces: Int[Tensor, "face 3"] | None
-
-
-def near_plane(radius: float) -> float:
-    """Distance from the camera that drawing starts at [world units]; radius: of the object's bounding sphere."""
-    return NEAR_SHARE * radius
 
 
 def initial_points(views: Views, count: int, seed: int) -> InitialPoints:

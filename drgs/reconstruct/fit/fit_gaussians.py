@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.reconstruct.capture.initial_points import InitialPoints, near_plane
+from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.fit.densify import DensifySettings, ScreenGradientStats, densify, reset_opacity
 from drgs.reconstruct.fit.environment_pyramid import BACKGROUND_ROWS, ENVIRONMENT_PYRAMID, background_image, environment_table
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
@@ -41,6 +41,7 @@ from drgs.reconstruct.fit.surfel_parameters import (
     residual_sh,
 )
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
+from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.views import Views
 

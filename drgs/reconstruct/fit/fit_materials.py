@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.maths.frames import rotation_from_quat_wxyz
-from drgs.reconstruct.capture.initial_points import near_plane
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
 from drgs.reconstruct.fit.incident_light import AbstractIncidentLight, build_incident_light
@@ -39,6 +38,7 @@ from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Rays, SampleCounts, ShadingPoints
 from drgs.render.visible.lift_points import lift_points
+from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh

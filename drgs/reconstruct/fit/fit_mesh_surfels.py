@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drgs.reconstruct.capture.initial_points import near_plane
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_gaussians import FitSettings, displayed, squared_error, stage_one_terms
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
@@ -32,6 +31,7 @@ from drgs.reconstruct.fit.surfel_parameters import (
 from drgs.reconstruct.fit.view_targets import drawn_view, view_targets
 from drgs.reconstruct.geometry.bind_gaussians import foot_and_normal
 from drgs.reconstruct.geometry.mesh_surfels import FARTHEST, face_frames
+from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.binding import Binding
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh

@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from drgs.reconstruct.capture.initial_points import InitialPoints, near_plane
+from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, clean_mesh, extract_mesh
 from drgs.render.visible.rasterize import RasterSettings, rasterize
+from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera
 from drgs.scene.gaussians import Gaussians, surfel_tangents

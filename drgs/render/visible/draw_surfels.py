@@ -10,7 +10,7 @@ from torch import Tensor
 
 from drgs.maths.constants import MIN_COVERAGE
 from drgs.render.visible.rasterize import RasterSettings, rasterize
-from drgs.render.visible.rasterize.gbuffer import near_plane
+from drgs.render.visible.rasterize.near_plane import near_plane_of
 from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedSurfels
 
@@ -43,7 +43,7 @@ def draw_surfels(surfels: PosedSurfels, camera: Camera, band: slice | None = Non
         torch.full((count,), STEEPNESS, device=device),
         colors,
         camera,
-        RasterSettings(near=near_plane(surfels.centers), depth=False),
+        RasterSettings(near=near_plane_of(surfels.centers), depth=False),
         band=band,
     )
     mean = maps.features.permute(1, 2, 0) / maps.coverage.clamp(min=MIN_COVERAGE)[..., None]

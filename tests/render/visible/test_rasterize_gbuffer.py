@@ -12,9 +12,9 @@ from drgs.render.visible.rasterize.gbuffer import (
     differentiable_gbuffer,
     face_camera,
     facing_normals,
-    near_plane,
     rasterize_gbuffer,
 )
+from drgs.render.visible.rasterize.near_plane import near_plane_of
 from drgs.scene.camera import Camera, pixel_rays_world
 from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.materials import Materials
@@ -202,7 +202,7 @@ def test_kernels_write_the_maps_that_torch_writes(device: str):
     # the division where coverage, and by normalising where the blended normal, is small.
     for name, (surfels, camera) in seen_in_part_and_nowhere(device).items():
         kernels = rasterize_gbuffer(surfels, camera)
-        by_torch = differentiable_gbuffer(surfels, camera, RasterSettings(near=near_plane(surfels.centers)))
+        by_torch = differentiable_gbuffer(surfels, camera, RasterSettings(near=near_plane_of(surfels.centers)))
         covered = by_torch.coverage >= MIN_COVERAGE
         assert bool(covered.any()) == (name not in ("behind the camera", "no surfels")), name
         for field in vars(kernels):

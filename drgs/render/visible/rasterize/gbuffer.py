@@ -13,6 +13,7 @@ from torch import Tensor
 from drgs.maths.constants import MIN_COVERAGE
 from drgs.render.records import GBuffer
 from drgs.render.visible.image_tiles import TILE, window_of_tiles
+from drgs.render.visible.rasterize.near_plane import near_plane_of
 from drgs.render.visible.rasterize.rasterize import RasterSettings, rasterize
 from drgs.scene.camera import Camera, pixel_rays_world, world_from_pixel
 from drgs.scene.posed_scene import PosedSurfels
@@ -22,8 +23,6 @@ wp.set_module_options({"enable_backward": False})
 
 SEEN_FROM_BEHIND = 0.3
 """Cosine between a surfel's normal and the viewing ray above which the surfel is taken to show its back."""
-NEAR_SHARE = 0.01
-"""Distance of the near plane in half sides of the surfels' box; builds fit with about the same."""
 LEAST_FACING = 0.02
 """Blended normals face the camera at least by this cosine."""
 
@@ -144,14 +143,6 @@ def face_camera(normals: Tensor, wo: Tensor) -> Tensor:
     return torch.nn.functional.normalize(unit + lacking * wo, dim=-1)
 
 
-def near_plane(centers: Tensor) -> float:
-    """Distance before which nothing is drawn [world units]: a share of what the surfels span, so that pictures know no unit."""
-    if len(centers) == 0:
-        return 0.0
-    low, high = centers.detach().aminmax(dim=0)
-    return NEAR_SHARE * 0.5 * float((high - low).max())
-
-
 def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSettings | None = None, band: slice | None = None) -> GBuffer:
     """What the camera sees of the surfels.
 
@@ -161,7 +152,7 @@ def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSet
         settings: None: the near plane follows the surfels' span.
         band: rows of the image, from a tile's edge to a tile's edge, that the maps are to hold; None: all, and only then differentiable.
     """
-    settings = settings or RasterSettings(near=near_plane(surfels.centers))
+    settings = settings or RasterSettings(near=near_plane_of(surfels.centers))
     device, materials = surfels.centers.device, surfels.materials
     given = (surfels.centers, surfels.tangents, surfels.opacities, *vars(materials).values(), camera.camera_from_world, camera.intrinsics)
     if torch.is_grad_enabled() and any(values.requires_grad for values in given):

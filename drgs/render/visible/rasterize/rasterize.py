@@ -44,7 +44,7 @@ class RasterSettings:
     """How surfels become maps."""
 
     near: float = 0.01
-    """[world units]; nothing nearer is drawn. build_asset scales it with the scene."""
+    """[world units]; nothing nearer is drawn. near_plane.py scales it with the scene."""
     filter_sigma: float = PUBLISHED_FILTER_SIGMA
     """[pixels] of the Gaussian low-pass that no surfel is drawn narrower than."""
     depth: bool = True
