@@ -30,7 +30,8 @@ import psutil
 from websockets.asyncio.client import ClientConnection, connect
 
 from drgs_server.client import Client
-from drgs_server.live.messages import ServerHello, server_message, unpack_frame
+from drgs_server.live.frame_header import unpack_frame
+from drgs_server.live.messages import ServerHello, server_message
 
 SERVE = "import sys; from pathlib import Path; from drgs_server.run import serve; serve(Path(sys.argv[1]), port=0, with_worker=False, ready=lambda a: print(a, flush=True))"
 CAMERAS_A_SECOND = 10

@@ -11,7 +11,6 @@ Speaks only HTTP and WebSocket; imports neither torch nor the renderer. Final st
 the server does not know is an error, never done.
 """
 
-import json
 import tempfile
 import time
 import zipfile
@@ -42,7 +41,8 @@ from drgs_server.api.rest_records import (
     SnapshotInfo,
     SnapshotList,
 )
-from drgs_server.live.messages import EditLog, FrameHeader, ServerHello, Settings, server_message, unpack_frame
+from drgs_server.client_stream import ServerError, Stream
+from drgs_server.live.messages import EditLog, Settings
 from drgs_worker.jobs.requests import BindingName, ExportRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -50,14 +50,6 @@ Preset = Literal["draft", "fast", "full"]
 
 FINAL_STATES = ("done", "failed", "cancelled")
 _edit = TypeAdapter(Edit)
-
-
-class ServerError(Exception):
-    """The server said no; the text is its sentence."""
-
-    def __init__(self, status: int, detail: str) -> None:
-        super().__init__(detail)
-        self.status = status
 
 
 class Client:
@@ -359,70 +351,13 @@ class RemoteSession:
         self._client._request("DELETE", f"/api/sessions/{self.id}")
 
     @contextmanager
-    def stream(self, settings: Settings | None = None) -> Iterator["Stream"]:
+    def stream(self, settings: Settings | None = None) -> Iterator[Stream]:
         """A live connection; frames come as the server has them."""
         with self._client._connect(self.id) as socket:
             stream = Stream(socket)
             if settings is not None:
                 stream.send(type="settings", settings=settings.model_dump())
             yield stream
-
-
-class Stream:
-    """Final. A viewer without a screen: say where to look, take frames as they come."""
-
-    def __init__(self, socket: ClientConnection) -> None:
-        self._socket = socket
-        self._camera_number = 0
-        self.messages: list[BaseModel] = []
-        """Everything but frames that the server said, in order."""
-        self.send(type="hello", v=1, client="drgs.client")
-        while not self.messages or not isinstance(self.messages[-1], ServerHello):
-            self.receive(timeout_seconds=120)
-        self.hello: ServerHello = self.messages[-1]
-
-    def send(self, **message: Any) -> None:
-        self._socket.send(json.dumps(message))
-
-    def look(self, width: int, height: int, world_from_camera: Any = None, fov_y_degrees: float | None = None) -> None:
-        """Move the camera; the start view where nothing else is said."""
-        start = self.hello.start_view
-        self._camera_number += 1
-        self.send(
-            type="camera",
-            number=self._camera_number,
-            world_from_camera=world_from_camera or start.world_from_camera,
-            fov_y_degrees=fov_y_degrees or start.fov_y_degrees,
-            width=width,
-            height=height,
-        )
-
-    def receive(self, timeout_seconds: float | None = None) -> tuple[FrameHeader, bytes] | None:
-        """The next frame, acknowledged; or None after a text message, which is kept in `messages`.
-
-        Raises:
-            TimeoutError: nothing came.
-            ServerError: something the client did, or that the server could not do.
-        """
-        received = self._socket.recv(timeout=timeout_seconds)
-        if isinstance(received, str):
-            message = server_message.validate_json(received)
-            if message.type == "error":
-                raise ServerError(400, message.message)
-            self.messages.append(message)
-            return None
-        header, picture = unpack_frame(received)
-        self.send(type="ack", frame_id=header.frame_id)
-        return header, picture
-
-    def frames(self, timeout_seconds: float | None = 60) -> Iterator[tuple[FrameHeader, bytes]]:
-        """Frames until the converged one, and with it."""
-        while True:
-            frame = self.receive(timeout_seconds)
-            if frame is not None:
-                yield frame
-                if frame[0].flags & 2:
-                    return
 
 
 def _error(response: httpx.Response) -> ServerError:

@@ -1,7 +1,7 @@
 """Write web/src/session/protocol.gen.ts from the pydantic models of the stream and of REST, and constants.gen.ts beside it from drgs.
 
-Run `python -m drgs_server.generate_types` after changing messages.py, rest_records.py, drgs/maths/constants.py or
-drgs/exchange/export_formats.py; a test fails until it was run.
+Run `python -m drgs_server.generate_types` after changing messages.py, frame_header.py, rest_records.py, drgs/maths/constants.py
+or drgs/exchange/export_formats.py; a test fails until it was run.
 Input: JSON Schema as pydantic states it. Client messages and requests are written as their validator reads them (fields
 with defaults are optional), answers as they are serialised (every field is there).
 """
@@ -18,7 +18,7 @@ from drgs.exchange.export_formats import FILE_KINDS
 from drgs.maths import constants
 from drgs.scene.edits import Edit
 from drgs_server.api import rest_records
-from drgs_server.live import messages
+from drgs_server.live import frame_header, messages
 
 Mode = Literal["validation", "serialization"]
 
@@ -46,6 +46,9 @@ _CONSTANTS = (
     "MAX_PIXELS",
     "MAX_STILL_PIXELS",
     "MAX_STILL_SAMPLES",
+    "LEAST_SHOWN_ERROR",
+)
+_FRAME_CONSTANTS = (
     "FRAME_KIND_PICTURE",
     "CODEC_JPEG",
     "CODEC_PNG",
@@ -53,7 +56,6 @@ _CONSTANTS = (
     "FLAG_CONVERGED",
     "FLAG_ALPHA",
     "CAMERA_NUMBER_SHIFT",
-    "LEAST_SHOWN_ERROR",
 )
 
 _REQUESTS: tuple[type[BaseModel], ...] = (
@@ -184,9 +186,10 @@ def typescript_text() -> str:
     wanted = {key: node["$ref"].rsplit("/", 1)[1] for key, node in names.items()}
     definitions = document["$defs"]
 
-    text = "// Written by `python -m drgs_server.generate_types` from server/drgs_server/live/messages.py and server/drgs_server/api/rest_records.py. Do not edit.\n\n"
-    for constant in _CONSTANTS:
-        text += f"export const {constant} = {getattr(messages, constant)};\n"
+    text = "// Written by `python -m drgs_server.generate_types` from messages.py and frame_header.py of server/drgs_server/live and server/drgs_server/api/rest_records.py. Do not edit.\n\n"
+    for module, names_there in ((messages, _CONSTANTS), (frame_header, _FRAME_CONSTANTS)):
+        for constant in names_there:
+            text += f"export const {constant} = {getattr(module, constant)};\n"
     text += "\n" + _HEADER_TYPE + "\n"
     for name in sorted(definitions):
         node = definitions[name]

@@ -5,7 +5,7 @@ import struct
 import pytest
 
 from drgs_server.generate_types import CONSTANTS_OUTPUT, OUTPUT, constants_text, typescript_from_schema, typescript_text
-from drgs_server.live.messages import FRAME_HEADER, FrameHeader, pack_frame, unpack_frame
+from drgs_server.live.frame_header import FRAME_HEADER, FrameHeader, pack_frame, unpack_frame
 
 
 def test_the_generated_types_are_up_to_date() -> None:

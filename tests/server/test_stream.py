@@ -21,7 +21,8 @@ from sqlalchemy.orm import Session as Database
 from starlette.websockets import WebSocketDisconnect
 
 from drgs_server.live import messages, stream
-from drgs_server.live.messages import CLOSE_TRY_AGAIN, FLAG_ALPHA, FLAG_CONVERGED, FLAG_MOVING, FrameHeader, unpack_frame
+from drgs_server.live.frame_header import FLAG_ALPHA, FLAG_CONVERGED, FLAG_MOVING, FrameHeader, unpack_frame
+from drgs_server.live.messages import CLOSE_TRY_AGAIN
 from drgs_server.render import thread
 from drgs_server.render.thread import MODESTY, give_way
 from drgs_worker.store.database import AssetRow, now

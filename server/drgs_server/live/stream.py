@@ -14,6 +14,7 @@ from drgs_server.api.context import ServerContext, caller_of
 from drgs_server.api.problems import MOST_PLACE, ProblemError
 from drgs_server.live import messages
 from drgs_server.live.edit_log import ChangeQueue, ChangeRequest, Splice
+from drgs_server.live.frame_header import unpack_frame
 from drgs_server.live.live_session import LiveSession, Overtaken
 from drgs_server.live.messages import (
     CLOSE_POLICY,
@@ -43,7 +44,6 @@ from drgs_server.live.messages import (
     UndoMessage,
     VisibilityMessage,
     client_message,
-    unpack_frame,
 )
 from drgs_server.live.outbox import Outbox
 from drgs_server.live.session_store import AssetGone

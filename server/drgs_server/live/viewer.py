@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drgs_server.live.messages import (
+from drgs_server.live.frame_header import (
     CAMERA_NUMBER_SHIFT,
     CODEC_JPEG,
     CODEC_PNG,
@@ -17,15 +17,10 @@ from drgs_server.live.messages import (
     FLAG_CONVERGED,
     FLAG_MOVING,
     FRAME_KIND_PICTURE,
-    MAX_FRAMES_IN_FLIGHT,
-    CameraMessage,
-    ErrorMessage,
     FrameHeader,
-    Phase,
-    Settings,
-    StatusMessage,
     pack_frame,
 )
+from drgs_server.live.messages import MAX_FRAMES_IN_FLIGHT, CameraMessage, ErrorMessage, Phase, Settings, StatusMessage
 from drgs_server.live.pace import Pace
 from drgs_server.render.encode import encode_jpeg, encode_png, has_alpha
 from drgs_server.render.interface import AbstractPicture, AbstractPose

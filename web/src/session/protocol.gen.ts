@@ -1,4 +1,4 @@
-// Written by `python -m drgs_server.generate_types` from server/drgs_server/live/messages.py and server/drgs_server/api/rest_records.py. Do not edit.
+// Written by `python -m drgs_server.generate_types` from messages.py and frame_header.py of server/drgs_server/live and server/drgs_server/api/rest_records.py. Do not edit.
 
 export const PROTOCOL_VERSION = 1;
 export const MAX_FRAMES_IN_FLIGHT = 2;
@@ -7,6 +7,7 @@ export const MAX_SIDE = 4096;
 export const MAX_PIXELS = 4194304;
 export const MAX_STILL_PIXELS = 8847360;
 export const MAX_STILL_SAMPLES = 1073741824;
+export const LEAST_SHOWN_ERROR = 0.001;
 export const FRAME_KIND_PICTURE = 1;
 export const CODEC_JPEG = 0;
 export const CODEC_PNG = 1;
@@ -14,7 +15,6 @@ export const FLAG_MOVING = 1;
 export const FLAG_CONVERGED = 2;
 export const FLAG_ALPHA = 4;
 export const CAMERA_NUMBER_SHIFT = 8;
-export const LEAST_SHOWN_ERROR = 0.001;
 
 /** The 24 little-endian bytes before each picture; see docs/protocol.md. */
 export interface FrameHeader {
