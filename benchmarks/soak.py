@@ -1,6 +1,6 @@
 """Change one session ten thousand times, kill the server, and compare: the log and the picture must come back bit for bit.
 
-    python -m benchmarks soak [--changes 10000] [--json]
+    python -m benchmarks soak [--changes 10000] [--edits-only] [--json]
 
 Starts `drgs serve` in a process of its own on a new data folder, with the real renderer and a ball of 1 280 faces. A program sends edits,
 undos and redos over a stream (six, three and one in ten), a few at a time on their way. Then the server is killed (-9) and another one
@@ -39,13 +39,18 @@ def main(arguments: list[str]) -> None:
     )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--changes", type=int, default=10_000)
+    parser.add_argument("--edits-only", action="store_true", help="no undo, no redo: all changes are in force at the end")
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        print(json.dumps(measure(given.changes, Path(folder)), indent=None if given.json else 1))
+        print(json.dumps(measure(given.changes, Path(folder), mixed=not given.edits_only), indent=None if given.json else 1))
 
 
-def measure(changes: int, folder: Path) -> dict:
-    """Serve, change, kill, serve again, compare."""
+def measure(changes: int, folder: Path, mixed: bool = True) -> dict:
+    """Serve, change, kill, serve again, compare.
+
+    Args:
+        mixed: with undo and redo; else edits only, all of which are in force at the end.
+    """
     import trimesh
 
     trimesh.creation.icosphere(subdivisions=3).export(folder / "ball.ply")
@@ -56,7 +61,8 @@ def measure(changes: int, folder: Path) -> dict:
         _digest(session)  # kernels are compiled once a machine; that is not what is measured
         process = psutil.Process(server.pid)
         rss_before, cpu_before, start = process.memory_info().rss, sum(process.cpu_times()[:2]), time.monotonic()
-        seconds, received = asyncio.run(_send(client, session.id, _messages(changes)))
+        tenth = max(1, changes // 10)
+        seconds, spent, received = asyncio.run(_send(client, session.id, _messages(changes, mixed), process))
         took, cpu = time.monotonic() - start, sum(process.cpu_times()[:2]) - cpu_before
         rss_after = process.memory_info().rss
         info, picture = session.info(), _digest(session)
@@ -76,7 +82,6 @@ def measure(changes: int, folder: Path) -> dict:
         client.close()
         server.kill()
         server.wait()
-    tenth = max(1, len(seconds) // 10)
     return {
         "changes": changes,
         "acknowledged": info.revision,
@@ -89,6 +94,8 @@ def measure(changes: int, folder: Path) -> dict:
         "server_cpu_seconds": round(cpu, 1),
         "ms_a_change_first_tenth": round(1e3 * statistics.mean(seconds[:tenth]), 2),
         "ms_a_change_last_tenth": round(1e3 * statistics.mean(seconds[-tenth:]), 2),
+        "server_ms_a_change_first_tenth": round(1e3 * (spent[tenth] - spent[0]) / tenth, 2),
+        "server_ms_a_change_last_tenth": round(1e3 * (spent[-1] - spent[-1 - tenth]) / tenth, 2),
         "bytes_to_the_viewer": received,
         "replay_seconds": round(replay_seconds, 2),
         "memory_mib_before": round(rss_before / 2**20),
@@ -106,13 +113,13 @@ def _digest(session: RemoteSession) -> str:
     return hashlib.sha256(session.frame(**PICTURE)).hexdigest()
 
 
-def _messages(changes: int) -> list[dict]:
+def _messages(changes: int, mixed: bool) -> list[dict]:
     """Fixed by the seed. Undo and redo only where there is something to undo or redo."""
     chooser = random.Random(SEED)
     done = undone = 0
     made: list[dict] = []
     for _ in range(changes):
-        kind = chooser.choices(list(SHARES), list(SHARES.values()))[0]
+        kind = chooser.choices(list(SHARES), list(SHARES.values()))[0] if mixed else "edit"
         if (kind == "undo" and not done) or (kind == "redo" and not undone):
             kind = "edit"
         done += -1 if kind == "undo" else 1
@@ -136,14 +143,16 @@ def _edit(chooser: random.Random) -> dict:
     }
 
 
-async def _send(client: Client, session: str, messages: list[dict]) -> tuple[list[float], int]:
-    """Seconds between each change's acknowledgement and the one before; and the bytes that came meanwhile.
+async def _send(client: Client, session: str, messages: list[dict], server: psutil.Process) -> tuple[list[float], list[float], int]:
+    """Seconds between each change's acknowledgement and the one before; the server's processor seconds before the first and after each; and the
+    bytes that came meanwhile.
 
     Raises:
         ValueError: one was not accepted.
     """
     address = client.address.replace("http", "ws", 1) + f"/api/sessions/{session}/stream"
     seconds: list[float] = []
+    spent = [sum(server.cpu_times()[:2])]
     received = 0
     async with connect(address, additional_headers=client._headers, compression=None, max_size=1 << 26) as socket:
         await socket.send(json.dumps({"type": "hello", "v": 1, "changes": True, "client": "soak"}))
@@ -158,8 +167,9 @@ async def _send(client: Client, session: str, messages: list[dict]) -> tuple[lis
                 raise ValueError(f"a change was refused: {said[:300]}")
             if isinstance(said, str) and said.startswith('{"type":"accepted"'):
                 seconds.append(time.monotonic() - at)
+                spent.append(sum(server.cpu_times()[:2]))
                 at = time.monotonic()
-    return seconds, received
+    return seconds, spent, received
 
 
 def _replayed(folder: Path, session: str) -> tuple[int, tuple]:

@@ -4,7 +4,6 @@ The file is a cache: one that is missing, damaged or of other edits is as good a
 digests of the edits that made them.
 """
 
-import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,9 +13,13 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from drgs.deform.pose_scene import PoseParts, known_parts, pose_words, remember_parts
+from drgs.deform.pose_scene import PoseParts, known_parts, remember_parts
+from drgs.deform.sort_edits import EditFiles, SortedEdits, sort_edits
 from drgs.scene.asset import Asset
 from drgs.scene.edits import Edit
+
+KINDS = ("material", "shape")
+"""Of edits that change tensors."""
 
 
 def save_pose(asset: Asset, edits: Sequence[Edit], path: Path, base_directory: Path | None = None) -> bool:
@@ -29,11 +32,11 @@ def save_pose(asset: Asset, edits: Sequence[Edit], path: Path, base_directory: P
         OSError: it cannot be written; an older file stays.
         ValueError: a file that an edit names is missing.
     """
-    words = pose_words(edits, base_directory)
-    parts = known_parts(asset, words)
+    by_kind = sort_edits(asset, edits, EditFiles(base_directory, confine=False))
+    parts = known_parts(asset, by_kind)
     if parts is None:
         return False
-    said = {kind: f"{len(of_kind)} {_digest(of_kind)}" for kind, of_kind in words.items()}
+    said = _said(by_kind, {"material": by_kind.material.count, "shape": by_kind.shape.count})
     arrays = {name: values.detach().cpu().contiguous() for name, values in parts.items()}
     draft = path.with_suffix(".new")
     draft.write_bytes(safetensors.torch.save(arrays, said))
@@ -45,11 +48,11 @@ def recall_pose(asset: Asset, edits: Sequence[Edit], path: Path, base_directory:
     """Let pose_scene go on from a file of save_pose; returns how many of the edits need not be applied any more."""
     device = asset.mesh.vertices.device
     try:
-        words = pose_words(edits, base_directory)
+        by_kind = sort_edits(asset, edits, EditFiles(base_directory, confine=False))
         with safetensors.safe_open(path, framework="pt") as file:
             said = file.metadata() or {}
-            counts = {kind: int(said[kind].split()[0]) for kind in words}
-            if any(said[kind] != f"{count} {_digest(words[kind][:count])}" for kind, count in counts.items()):
+            counts = {kind: int(said[kind].split()[0]) for kind in KINDS}
+            if any(not 0 <= count <= getattr(by_kind, kind).count for kind, count in counts.items()) or said != _said(by_kind, counts):
                 return 0
             names = file.keys()  # no mapping: it cannot be gone through itself
             parts: PoseParts = {name: file.get_tensor(name).to(device) for name in names}
@@ -57,7 +60,7 @@ def recall_pose(asset: Asset, edits: Sequence[Edit], path: Path, base_directory:
         return 0
     if not _fits(asset, parts):
         return 0
-    remember_parts(asset, {kind: words[kind][:count] for kind, count in counts.items()}, parts)
+    remember_parts(asset, counts, by_kind, parts)
     return sum(counts.values())
 
 
@@ -77,5 +80,6 @@ def _fits(asset: Asset, parts: dict[str, Tensor]) -> bool:
     )
 
 
-def _digest(words: tuple) -> str:
-    return hashlib.blake2b(repr(words).encode(), digest_size=16).hexdigest()
+def _said(by_kind: SortedEdits, counts: dict[str, int]) -> dict[str, str]:
+    """What the file says of the edits that made it: how many of each kind, and their digest."""
+    return {kind: f"{counts[kind]} {getattr(by_kind, kind).digest(counts[kind]).hex()}" for kind in KINDS}

@@ -5,7 +5,6 @@ edits, in their order, and remembered for the asset. A scene posed again with on
 same tensors for the rest, and a renderer sees by identity what it must rebuild.
 """
 
-import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
-from weakref import ReferenceType, WeakKeyDictionary, ref
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
@@ -26,10 +25,11 @@ from drgs.deform.hold_handles import HeldObject
 from drgs.deform.maps import check_map, evaluate_map
 from drgs.deform.rig_clip import bind_rig
 from drgs.deform.simulate import Simulation
-from drgs.deform.simulation_scene import mesh_files, parse_simulation_scene
+from drgs.deform.simulation_scene import parse_simulation_scene
+from drgs.deform.sort_edits import EditFiles, EditSteps, ShapeEdit, SortedEdits, file_names, sort_edits
 from drgs.deform.vertex_sequence import vertices_at
 from drgs.scene.asset import Asset
-from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, SimulateEdit, split_rig_clip
+from drgs.scene.edits import DeformEdit, Edit, MaterialEdit, PoseEdit, SimulateEdit, split_rig_clip
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.load_environment import load_environment
@@ -43,9 +43,6 @@ CHECKPOINT = 64
 """Edits after which what they have made so far is kept by itself, so that undoing many of a long list begins with the last of these."""
 CHECKPOINTS = " checkpoints"
 """Behind a kind: those of it."""
-
-ShapeEdit = DeformEdit | PoseEdit | SimulateEdit
-"""Edits that move things."""
 
 Result = TypeVar("Result")
 _lock = threading.Lock()
@@ -71,50 +68,40 @@ def pose_scene(
     Raises:
         ValueError: one sentence: an edit that does not fit this asset, or a missing or damaged file.
     """
-    files = _Files(base_directory, confine)
-    material = [edit for edit in edits if isinstance(edit, MaterialEdit)]
-    deform = [edit for edit in edits if isinstance(edit, ShapeEdit)]
+    files = EditFiles(base_directory, confine)
+    by_kind = sort_edits(asset, edits, files)
 
-    vertex_materials, surfel_materials = _materials_after(asset, material, files, go_on)
-    shape = _shape_after(asset, deform, files, go_on)
+    vertex_materials, surfel_materials = _materials_after(asset, by_kind.material, files, go_on)
+    shape = _shape_after(asset, by_kind.shape, files, go_on)
 
     mesh, surfels = asset.mesh, None
-    if material:
+    if by_kind.material.count:
         mesh = replace(mesh, albedo=vertex_materials.albedo, roughness=vertex_materials.roughness, metallic=vertex_materials.metallic)
-    if deform:
+    if by_kind.shape.count:
         mesh = replace(mesh, vertices=shape.vertices, normals=shape.normals)
     if surfel_materials is not None and shape.centers is not None and shape.tangents is not None:
         surfels = PosedSurfels(shape.centers, shape.tangents, _rest(asset).opacities, surfel_materials)
-    environment, rotation, intensity = asset.environment, 0.0, 1.0
-    for edit in edits:
-        if isinstance(edit, EnvironmentEdit):
-            rotation, intensity = edit.rotation, edit.intensity
-            if edit.file is not None:
-                environment = _environment(asset, edit.file, files, environments)
-    return PosedScene(surfels, mesh, environment, rotation, intensity, None if deform else asset.horizons)
+    environment, light = asset.environment, by_kind.light
+    for name in light.files:
+        environment = _environment(asset, name, files, environments)
+    horizons = None if by_kind.shape.count else asset.horizons
+    return PosedScene(surfels, mesh, environment, light.rotation_degrees, light.intensity, horizons)
 
 
 PoseParts = dict[str, Tensor]
 """Results behind a posed scene by name: mesh.albedo, mesh.vertices, surfel.tangents, ..."""
 
 
-def pose_words(edits: Sequence[Edit], base_directory: Path | None = None) -> dict[str, tuple]:
-    """What stands for the edits of material and of shape: equal for equal edits of equal files.
-
-    Raises:
-        ValueError: a file that an edit names is missing.
-    """
-    files = _Files(base_directory, confine=False)
-    material = [edit for edit in edits if isinstance(edit, MaterialEdit)]
-    shape = [edit for edit in edits if isinstance(edit, ShapeEdit)]
-    return {"material": _material_words(material, files), "shape": _shape_words(shape, files)}
-
-
-def known_parts(asset: Asset, words: dict[str, tuple]) -> PoseParts | None:
+def known_parts(asset: Asset, by_kind: SortedEdits) -> PoseParts | None:
     """What these edits have made of the asset, where it is still remembered."""
+    materials: tuple[Materials, Materials | None] | None = _materials_at_rest(asset)
+    shape: _Shape | None = _shape_at_rest(asset)
     with _lock:
         kept = _memory.get(asset, OrderedDict())
-        materials, shape = (kept.get((kind, *words[kind])) for kind in ("material", "shape"))
+        if by_kind.material.count:
+            materials = kept.get(_key("material", by_kind.material))
+        if by_kind.shape.count:
+            shape = kept.get(_key("shape", by_kind.shape))
     if materials is None or shape is None:
         return None
     of_mesh, of_surfels = materials
@@ -128,8 +115,12 @@ def known_parts(asset: Asset, words: dict[str, tuple]) -> PoseParts | None:
     return parts
 
 
-def remember_parts(asset: Asset, words: dict[str, tuple], parts: PoseParts) -> None:
-    """Go on from there when these edits, or more, are posed next."""
+def remember_parts(asset: Asset, counts: dict[str, int], by_kind: SortedEdits, parts: PoseParts) -> None:
+    """Go on from there when these edits, or more, are posed next.
+
+    Args:
+        counts: how many of the edits of material and of shape made the parts.
+    """
 
     def materials(of: str) -> Materials:
         return Materials(parts[f"{of}.albedo"], parts[f"{of}.roughness"], parts[f"{of}.metallic"])
@@ -137,10 +128,10 @@ def remember_parts(asset: Asset, words: dict[str, tuple], parts: PoseParts) -> N
     shape = _Shape(parts["mesh.vertices"], parts["mesh.normals"], parts.get("surfel.centers"), parts.get("surfel.tangents"))
     both = materials("mesh"), materials("surfel") if "surfel.albedo" in parts else None
     # Of no edits it is the asset's own tensors, by which a renderer sees that nothing has changed.
-    if words["material"]:
-        _remembered(asset, ("material", *words["material"]), lambda: both)
-    if words["shape"]:
-        _remembered(asset, ("shape", *words["shape"]), lambda: shape)
+    if counts["material"]:
+        _remembered(asset, _key("material", by_kind.material, counts["material"]), lambda: both)
+    if counts["shape"]:
+        _remembered(asset, _key("shape", by_kind.shape, counts["shape"]), lambda: shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,54 +152,40 @@ class _Rest:
     opacities: Float[Tensor, "surfel"]
 
 
-@dataclass(frozen=True)
-class _Files:
-    """Turns the names in edits into paths."""
-
-    base_directory: Path | None
-    confine: bool
-
-    def path(self, name: str, or_folder: bool = False) -> Path:
-        base = Path.cwd() if self.base_directory is None else Path(self.base_directory)
-        path = (base / name).resolve()
-        if self.confine and not path.is_relative_to(base.resolve()):
-            raise ValueError(f"the file {name!r} lies outside the folder that edits may read")
-        if not path.is_file() and not (or_folder and path.is_dir()):
-            raise ValueError(f"{path}: does not exist")
-        return path
-
-    def stamp(self, name: str | None) -> tuple | None:
-        """Changes when the file does."""
-        if name is None:
-            return None
-        path = self.path(name, or_folder=True)
-        states = [(file.name, file.stat()) for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
-        return str(path), tuple((file, state.st_mtime_ns, state.st_size) for file, state in states)
-
-
 def _rest(asset: Asset) -> _Rest:
     gaussians = asset.gaussians
     assert gaussians is not None
     return _remembered(asset, ("rest",), lambda: _Rest(surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)))
 
 
+def _materials_at_rest(asset: Asset) -> tuple[Materials, Materials | None]:
+    """Of the mesh's vertices and of the surfels."""
+    mesh, gaussians = asset.mesh, asset.gaussians
+    of_mesh = Materials(mesh.albedo, mesh.roughness, mesh.metallic)
+    return of_mesh, None if gaussians is None else Materials(gaussians.albedo, gaussians.roughness, gaussians.metallic)
+
+
+def _shape_at_rest(asset: Asset) -> _Shape:
+    mesh, gaussians = asset.mesh, asset.gaussians
+    centers, tangents = (None, None) if gaussians is None else (gaussians.centers, _rest(asset).tangents)
+    return _Shape(mesh.vertices, mesh.normals, centers, tangents)
+
+
 def _materials_after(
-    asset: Asset, edits: list[MaterialEdit], files: _Files, go_on: Callable[[], None] | None
+    asset: Asset, edits: EditSteps[MaterialEdit], files: EditFiles, go_on: Callable[[], None] | None
 ) -> tuple[Materials, Materials | None]:
     """Materials of the mesh's vertices and of the surfels."""
     mesh, gaussians = asset.mesh, asset.gaussians
-    of_mesh = Materials(mesh.albedo, mesh.roughness, mesh.metallic)
-    of_gaussians = None if gaussians is None else Materials(gaussians.albedo, gaussians.roughness, gaussians.metallic)
 
     def apply(before: tuple[Materials, Materials | None], index: int) -> tuple[Materials, Materials | None]:
-        edit, (of_vertices, of_surfels) = edits[index], before
+        edit, (of_vertices, of_surfels) = edits.edit(index), before
         file = edit.select.weights_file
         weights = select_vertices(mesh, edit.select) if file is None else read_weights(files.path(file), mesh)
         if gaussians is not None and of_surfels is not None:
             of_surfels = _edited(of_surfels, edit, select_surfels(gaussians.centers, mesh, asset.binding, edit.select, weights))
         return _edited(of_vertices, edit, weights), of_surfels
 
-    return _applied_in_turn(asset, "material", _material_words(edits, files), (of_mesh, of_gaussians), apply, go_on)
+    return _applied_in_turn(asset, "material", edits, _materials_at_rest(asset), apply, go_on)
 
 
 def _edited(materials: Materials, edit: MaterialEdit, weights: Float[Tensor, "n"]) -> Materials:
@@ -230,27 +207,23 @@ def _edited(materials: Materials, edit: MaterialEdit, weights: Float[Tensor, "n"
     )
 
 
-def _shape_after(asset: Asset, edits: list[ShapeEdit], files: _Files, go_on: Callable[[], None] | None) -> _Shape:
-    mesh, gaussians = asset.mesh, asset.gaussians
-    centers, tangents = (None, None) if gaussians is None else (gaussians.centers, _rest(asset).tangents)
-    words = _shape_words(edits, files)
-
+def _shape_after(asset: Asset, edits: EditSteps[ShapeEdit], files: EditFiles, go_on: Callable[[], None] | None) -> _Shape:
     def apply(before: _Shape, index: int) -> _Shape:
-        edit = edits[index]
-        after = _deformed(asset, before, edit, words[:index], files, go_on)
+        edit = edits.edit(index)
+        after = _deformed(asset, before, edit, edits.digest(index), files, go_on)
         if not all(torch.isfinite(values).all() for values in vars(after).values() if values is not None):
-            raise ValueError(f"the {edit.op} edit {_text(edit)[:120]} moves parts of this object to infinity")
+            raise ValueError(f"the {edit.op} edit {edit.model_dump_json()[:120]} moves parts of this object to infinity")
         return after
 
-    return _applied_in_turn(asset, "shape", words, _Shape(mesh.vertices, mesh.normals, centers, tangents), apply, go_on)
+    return _applied_in_turn(asset, "shape", edits, _shape_at_rest(asset), apply, go_on)
 
 
 def _deformed(
-    asset: Asset, before: _Shape, edit: ShapeEdit, words_before: tuple, files: _Files, go_on: Callable[[], None] | None
+    asset: Asset, before: _Shape, edit: ShapeEdit, digest_before: bytes, files: EditFiles, go_on: Callable[[], None] | None
 ) -> _Shape:
     """
     Args:
-        words_before: of the edits that made `before`.
+        digest_before: of the edits that made `before`.
     """
     mesh, gaussians = asset.mesh, asset.gaussians
     vertices, normals, centers, tangents = before.vertices, before.normals, before.centers, before.tangents
@@ -280,7 +253,7 @@ def _deformed(
     elif edit.handles is not None and edit.handles.drag:
         handles, points = edit.handles, vertices if centers is None else torch.cat([vertices, centers])
         # What is held is prepared once for all targets that a drag passes through.
-        grips = ("handles", *words_before, _text_of_grips(edit))
+        grips = ("handles", digest_before, _text_of_grips(edit))
         hold = partial(HeldObject, mesh.vertices, vertices, mesh.faces, handles, points)
         held: HeldObject = _remembered(asset, grips, hold)
         positions, gradient = held.pull(handles)
@@ -291,7 +264,7 @@ def _deformed(
     return _Shape(vertices, normals, centers, tangents)
 
 
-def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files, go_on: Callable[[], None] | None) -> ClipFrame:
+def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: EditFiles, go_on: Callable[[], None] | None) -> ClipFrame:
     """What a clip, a rig or a simulation shows at the edit's time; at rest, the asset's own tensors."""
     centers, tangents = (None, None) if asset.gaussians is None else (asset.gaussians.centers, _rest(asset).tangents)
     rest = ClipFrame(asset.mesh.vertices, asset.mesh.normals, centers, tangents)
@@ -299,7 +272,7 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files, go_on: C
         scene = parse_simulation_scene(edit.scene)
         if edit.time == 0:
             return rest
-        scene_key = ("simulation", scene.model_dump_json(), _stamps(edit, files))
+        scene_key = ("simulation", scene.model_dump_json(), *map(files.stamp, file_names(edit)))
         simulation = _remembered(asset, scene_key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True)))
         frame = simulation.at(edit.time, go_on)
     elif (rig := split_rig_clip(edit.clip)) is not None:
@@ -318,15 +291,7 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: _Files, go_on: C
     return frame
 
 
-def _file(edit: ShapeEdit) -> str | None:
-    """The file that an edit reads, whose change must be noticed."""
-    if isinstance(edit, PoseEdit):
-        rig = split_rig_clip(edit.clip)
-        return f"{edit.clip}/clip.json" if rig is None else rig[0]
-    return edit.vertices if isinstance(edit, DeformEdit) else None
-
-
-def _environment(asset: Asset, name: str, files: _Files, environments: Callable[[str], Environment] | None) -> Environment:
+def _environment(asset: Asset, name: str, files: EditFiles, environments: Callable[[str], Environment] | None) -> Environment:
     if environments is not None:
         return environments(name)
     device = asset.environment.radiance.device
@@ -337,49 +302,9 @@ def _environment(asset: Asset, name: str, files: _Files, environments: Callable[
     return _remembered(asset, ("environment", files.stamp(name)), load)
 
 
-def _material_words(edits: list[MaterialEdit], files: _Files) -> tuple:
-    """Differ where materials may."""
-    return tuple(
-        _word(edit) if edit.select.weights_file is None else (_word(edit), files.stamp(edit.select.weights_file)) for edit in edits
-    )
-
-
-def _shape_words(edits: list[ShapeEdit], files: _Files) -> tuple:
-    """Differ where shapes may."""
-    return tuple((_word(edit), stamps) if any(stamps := _stamps(edit, files)) else _word(edit) for edit in edits)
-
-
-def _stamps(edit: ShapeEdit, files: _Files) -> tuple:
-    """Of all files that the edit reads: whoever changes one must be noticed."""
-    if isinstance(edit, SimulateEdit):
-        return tuple(map(files.stamp, mesh_files(parse_simulation_scene(edit.scene))))
-    return (files.stamp(_file(edit)),)
-
-
 def _text_of_grips(edit: DeformEdit) -> str:
     """What is held, whatever the targets."""
     return edit.model_dump_json(exclude={"handles": {"drag": {"__all__": {"target", "turn"}}}})
-
-
-def _text(edit: Edit) -> str:
-    return edit.model_dump_json()
-
-
-_words: dict[int, tuple[ReferenceType, bytes]] = {}
-"""Of edits that live, by their identity: they are frozen, and a long list of them is looked at for each edit more."""
-
-
-def _word(edit: Edit) -> bytes:
-    """Stands for an edit in keys; equal for equal edits."""
-    known = _words.get(id(edit))
-    if known is not None and known[0]() is edit:
-        return known[1]
-    word = hashlib.blake2b(_text(edit).encode(), digest_size=16).digest()
-    # Lists and dictionaries in an edit could be written to by whoever made it.
-    if not isinstance(edit, SimulateEdit) and (not isinstance(edit, MaterialEdit) or edit.select.vertex_weights is None):
-        number = id(edit)
-        _words[number] = ref(edit, lambda _: _words.pop(number, None)), word
-    return word
 
 
 def _is_optimised(asset: Asset) -> bool:
@@ -387,42 +312,48 @@ def _is_optimised(asset: Asset) -> bool:
 
 
 def _applied_in_turn(
-    asset: Asset, kind: str, words: tuple, first: Result, apply: Callable[[Result, int], Result], go_on: Callable[[], None] | None
+    asset: Asset, kind: str, edits: EditSteps, first: Result, apply: Callable[[Result, int], Result], go_on: Callable[[], None] | None
 ) -> Result:
     """What edits make of `first`, one after the other. One edit more on a long list costs one edit, and so do a few less.
 
     Args:
-        words: of the edits.
         apply: the result of edit number `index` on what those before it have made.
     """
+    if edits.count == 0:
+        return first
 
     def make() -> Result:
-        done, result = _longest_remembered(asset, kind, words, first)
-        for index in range(done, len(words)):
+        done, result = _longest_remembered(asset, kind, edits, first)
+        for index in range(done, edits.count):
             if go_on is not None:
                 go_on()
             result = apply(result, index)
             if (index + 1) % CHECKPOINT == 0:
-                result = _remembered(asset, (kind + CHECKPOINTS, *words[: index + 1]), _constant(result))
+                result = _remembered(asset, _key(kind + CHECKPOINTS, edits, index + 1), _constant(result))
         return result
 
-    return _remembered(asset, (kind, *words), make)
+    return _remembered(asset, _key(kind, edits), make)
+
+
+def _key(kind: str, edits: EditSteps, count: int | None = None) -> tuple[str, int, bytes]:
+    """Of what the first edits, all where None, have made."""
+    count = edits.count if count is None else count
+    return kind, count, edits.digest(count)
 
 
 def _constant(value: Result) -> Callable[[], Result]:
     return lambda: value
 
 
-def _longest_remembered(asset: Asset, kind: str, words: tuple, first: Result) -> tuple[int, Result]:
+def _longest_remembered(asset: Asset, kind: str, edits: EditSteps, first: Result) -> tuple[int, Result]:
     """How many of the first edits are those of a result that is remembered, and that; or 0 and `first`."""
     if _is_optimised(asset):
         return 0, first
     with _lock:
         kept = _memory.get(asset, OrderedDict())
-        alike = [key for key in kept if key[0] in (kind, kind + CHECKPOINTS) and 1 < len(key) <= len(words) + 1]
-        begun = [key for key in alike if key[-1] == words[len(key) - 2] and key[1:] == words[: len(key) - 1]]
-        longest = max(begun, key=len, default=None)
-        return (0, first) if longest is None else (len(longest) - 1, kept[longest])
+        alike = [key for key in kept if key[0] in (kind, kind + CHECKPOINTS) and key[1] <= edits.count]
+        longest = max((key for key in alike if key[2] == edits.digest(key[1])), key=lambda key: key[1], default=None)
+        return (0, first) if longest is None else (longest[1], kept[longest])
 
 
 def _remembered(asset: Asset, key: tuple, make: Callable[[], Result]) -> Result:

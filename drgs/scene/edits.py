@@ -1,6 +1,7 @@
 """Edits as plain data: one schema for file, REST and WebSocket, applied in order, each undoable (design: Edits)."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -262,6 +263,27 @@ def parse_edits(data: list | str | bytes) -> list[Edit]:
 def plain_edit(edit: Edit) -> dict:
     """An edit as parse_edits reads it, without what it leaves out."""
     return edit.model_dump(mode="json", exclude_none=True)
+
+
+def shared_beginning(one: Sequence[Edit], other: Sequence[Edit]) -> int:
+    """How many of the first edits are the same. Comparing the same objects takes microseconds for thousands, so it looks from the end, where lists
+    of one session mostly part."""
+    one, other = tuple(one), tuple(other)
+    most = min(len(one), len(other))
+    if _begin_alike(one, other, most):
+        return most
+    step = 1
+    while step < most and not _begin_alike(one, other, most - step):
+        step *= 2
+    alike, parted = max(most - step, 0), most - step // 2
+    while parted - alike > 1:
+        middle = (alike + parted) // 2
+        alike, parted = (middle, parted) if _begin_alike(one, other, middle) else (alike, middle)
+    return alike
+
+
+def _begin_alike(one: tuple[Edit, ...], other: tuple[Edit, ...], count: int) -> bool:
+    return one[:count] == other[:count]
 
 
 def load_edits(path: Path) -> list[Edit]:

@@ -2,8 +2,10 @@
 
 import asyncio
 import random
+import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,9 +13,9 @@ from conftest import Service
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drgs.scene.edits import parse_edits
+from drgs.scene.edits import Edit, parse_edits
 from drgs_server.live import sessions
-from drgs_server.live.edit_log import ChangeQueue, ChangeRequest, EditLog, NothingToDo, Splice
+from drgs_server.live.edit_log import ChangeQueue, ChangeRequest, EditLog, EventKind, NothingToDo, Splice
 
 
 def material(roughness: float) -> dict:
@@ -60,6 +62,42 @@ def test_the_log_behaves_like_two_stacks(kinds: list[str]) -> None:
         else:
             done.append(undone.pop())
         assert (log.done, log.undone, log.revision) == (tuple(done), tuple(undone), count)
+
+
+def test_a_change_of_a_long_log_takes_as_many_steps_as_that_of_a_short_one() -> None:
+    def calls(work: Callable[[], object]) -> int:
+        count = 0
+
+        def see(frame: object, event: str, argument: object) -> None:
+            nonlocal count
+            count += event in ("call", "c_call")
+
+        sys.setprofile(see)
+        try:
+            work()
+        finally:
+            sys.setprofile(None)
+        return count
+
+    def change(log: EditLog, kind: EventKind, edit: Edit | None = None) -> None:
+        after = log.after(kind, edit)
+        after.change_since(log).model_dump_json()
+
+    taken: dict[str, list[int]] = {}
+    for length in (64, 2000):
+        log = EditLog()
+        for number in range(length):
+            log = log.after("edit", EDITS[number % 10])
+        half = log
+        for _ in range(length // 2):
+            half = half.after("undo")
+        for name, start, kind, edit in (
+            ("edit", log, "edit", EDITS[3]), ("undo", log, "undo", None), ("replace", log, "replace", EDITS[4]),
+            ("undo again", half, "undo", None), ("redo", half, "redo", None), ("edit instead", half, "edit", EDITS[3]),
+        ):  # fmt: skip
+            taken.setdefault(name, []).append(calls(lambda start=start, kind=kind, edit=edit: change(start, kind, edit)))
+    # Where lists part is found by halving: a few steps more, not as many as there are edits.
+    assert all(long < 2 * short for short, long in taken.values()), taken
 
 
 @pytest.mark.slow

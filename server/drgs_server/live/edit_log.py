@@ -14,11 +14,9 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import compress, takewhile
-from operator import is_not
 from typing import Literal
 
-from drgs.scene.edits import Edit
+from drgs.scene.edits import Edit, shared_beginning
 from drgs_server.live import messages
 
 RequestKind = Literal["edit", "splice", "restore", "undo", "redo"]
@@ -79,12 +77,39 @@ class ChangeRequest:
 
 
 @dataclass(frozen=True)
+class Steps:
+    """Steps of undo, the newest last. Knows where everything was restored, so that nobody looks through all of them."""
+
+    entries: tuple[Entry, ...] = ()
+    restored_at: tuple[int, ...] = ()
+    """Places of those that are Restored."""
+
+    def pushed(self, entry: Entry) -> "Steps":
+        place = (len(self.entries),) if isinstance(entry, Restored) else ()
+        return Steps((*self.entries, entry), self.restored_at + place)
+
+    def popped(self) -> "Steps":
+        was_restored = isinstance(self.entries[-1], Restored)
+        return Steps(self.entries[:-1], self.restored_at[:-1] if was_restored else self.restored_at)
+
+    @property
+    def edit_count(self) -> int:
+        """How many, counted from the newest, are edits."""
+        return len(self.entries) - (self.restored_at[-1] + 1 if self.restored_at else 0)
+
+    @property
+    def edits(self) -> tuple[Edit, ...]:
+        """Those, the newest last."""
+        return self.entries[len(self.entries) - self.edit_count :]  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
 class EditLog:
     """What undo takes away one by one, and what redo brings back, the last one first."""
 
     revision: int = 0
-    entries: tuple[Entry, ...] = ()
-    undone: tuple[Entry, ...] = ()
+    steps: Steps = Steps()
+    redoable: Steps = Steps()
     digest: str = field(default=EMPTY_DIGEST, compare=False)
     """Of all events behind it, each hashed with the digest before: who holds the same digest holds the same log."""
     newest: ChangeRequest | None = field(default=None, compare=False)
@@ -92,13 +117,24 @@ class EditLog:
     broken: Mapping[int, str] = field(default_factory=dict, compare=False)
     """Place in `done` -> why the edit there is skipped, a sentence: what posing by this log has found, none before."""
 
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """What undo takes away, the next one last."""
+        return self.steps.entries
+
+    @property
+    def undone(self) -> tuple[Entry, ...]:
+        """What redo brings back, the next one last."""
+        return self.redoable.entries
+
     @cached_property
     def done(self) -> tuple[Edit, ...]:
         """The edits in force, in order."""
-        for index in range(len(self.entries) - 1, -1, -1):
-            if isinstance(entry := self.entries[index], Restored):
-                return entry.edits + self.entries[index + 1 :]  # type: ignore[operator]
-        return self.entries  # type: ignore[return-value]
+        if not self.steps.restored_at:
+            return self.steps.edits
+        restored = self.entries[self.steps.restored_at[-1]]
+        assert isinstance(restored, Restored)
+        return restored.edits + self.steps.edits
 
     def event_of(self, request: ChangeRequest) -> EventKind:
         """What a request becomes in this log."""
@@ -131,19 +167,19 @@ class EditLog:
         if kind == "undo":
             if not self.entries:
                 raise NothingToDo("There is nothing to undo.")
-            return EditLog(revision, self.entries[:-1], (*self.undone, self.entries[-1]))
+            return EditLog(revision, self.steps.popped(), self.redoable.pushed(self.entries[-1]))
         if kind == "redo":
             if not self.undone:
                 raise NothingToDo("There is nothing to redo.")
-            return EditLog(revision, (*self.entries, self.undone[-1]), self.undone[:-1])
+            return EditLog(revision, self.steps.pushed(self.undone[-1]), self.redoable.popped())
         if change is None:
             raise ValueError(f"an event of kind {kind!r} needs what it puts into the log")
         entry = self._entry(change)
         if kind == "replace":
             if not self.entries:
                 raise NothingToDo("There is no such step to replace.")
-            return EditLog(revision, (*self.entries[:-1], entry))
-        return EditLog(revision, (*self.entries, entry))
+            return EditLog(revision, self.steps.popped().pushed(entry))
+        return EditLog(revision, self.steps.pushed(entry))
 
     def _entry(self, change: Change) -> Entry:
         if isinstance(change, Splice):
@@ -167,12 +203,12 @@ class EditLog:
     @property
     def appended(self) -> int:
         """How many edits, counted from the last, are steps of undo of their own."""
-        return sum(1 for _ in takewhile(_is_edit, reversed(self.entries)))
+        return self.steps.edit_count
 
     @cached_property
     def redone_next(self) -> tuple[Edit, ...]:
         """The edits that redo brings back one by one, the next one first."""
-        return tuple(takewhile(_is_edit, reversed(self.undone)))  # type: ignore[arg-type]
+        return self.redoable.edits[::-1]
 
     def message(self) -> messages.EditLog:
         """As callers see it. Its parts are valid already; looking once more takes milliseconds of a long log."""
@@ -217,16 +253,10 @@ def _next_digest(before: str, kind: EventKind, change: Change | None) -> str:
 
 
 def _list_change(before: tuple[Edit, ...], after: tuple[Edit, ...]) -> messages.ListChange:
-    """Edits are compared by identity, which logs that follow each other share."""
-    least = min(len(before), len(after))
-    start = next(compress(range(least), map(is_not, before, after)), least)
-    left = least - start
-    kept = next(compress(range(left), map(is_not, reversed(before), reversed(after))), left)
-    return messages.ListChange.model_construct(start=start, remove=len(before) - start - kept, edits=list(after[start : len(after) - kept]))
-
-
-def _is_edit(entry: Entry) -> bool:
-    return not isinstance(entry, Restored)
+    start = shared_beginning(before, after)
+    gone, come = before[start:], after[start:]
+    kept = shared_beginning(gone[::-1], come[::-1])
+    return messages.ListChange.model_construct(start=start, remove=len(gone) - kept, edits=list(come[: len(come) - kept]))
 
 
 @dataclass(frozen=True)

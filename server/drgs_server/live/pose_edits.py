@@ -43,12 +43,12 @@ def pose_edits(
     broken: dict[int, str] = {}
     searched = False
     while True:
-        kept = [place for place in range(len(edits)) if place not in broken]
         try:
-            return PosedEdits(pose([edits[place] for place in kept]), broken)
+            return PosedEdits(pose(_without(edits, broken)), broken)
         except FAILURES as error:
             if passes(error):
                 raise
+            kept = [place for place in range(len(edits)) if place not in broken]
             if not searched:  # a lost file may have broken many
                 searched = True
                 lost = {place: reason for place in kept if not is_new(edits[place]) and (reason := missing(edits[place])) is not None}
@@ -60,6 +60,11 @@ def pose_edits(
             if place is None or is_new(edits[place]):
                 raise
             broken[place] = reason
+
+
+def _without(edits: Sequence[Edit], broken: dict[int, str]) -> Sequence[Edit]:
+    """The edits that apply; all of a long list as it is, for that takes no time."""
+    return [edit for place, edit in enumerate(edits) if place not in broken] if broken else edits
 
 
 def passes(error: Exception) -> bool:
