@@ -13,19 +13,18 @@ import psutil
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, PlainTextResponse
 from sqlalchemy.exc import SQLAlchemyError
-from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 from drgs import __version__
 from drgs_server.api import routes_assets, routes_jobs, routes_sessions, routes_views, routes_weights
+from drgs_server.api.body_limit import BodyLimit
 from drgs_server.api.context import ServerContext
 from drgs_server.api.docs_page import docs_page
 from drgs_server.api.environments import EnvironmentStore
 from drgs_server.api.metrics import CONTENT_TYPE, Metrics, MetricsMiddleware
 from drgs_server.api.openapi_document import complete_document
 from drgs_server.api.problems import ProblemError, UnexpectedErrors, add_problem_handlers
-from drgs_server.api.rate_limit import OPEN_API_PATHS, CallBuckets, RateLimit
+from drgs_server.api.rate_limit import CallBuckets, RateLimit
 from drgs_server.api.rest_records import Health, TokenRequest
 from drgs_server.api.security import COOKIE_NAME, Gatekeeper, GateMiddleware
 from drgs_server.live import stream
@@ -34,7 +33,7 @@ from drgs_server.live.sessions import SessionRegistry
 from drgs_server.render.interface import AbstractRenderer
 from drgs_server.render.shared_renderer import SharedRenderer
 from drgs_server.render.thread import RenderThread
-from drgs_server.settings import Limits, ServerSettings
+from drgs_server.settings import ServerSettings
 from drgs_worker.jobs.queue import JobQueue
 from drgs_worker.store.artifact_store import ArtifactError
 from drgs_worker.store.backups import back_up_databases
@@ -49,9 +48,6 @@ REMOVAL_SECONDS = 600.0
 BACKUP_SECONDS = 3600.0
 """Between two copies of the databases."""
 VIEWER = Path(__file__).parent / "static"
-OPEN_BODY_BYTES = 4096
-"""Of a call without the token: a login."""
-UPLOAD_PATHS = ("/api/jobs", "/api/assets", "/api/environments")
 
 
 def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = None) -> FastAPI:
@@ -117,24 +113,12 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     _add_pages(app, settings)
     app.add_middleware(UnexpectedErrors)
     # Outermost last: the gate comes before anything reads a body.
-    app.add_middleware(_BodyLimit, limits=settings.limits)
+    app.add_middleware(BodyLimit, limits=settings.limits)
     failures = CallBuckets(settings.limits.failures_a_second)
     app.add_middleware(RateLimit, requests_a_second=settings.limits.requests_a_second, failures=failures)
     app.add_middleware(GateMiddleware, gatekeeper=context.gatekeeper, failures=failures, most_streams=settings.limits.connections)
     app.add_middleware(MetricsMiddleware, metrics=context.metrics)
     return app
-
-
-class _BodyLimit:
-    """Uploads get their own, larger limit, and calls without the token a smaller one."""
-
-    def __init__(self, app: ASGIApp, limits: Limits) -> None:
-        self._small = RequestBodyLimitMiddleware(app, limits.body_bytes)
-        sizes = dict.fromkeys(UPLOAD_PATHS, limits.upload_bytes) | dict.fromkeys(OPEN_API_PATHS, OPEN_BODY_BYTES)
-        self._others = {path: RequestBodyLimitMiddleware(app, size) for path, size in sizes.items()}
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await self._others.get(scope.get("path", ""), self._small)(scope, receive, send)
 
 
 async def _requeue_dead_workers_jobs(context: ServerContext) -> None:

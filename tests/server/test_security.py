@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from conftest import Service
 from starlette.websockets import WebSocketDisconnect
+from test_rest import is_problem
 
 from drgs_worker.store.settings import read_settings
 
@@ -120,9 +121,12 @@ def test_answers_tell_browsers_to_be_careful(service: Service) -> None:
         assert "access-control-allow-origin" not in headers
 
 
-def test_large_bodies_are_refused(service: Service) -> None:
-    response = service.client.post("/api/sessions", content=b"x" * ((16 << 20) + 1), headers={"content-type": "application/json"})
-    assert response.status_code == 413
+def test_large_bodies_are_refused_with_a_sentence_whether_their_size_was_said_or_not(service: Service) -> None:
+    large, json_type = b"x" * ((16 << 20) + 1), {"content-type": "application/json"}
+    for path, content in (("/api/sessions", large), ("/api/sessions", (large[k : k + (1 << 20)] for k in range(0, len(large), 1 << 20)))):
+        assert "16777216 bytes" in is_problem(service.client.post(path, content=content, headers=json_type), 413)
+    assert "4096 bytes" in is_problem(service.anonymous.post("/api/login", json={"token": "x" * 5000}), 413)
+    assert "16777216 bytes" in is_problem(service.client.post("/api/weights", content=large), 413)
 
 
 @pytest.mark.slow
