@@ -88,6 +88,24 @@ def pose_scene(
     return PosedScene(surfels, mesh, environment, light.rotation_degrees, light.intensity, horizons)
 
 
+def simulation_bytes(asset: Asset) -> int:
+    """Of the frames that simulations of this asset have made, as far as they are remembered."""
+    return sum(simulation.frame_bytes for simulation in _simulations(asset).values())
+
+
+def forget_simulations(asset: Asset) -> None:
+    """All but the one asked for last: frames of others are computed again when somebody asks for them."""
+    unused = list(_simulations(asset))[:-1]
+    with _lock:
+        for key in unused:
+            _memory.get(asset, OrderedDict()).pop(key, None)
+
+
+def _simulations(asset: Asset) -> dict[tuple, Simulation]:
+    with _lock:
+        return {key: value for key, value in _memory.get(asset, OrderedDict()).items() if key[0] == "simulation"}
+
+
 PoseParts = dict[str, Tensor]
 """Results behind a posed scene by name: mesh.albedo, mesh.vertices, surfel.tangents, ..."""
 

@@ -127,6 +127,7 @@ class Simulation:
         self._rest_tangents = tangents
         rest_centers = None if asset.gaussians is None else asset.gaussians.centers
         self._frames = [ClipFrame(mesh.vertices, mesh.normals, rest_centers, tangents)]
+        self._frame_bytes = 0
 
     @property
     def report(self) -> SimulationReport:
@@ -142,6 +143,16 @@ class Simulation:
         return self._state
 
     @property
+    def frame_bytes(self) -> int:
+        """Memory of the frames that were computed; the first, at rest, is the asset's own."""
+        return self._frame_bytes
+
+    def _append(self, frame: ClipFrame) -> None:
+        before = {id(values) for values in vars(self._frames[-1]).values()}
+        self._frame_bytes += sum(values.nbytes for values in vars(frame).values() if values is not None and id(values) not in before)
+        self._frames.append(frame)
+
+    @property
     def progress(self) -> SimulationProgress:
         """What was computed so far."""
         with self._lock:
@@ -150,7 +161,9 @@ class Simulation:
     def go_on_from(self, progress: SimulationProgress) -> None:
         """As if what another run of the same asset and scene had made had been computed here."""
         with self._lock:
-            self._frames, self._state = list(progress.frames), progress.state
+            self._frames, self._frame_bytes, self._state = list(progress.frames[:1]), 0, progress.state
+            for frame in progress.frames[1:]:
+                self._append(frame)
             self._totals, self._still = dict(progress.totals), progress.still
 
     def frame(self, index: int, go_on: Callable[[], None] | None = None) -> ClipFrame:
@@ -168,7 +181,7 @@ class Simulation:
             try:
                 if len(self._frames) > index:
                     return self._frames[index]
-                self._frames.append(self._next_frame(go_on))
+                self._append(self._next_frame(go_on))
             finally:
                 self._lock.release()
             if go_on is not None:

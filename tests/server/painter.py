@@ -35,6 +35,7 @@ class Painter(AbstractRenderer):
         self.recalled: list[int] = []
         """How many edits of a long log were known from a file, each time that one was opened."""
         self.light_bytes = 0
+        self.frame_bytes = 0
         self.prepared = 0
         self.stills = 0
         self.slices = 0
@@ -80,6 +81,12 @@ class PaintedAsset(AbstractLoadedAsset):
         known = path.is_file() and int(path.read_text()) <= len(edits)
         self.painter.recalled.append(int(path.read_text()) if known else 0)
         return known
+
+    def simulation_bytes(self) -> int:
+        return self.painter.frame_bytes
+
+    def forget_simulations(self) -> None:
+        self.painter.frame_bytes = 0
 
 
 class PaintedPose(AbstractPose):

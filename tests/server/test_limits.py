@@ -1,6 +1,7 @@
 """Rates, metrics and settings: what an operator turns and reads."""
 
 import asyncio
+import json
 import re
 import shutil
 from pathlib import Path
@@ -214,6 +215,27 @@ def test_unused_assets_leave_memory_beyond_the_budget_and_come_back(tmp_path: Pa
             assert service.context.sessions.loaded_count() <= 2
         assert service.painter.loads == 4  # the first one again
     assert ServiceSettings(limits={"loaded_bytes": 5}).limits.loaded_bytes == 5  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_frames_of_simulations_count_as_loaded_and_leave_memory_for_newer_ones(tmp_path: Path) -> None:
+    service = Service(tmp_path, DrgsRenderer("cpu"), limits={"loaded_bytes": 1 << 19})  # type: ignore[arg-type]
+    with service.client:
+        asset = service.add_asset()
+        write_ball(tmp_path / "ball.ply")
+        shutil.rmtree(service.context.directory.asset(asset))
+        save_asset(import_mesh(tmp_path / "ball.ply"), service.context.directory.asset(asset))
+        session, sessions = service.client.post("/api/sessions", json={"asset": asset}).json()["id"], service.context.sessions
+        vertices, used = json.loads((service.context.directory.asset(asset) / "asset.json").read_text())["counts"]["vertices"], []
+        for seed in range(4):
+            scene = {"particles": 500, "seed": seed, "duration": 1.0}
+            edit = {"op": "simulate", "scene": scene, "time": 10 / 24}
+            answer = service.client.post(f"/api/sessions/{session}/edits", json={"edit": edit})
+            assert answer.status_code == 200, answer.text
+            used.append(sessions.loaded_bytes())
+        # Ten frames of positions and normals; where they sleep, fewer.
+        assert used[1] - used[0] == 10 * vertices * 2 * 3 * 4
+        assert max(used) <= 1 << 19
 
 
 @pytest.mark.slow

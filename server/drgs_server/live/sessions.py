@@ -225,16 +225,19 @@ class SessionRegistry:
         return self._directory.poses / f"{session_id}.safetensors"
 
     def loaded_bytes(self) -> int:
-        """Of assets in memory, and of the environments that they are shown under."""
-        return sum(self._asset_bytes[name] for name in self._loaded) + self._renderer.environment_bytes()
+        """Of assets in memory, of the frames of their simulations, and of the environments that they are shown under."""
+        assets = sum(self._asset_bytes[name] + loaded.simulation_bytes() for name, loaded in self._loaded.items())
+        return assets + self._renderer.environment_bytes()
 
     def _make_room(self, newest: LiveSession) -> None:
-        """Let go of what was used least recently: environments that light nothing, then poses with theirs, then assets. What somebody looks at stays,
+        """Let go of what was used least recently: environments that light nothing and simulations that nobody asked for last, then poses with theirs, then assets. What somebody looks at stays,
         and so does the session whose pose is new."""
         self._posed[newest.id] = newest
         self._posed.move_to_end(newest.id)
         if self.loaded_bytes() > self._limits.loaded_bytes:
             self._renderer.forget_environments()
+            for loaded in self._loaded.values():
+                loaded.forget_simulations()
         for session in [session for session in self._posed.values() if not session.viewers and session is not newest]:
             if len(self._posed) <= POSED_SESSIONS and self.loaded_bytes() <= self._limits.loaded_bytes:
                 break

@@ -110,6 +110,16 @@ class LoadedAsset(AbstractLoadedAsset):
 
         return recall_pose(self.asset, edits, path, self._environments) > 0
 
+    def simulation_bytes(self) -> int:
+        from drgs.deform.pose_scene import simulation_bytes
+
+        return simulation_bytes(self.asset)
+
+    def forget_simulations(self) -> None:
+        from drgs.deform.pose_scene import forget_simulations
+
+        forget_simulations(self.asset)
+
     def _environment(self, name: str) -> "Environment":
         return self._light.get(self._environments / name, self.asset.mesh.vertices.device)
 

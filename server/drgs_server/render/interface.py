@@ -148,6 +148,14 @@ class AbstractLoadedAsset(ABC):
     def recall(self, edits: Sequence[Edit], path: Path) -> bool:
         """Let `pose` go on from what `keep` has written, where that is of the first of these edits; returns whether it is."""
 
+    @abstractmethod
+    def simulation_bytes(self) -> int:
+        """Of the frames of its simulations that are in memory."""
+
+    @abstractmethod
+    def forget_simulations(self) -> None:
+        """All but the one asked for last leave memory."""
+
 
 class AbstractRenderer(ABC):
     """Loads assets."""

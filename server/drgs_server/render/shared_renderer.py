@@ -63,6 +63,12 @@ class SharedAsset(AbstractLoadedAsset):
     def recall(self, edits: Sequence[Edit], path: Path) -> bool:
         return self._asset.recall(edits, path)
 
+    def simulation_bytes(self) -> int:
+        return self._asset.simulation_bytes()
+
+    def forget_simulations(self) -> None:
+        self._asset.forget_simulations()
+
 
 @contextmanager
 def _as_problems() -> Iterator[None]:
