@@ -39,12 +39,13 @@ from drgs_worker.store.artifact_store import ArtifactError
 from drgs_worker.store.backups import back_up_databases
 from drgs_worker.store.data_directory import open_data_directory, read_token
 from drgs_worker.store.database import open_database
+from drgs_worker.store.remove_unused import remove_unused_poses, remove_unused_weights
 from drgs_worker.store.scratch import claim_scratch
 
 LIVENESS_SECONDS = 5.0
 """Between two looks for jobs of dead workers."""
 REMOVAL_SECONDS = 600.0
-"""Between two looks for assets whose deletion can no longer be undone."""
+"""Between two looks for assets whose deletion can no longer be undone, and for what nobody refers to."""
 BACKUP_SECONDS = 3600.0
 """Between two copies of the databases."""
 VIEWER = Path(__file__).parent / "static"
@@ -59,6 +60,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
         ValueError: the data directory cannot be used.
     """
     directory = open_data_directory(settings.data, settings.database_url, settings.queue_url, settings.artifact_url)
+    scratch = claim_scratch(directory)  # before anything is written: it sweeps what is half written
     engine = open_database(directory)
     environments = EnvironmentStore(directory)
     environments.add_bundled(settings.bundled_environments)
@@ -73,7 +75,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     context = ServerContext(
         settings=settings,
         directory=directory,
-        scratch=claim_scratch(directory),
+        scratch=scratch,
         engine=engine,
         queue=JobQueue(directory, engine),
         environments=environments,
@@ -89,7 +91,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
         thread.start()
         if await asyncio.to_thread(context.sessions.any):
             asyncio.get_running_loop().run_in_executor(None, renderer.prepare)
-        work = (_requeue_dead_workers_jobs, _remove_deleted_assets, _forget_assets_deleted_elsewhere, _back_up_databases)
+        work = (_requeue_dead_workers_jobs, _remove_unused, _forget_assets_deleted_elsewhere, _back_up_databases)
         chores = [asyncio.create_task(chore(context)) for chore in work]
         yield
         for chore in chores:
@@ -133,12 +135,14 @@ async def _requeue_dead_workers_jobs(context: ServerContext) -> None:
             logging.getLogger(__name__).warning("handed over %d jobs of dead workers", len(moved))
 
 
-async def _remove_deleted_assets(context: ServerContext) -> None:
+async def _remove_unused(context: ServerContext) -> None:
     while True:
         try:
             await asyncio.to_thread(routes_assets.remove_deleted_assets, context)
-        except (SQLAlchemyError, ArtifactError) as error:
-            logging.getLogger(__name__).warning("deleted assets were not removed: %s", error)
+            await asyncio.to_thread(remove_unused_weights, context.directory, context.engine)
+            await asyncio.to_thread(remove_unused_poses, context.directory, context.engine)
+        except (SQLAlchemyError, ArtifactError, OSError) as error:
+            logging.getLogger(__name__).warning("what is deleted or unused was not removed: %s", error)
         await asyncio.sleep(REMOVAL_SECONDS)
 
 

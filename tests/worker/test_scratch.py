@@ -51,3 +51,19 @@ def test_old_drafts_without_an_owner_are_removed_and_nothing_else(tmp_path: Path
     claim_scratch(directory).close()
     left = {path.name for folder in (directory.uploads, directory.assets, directory.environments) for path in folder.iterdir()}
     assert left == {"asset", ".new"}
+
+
+def test_half_written_poses_and_pictures_are_swept_by_the_first_server_and_left_alone_by_a_second(tmp_path: Path) -> None:
+    directory = open_data_directory(tmp_path)
+    drafts = [directory.poses / "a.new", directory.environments / "sky.new", directory.environments / ".sky.exr.new"]
+    whole = [directory.poses / "a.safetensors", directory.environments / "sky.exr", directory.environments / "sky.jpg"]
+    for path in (*drafts, *whole):
+        path.write_bytes(b"half")
+    first = claim_scratch(directory)
+    assert not any(path.exists() for path in drafts) and all(path.exists() for path in whole)
+    for path in drafts:
+        path.write_bytes(b"half")
+    second = claim_scratch(directory)
+    assert all(path.exists() for path in drafts), "the first one may be writing them"
+    for scratch in (first, second):
+        scratch.close()

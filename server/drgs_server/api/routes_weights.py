@@ -1,6 +1,6 @@
 """REST: painted weights of vertices as files, so that an edit may refer to them instead of holding them: a message of the stream has at most 1 MiB.
 
-A file is called by its content's hash and never changes; the same weights are one file.
+A file is called by its content's hash and never changes; the same weights are one file. It is removed a day after nobody names it any more.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from drgs_server.api.context import ServerContext, context_of
 from drgs_server.api.problems import ProblemError
 from drgs_server.api.rest_records import WeightsInfo
-from drgs_worker.store.artifacts import WEIGHTS, has_weights, share_artifact
+from drgs_worker.store.artifacts import WEIGHTS, has_weights, mark_used, share_artifact
 
 router = APIRouter(prefix="/api/weights", tags=["sessions"])
 
@@ -40,7 +40,7 @@ def _store(context: ServerContext, data: bytes) -> WeightsInfo:
         raise ProblemError(422, "Weights lie in 0..1; found others.")
     name = f"{hashlib.sha256(data).hexdigest()[:32]}.f32"
     place = context.directory.environments / WEIGHTS / name
-    if not place.is_file():
+    if not mark_used(place):
         place.parent.mkdir(mode=0o700, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".weights-", dir=context.scratch.folder) as folder:
             draft = Path(folder) / name

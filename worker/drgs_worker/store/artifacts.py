@@ -74,7 +74,7 @@ def fetch_environment(directory: DataDirectory, name: str) -> Path:
 
 
 def has_weights(directory: DataDirectory, name: str) -> bool:
-    """Whether there are such painted weights, `weights/HASH.f32` as selections call them; they are on this machine then.
+    """Whether there are such painted weights, `weights/HASH.f32` as selections call them; they are on this machine then, and stay for a while.
 
     Raises:
         StoreAway, ArtifactDamaged: a sentence.
@@ -84,9 +84,19 @@ def has_weights(directory: DataDirectory, name: str) -> bool:
     place = directory.environments / name
     place.parent.mkdir(mode=0o700, exist_ok=True)
     try:
-        return _fetch_missing(directory, WEIGHTS, place.name, place).is_file()
+        return mark_used(_fetch_missing(directory, WEIGHTS, place.name, place))
     except ArtifactMissing:
         return False
+
+
+def mark_used(weights: Path) -> bool:
+    """Note that somebody is about to name a file of weights (remove_unused.py); False where it is not there."""
+    try:
+        # The time of its last change stays: by that, poses see whether a file is another one.
+        os.utime(weights, ns=(time.time_ns(), weights.stat().st_mtime_ns))
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def fetch_edit_files(directory: DataDirectory, edits: Iterable[Edit]) -> None:

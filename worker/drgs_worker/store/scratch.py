@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from drgs_worker.store.data_directory import DataDirectory, try_lock_file
+from drgs_worker.store.data_directory import DataDirectory, lock_file, try_lock_file
 
 MOST_PROCESSES = 256
 STALE_SECONDS = 24 * 3600.0
@@ -38,13 +38,25 @@ def claim_scratch(directory: DataDirectory) -> Scratch:
         ValueError: very many processes use the data directory.
         OSError: the disk is full, or the folder cannot be written.
     """
+    with lock_file(directory.scratch / "claiming.lock"):  # nobody begins while it is found out who else there is
+        own, alone = _claim(directory)
+        if alone:
+            _remove_drafts_of_servers(directory)
+    _remove_stale_drafts(directory)
+    return own
+
+
+def _claim(directory: DataDirectory) -> tuple[Scratch, bool]:
+    """A folder, and whether no other process has one; raises like claim_scratch."""
     known = {int(path.stem) for path in directory.scratch.glob("*.lock") if path.stem.isdecimal()}
     own: Scratch | None = None
+    alone = True
     for number in range(MOST_PROCESSES):
         if own is not None and number not in known:
             continue
         lock = try_lock_file(directory.scratch / f"{number}.lock")
         if lock is None:
+            alone = False
             continue
         folder = directory.scratch / str(number)
         shutil.rmtree(folder, ignore_errors=True)
@@ -55,8 +67,13 @@ def claim_scratch(directory: DataDirectory) -> Scratch:
             os.close(lock)
     if own is None:
         raise ValueError(f"{MOST_PROCESSES} processes already use {directory.root}; expected fewer")
-    _remove_stale_drafts(directory)
-    return own
+    return own, alone
+
+
+def _remove_drafts_of_servers(directory: DataDirectory) -> None:
+    """What is half written beside its place (poses, thumbnails, environments): by servers only, of which none lives but this one."""
+    for path in (*directory.poses.glob("*.new"), *directory.environments.glob("*.new"), *directory.environments.glob(".*.new")):
+        path.unlink(missing_ok=True)
 
 
 def _remove_stale_drafts(directory: DataDirectory) -> None:
