@@ -18,13 +18,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.trials import access, captures, changes, connections, faults, load, streams, uploads
+from benchmarks.trials import access, captures, changes, connections, disk, faults, load, streams, uploads, weights
 from benchmarks.trials.load import MOST_BYTES
 from benchmarks.trials.shapes import ball, obj
 from benchmarks.trials.site import Site, Trial
 from benchmarks.trials.watch import HealthWatch, MemoryWatch, percentile_ms
 
-SOURCES = (changes, streams, uploads, captures, connections, access, load, faults)
+SOURCES = (changes, weights, streams, uploads, captures, connections, access, load, faults, disk)
 MOST_HEALTH_MS = 100.0
 """Of /healthz, p99 over everything. The short form, which shares its machine with tests, does not judge it."""
 

@@ -190,10 +190,13 @@ def _leftovers(work: Callable[[Site, str], None], site: Site) -> str | None:
         own.kill()
         for thread in threads:
             thread.join()
+        for half in ("poses/half.new", "environments/half.new", "environments/.half.exr.new"):
+            (own.data / half).write_bytes(b"half written")
         own.start()
         time.sleep(1.0)
         left = sorted(path.name for path in (own.data / "uploads").iterdir() if path.name.startswith("."))
-        return f"{len(left)} folders are left, such as {left[0]}" if left else None
+        left += [path.name for folder in ("poses", "environments") for path in (own.data / folder).iterdir() if path.suffix == ".new"]
+        return f"{len(left)} drafts are left, such as {left[0]}" if left else None
 
 
 def _clip_in_use(site: Site) -> str | None:

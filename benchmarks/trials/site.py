@@ -186,7 +186,8 @@ class Site:
         if answer.status < 400:
             return None
         if "json" not in answer.headers.get("content-type", "json"):
-            return None  # the web server's own answers to what is no HTTP
+            # The web server's own answers to what is no HTTP, or too long or too slow for it.
+            return None if answer.status in (400, 408, 431) else f"{answer.status} is no problem: {answer.body[:100]!r}"
         if len(answer.sentence) > LONGEST_SENTENCE:
             return f"the sentence has {len(answer.sentence)} characters"
         if str(self.folder) in answer.sentence or "Traceback" in answer.sentence:

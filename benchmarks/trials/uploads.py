@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.trials.changes import finite_picture
 from benchmarks.trials.shapes import ball, exr, glb, hdr, hdr_of_repeats, obj, ply, sparse_glb, zipped
 from benchmarks.trials.site import Site, Trial
+from benchmarks.trials.watch import MemoryWatch
 
 PATIENCE_SECONDS = 60.0
 """For one file, however it was made."""
@@ -61,8 +62,6 @@ LIGHTS: dict[str, tuple[str, Callable[[], bytes], bool]] = {
     "texels of 1e-38": ("a.exr", lambda: exr(np.full((8, 16, 3), 1e-38, np.float32)), False),
     "a Radiance picture of 1e13": ("a.hdr", lambda: hdr(16, 8, (200, 200, 200, 171)), False),
     "a Radiance picture of the largest exponent": ("a.hdr", lambda: hdr(16, 8, (255, 255, 255, 255)), False),
-    "98 kB that claim 16384x8192": ("a.hdr", partial(hdr_of_repeats, 16384, 8192), True),
-    "8 MB that claim 16384x8192": ("a.hdr", lambda: hdr(16384, 8192, (128, 128, 128, 129)), False),
     "a size that is not there": ("a.hdr", lambda: b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8192 +X 16384\n", False),
     "a name that says another format": ("a.hdr", partial(_light, 1.0), False),
     "no picture": ("a.exr", lambda: b"\x00" * 1000, False),
@@ -70,6 +69,14 @@ LIGHTS: dict[str, tuple[str, Callable[[], bytes], bool]] = {
     "a square": ("a.exr", lambda: exr(np.ones((8, 8, 3), np.float32)), False),
     "a name in another script": ("日本 ../../x.exr", partial(_light, 1.0), False),
 }
+TOO_LARGE: dict[str, Callable[[], bytes]] = {
+    "98 kB that claim 16384x8192": partial(hdr_of_repeats, 16384, 8192),
+    "8 MB that claim 16384x8192": lambda: hdr(16384, 8192, (128, 128, 128, 129)),
+    "a row more than 8192x4096": partial(hdr_of_repeats, 8194, 4097),
+}
+"""Environments beyond the largest one that is taken."""
+MOST_GROWTH_BYTES = 384 << 20
+"""Of a refusal by size: a process that reads a header, not the picture."""
 MESHES: dict[str, tuple[str, Callable[[], bytes], bool]] = {
     "sparse positions": ("a.glb", sparse_glb, True),
     "Latin-1": ("a.obj", _latin, False),
@@ -108,6 +115,8 @@ MESHES: dict[str, tuple[str, Callable[[], bytes], bool]] = {
 def trials() -> Iterator[Trial]:
     for title, (name, make, quick) in LIGHTS.items():
         yield Trial("lights", title, partial(_environment, name, make), quick)
+    for title, make_large in TOO_LARGE.items():
+        yield Trial("lights", f"{title} are refused at the door", partial(_too_large, make_large))
     for title, (name, make, quick) in MESHES.items():
         yield Trial("meshes", title, partial(_mesh, name, make), quick)
     for path in ("/api/assets", "/api/environments", "/api/jobs"):
@@ -148,6 +157,22 @@ def _environment(name: str, make: Callable[[], bytes], site: Site) -> str | None
     if changed.status != 200:
         return f"it was taken, but an edit that names it is answered {changed.status}: {changed.sentence[:200]}"
     return finite_picture(site, session, "width=24&height=24&spp=8&bounces=1") or _soon(answer.seconds)
+
+
+def _too_large(make: Callable[[], bytes], site: Site) -> str | None:
+    """By the header alone: with its largest size in the sentence, soon, and without the memory that the picture would take."""
+    assert site.process is not None
+    data = make()
+    watch = MemoryWatch(site.process.pid)
+    before = watch.now()
+    answer = site.upload("/api/environments", "large.hdr", data)
+    watch.stop()
+    if complaint := site.complaint(answer, {422}):
+        return complaint
+    if "8192" not in answer.sentence:
+        return f"the sentence does not say how large one may be: {answer.sentence[:200]}"
+    grown = watch.peak_bytes - before
+    return f"memory grew by {grown >> 20} MiB" if grown > MOST_GROWTH_BYTES else _soon(answer.seconds)
 
 
 def _mesh(name: str, make: Callable[[], bytes], site: Site) -> str | None:
