@@ -156,7 +156,7 @@ def figures_of_fit(parameters: dict[str, Tensor], dataset: Path, radius: float) 
 def deform_table(dataset: Path, work: Path, preset: str, samples: int, all_lights: bool, device: str) -> dict:
     """Figures of deformed pictures by binding and driver."""
     facts = json.loads((dataset / "scene.json").read_text())
-    settings = RenderSettings(samples_per_pixel=samples)
+    settings = RenderSettings(samples_per_pixel=samples, primary="gaussians")  # it is they whose driving is compared
     cameras = load_cameras(dataset / "transforms_test.json")
     table: dict = {}
     for binding in ("particles", "mesh"):

@@ -30,9 +30,10 @@ from drgs.deform.pose_scene import pose_scene
 from drgs.render.film.resolve_frame import resolve_frame
 from drgs.render.progressive.refine import refine_frame
 from drgs.render.progressive.start_frame import start_frame
-from drgs.render.records import PrimarySurface, RenderSettings
+from drgs.render.records import RenderSettings
 from drgs.scene.asset import Asset, load_asset
 from drgs.scene.camera import Camera, camera_from_opengl
+from drgs.scene.posed_scene import PrimarySurface
 from drgs.warp_torch import device_from_name
 from drgs_server.client import Client, Stream
 from drgs_server.live.messages import AcceptedMessage

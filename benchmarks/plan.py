@@ -28,11 +28,11 @@ from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.frame_state import FrameState, with_settings
 from drgs.render.progressive.refine import refine_frame
 from drgs.render.progressive.start_frame import start_frame
-from drgs.render.records import Frame, FrameInputs, PrimarySurface, RenderSettings
+from drgs.render.records import Frame, FrameInputs, RenderSettings
 from drgs.scene.asset import load_asset
 from drgs.scene.camera import Camera
 from drgs.scene.load_environment import load_environment
-from drgs.scene.posed_scene import PosedScene
+from drgs.scene.posed_scene import PosedScene, PrimarySurface
 
 EMPTY, STRATEGY, MATERIAL, HORIZON, DARK = (
     "rays through empty tiles",
@@ -196,7 +196,7 @@ def main(arguments: list[str]) -> None:
     scene = pose_scene(asset, [])
     if given.env:
         scene = replace(scene, environment=load_environment(given.env))
-    primary: PrimarySurface = given.primary or ("mesh" if scene.surfels is None else "gaussians")
+    primary: PrimarySurface = given.primary or scene.primary
     settings = RenderSettings(bounces=given.bounces, primary=primary, skip_error=given.skip_error)
     camera = resized(asset.cameras[given.camera], given.size)
     per_pass = samples_per_pass(FrameInputs(scene, camera, settings)).total

@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--spp", type=int, default=256, help="rays a pixel of the scored pictures")
     parser.add_argument("--views", type=int, default=4, help="test views of the parts that render their own pictures")
     parser.add_argument("--swap-spp", type=int, default=128, help="rays a pixel of the pictures of swaps")
-    parser.add_argument("--swap-bounces", type=int, default=3)
+    parser.add_argument("--swap-bounces", type=int, default=QualitySettings.swap_bounces)
     parser.add_argument("--mesh-samples", type=int, default=COUNT, help="points whose distance from the other surface is measured")
     parser.add_argument("--side", type=int, default=800, help="of a capture that is split: largest side of the pictures held out [pixels]")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])

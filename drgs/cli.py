@@ -21,6 +21,7 @@ from typer.core import TyperGroup
 
 from drgs.exchange.export_formats import EXPORT_FORMATS, FILE_KINDS, ExportFormat, export_format_of
 from drgs.installation import missing_package, unsupported_system
+from drgs.maths.constants import STILL_BOUNCES
 from drgs.scene.tone_curve import ToneCurve
 
 if TYPE_CHECKING:
@@ -154,8 +155,10 @@ def render(
     env_rotation: Annotated[float, typer.Option(help="Degrees, counter-clockwise seen from above.")] = 0.0,
     edits: Annotated[Path | None, typer.Option(help="Edits (JSON), applied in order.")] = None,
     spp: Annotated[int, typer.Option(min=1, help="Rays a pixel.")] = 256,
-    bounces: Annotated[int, typer.Option(min=0, help="Indirect bounces.")] = 1,
-    primary: Annotated[Primary | None, typer.Option(help="What the camera sees; by default the Gaussians where there are some.")] = None,
+    bounces: Annotated[int, typer.Option(min=0, help="Indirect bounces.")] = STILL_BOUNCES,
+    primary: Annotated[
+        Primary | None, typer.Option(help="What the camera sees; by default what the asset prefers: a built one its mesh.")
+    ] = None,
     denoise: Annotated[Denoiser, typer.Option()] = Denoiser.none,
     tone_curve: Annotated[ToneCurve, typer.Option(help="How bright light is brought to the screen; EXR files stay linear.")] = "standard",
     aov: Annotated[bool, typer.Option("--aov", help="Write <name>.exr with the maps behind the picture, too.")] = False,
@@ -183,7 +186,7 @@ def render(
     settings = RenderSettings(
         samples_per_pixel=spp,
         bounces=bounces,
-        primary=primary.value if primary else ("gaussians" if scene.surfels is not None else "mesh"),
+        primary=primary.value if primary else scene.primary,
         denoise=denoise.value,
         tone_curve=tone_curve,
         target_error=error,

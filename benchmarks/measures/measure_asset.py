@@ -31,11 +31,13 @@ from benchmarks.measures.swap_parts import Subject, swap_rows
 from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.evaluate_asset import EvaluationSettings, evaluate_asset
 from drgs.evaluate.metrics import picture_figures
+from drgs.maths.constants import STILL_BOUNCES
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.capture.visual_hull import visual_hull
 from drgs.render.render_cameras import render_cameras
 from drgs.render.render_frame import RenderSettings
 from drgs.scene.asset import Asset
+from drgs.scene.posed_scene import PRIMARY_SURFACES
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class QualitySettings:
     """Test views of the parts that render pictures of their own."""
     swap_samples: int = 128
     """Rays a pixel of the pictures of swaps."""
-    swap_bounces: int = 3
+    swap_bounces: int = STILL_BOUNCES
     mesh_samples: int = COUNT
     """Points on each surface whose distance from the other is measured."""
 
@@ -87,7 +89,8 @@ class Measurement:
         folder = self.work / "renders" / "test"
         missing = [camera for camera in self.scene.cameras if not (folder / f"{camera.name}.png").is_file()]
         if missing:
-            render_cameras(self.posed, missing, folder, RenderSettings(samples_per_pixel=self.settings.samples_per_pixel))
+            settings = RenderSettings(samples_per_pixel=self.settings.samples_per_pixel, bounces=STILL_BOUNCES)
+            render_cameras(self.posed, missing, folder, settings)
         return folder
 
     def mesh(self) -> dict:
@@ -123,13 +126,13 @@ class Measurement:
     def primary(self) -> dict:
         if self.posed.surfels is None:
             raise LeftOutError("the asset has no Gaussians")
-        settings = RenderSettings(samples_per_pixel=self.settings.samples_per_pixel, primary="mesh")
-        folder = self.work / "renders" / "mesh_primary"
-        render_cameras(self.posed, [c for c in self.few if not (folder / f"{c.name}.png").is_file()], folder, settings)
         truth = self.scene.folder / "test"
         psnr = {}
-        for name, rendered in (("gaussians", self.test_renders()), ("mesh", folder)):
-            pairs = [(read_rgba(rendered / f"{c.name}.png"), read_rgba(truth / f"{c.name}.png")) for c in self.few]
+        for name in PRIMARY_SURFACES:
+            settings = RenderSettings(samples_per_pixel=self.settings.samples_per_pixel, bounces=STILL_BOUNCES, primary=name)
+            folder = self.work / "renders" / f"{name}_primary"
+            render_cameras(self.posed, [c for c in self.few if not (folder / f"{c.name}.png").is_file()], folder, settings)
+            pairs = [(read_rgba(folder / f"{c.name}.png"), read_rgba(truth / f"{c.name}.png")) for c in self.few]
             psnr[name] = picture_figures(pairs)["psnr"]
         return {"views": len(self.few), "psnr": psnr, "gaussians_minus_mesh": psnr["gaussians"] - psnr["mesh"]}
 

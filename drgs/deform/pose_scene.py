@@ -85,7 +85,7 @@ def pose_scene(
     for name in light.files:
         environment = _environment(asset, name, files, environments)
     horizons = None if by_kind.shape.count else asset.horizons
-    return PosedScene(surfels, mesh, environment, light.rotation_degrees, light.intensity, horizons)
+    return PosedScene(surfels, mesh, environment, light.rotation_degrees, light.intensity, horizons, asset.primary)
 
 
 def simulation_bytes(asset: Asset) -> int:

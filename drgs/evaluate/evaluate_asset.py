@@ -13,6 +13,7 @@ from pathlib import Path
 from drgs.convert.export_asset import export_asset
 from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.metrics import score_renders, truth_folders
+from drgs.maths.constants import STILL_BOUNCES
 from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
@@ -24,6 +25,7 @@ from drgs.scene.edits import Edit, parse_edits
 @dataclass(frozen=True)
 class EvaluationSettings:
     samples_per_pixel: int = 256
+    bounces: int = STILL_BOUNCES
     seed: int = 0
 
 
@@ -57,9 +59,7 @@ def _render_all(
     asset: Asset, capture: Path, renders: Path, cameras: list[Camera], settings: EvaluationSettings, done: Callable[[str], None]
 ) -> None:
     """Write the test, relight and deform folders and the recovered light."""
-    render_settings = RenderSettings(
-        samples_per_pixel=settings.samples_per_pixel, primary="mesh" if asset.gaussians is None else "gaussians", seed=settings.seed
-    )
+    render_settings = RenderSettings(samples_per_pixel=settings.samples_per_pixel, bounces=settings.bounces, seed=settings.seed)
 
     def render(folder: Path, edits: list[Edit], aov: bool = False) -> None:
         """The cameras that have a truth picture in the capture's folder of the same name."""

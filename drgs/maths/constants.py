@@ -28,6 +28,9 @@ SRGB_GAMMA = 2.4
 MIDDLE_GREY = 0.18
 """Linear reflectance of a grey card: what thumbnails are exposed for, and their ground."""
 
+STILL_BOUNCES = 4
+"""Indirect bounces of pictures that are waited for (drgs render, drgs eval, stills and render jobs); live frames have one."""
+
 # How surfels cover what lies behind them (drgs/render/visible/rasterize, drgs/render/intersect/tracer_surfels).
 MIN_ALPHA = 1.0 / 255.0
 """Opacity below which a surfel counts as absent: the least that an 8-bit picture can show."""

@@ -4,28 +4,35 @@ Reads like the method: each step is a function of its own file, each stage with 
 """
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from jaxtyping import UInt8
+from torch import Tensor
 
 from drgs.exchange.photographs import encode_photographs
 from drgs.reconstruct.capture.find_masks import with_drawn_masks
-from drgs.reconstruct.capture.initial_points import initial_points
+from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_gaussians import FitSettings, gaussians_from_state
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.fit_materials import MaterialSettings, gaussians_from_materials
+from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings, gaussians_from_mesh_fit
+from drgs.reconstruct.fit.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.surface_passes import PASS_MESH, PassSettings
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
 from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, FULL_MESH, MeshSettings, mesh_report
+from drgs.reconstruct.geometry.face_surfels import radiating_surfels, surfels_on_faces_of
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
+from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.progress import STAGE_SHARES, Progress
 from drgs.reconstruct.report_progress import BuildReporter
 from drgs.reconstruct.stages import (
@@ -36,18 +43,20 @@ from drgs.reconstruct.stages import (
     fit_stage,
     forget_checkpoints,
     masks_stage,
-    materials_stage,
+    mesh_materials_stage,
     mesh_stage,
     points_of_found_masks,
     stage_two_preview,
+    surface_preview,
+    surface_stage,
+    surfel_materials_stage,
 )
 from drgs.render.intersect.horizon import find_horizons, stored_horizons
 from drgs.render.intersect.tracer import mesh_extent
 from drgs.render.records import SampleCounts
 from drgs.scene.asset import Asset, save_asset
-from drgs.scene.binding import Binding
-from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
+from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 from drgs.warp_torch import device_from_name
@@ -60,7 +69,7 @@ class BuildSettings:
     preset: str = "fast"
     """draft, fast or full."""
     binding: str = "particles"
-    """particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face."""
+    """particles: surfels lie on the surface as it was fitted. mesh: those on its faces are fitted to the photographs once more."""
     device: str = "auto"
     """auto, cpu or cuda."""
     seed: int = 0
@@ -78,9 +87,14 @@ class Preset:
     """Photos are reduced to at most this [pixels]."""
     fit: FitSettings
     mesh: MeshSettings
-    materials: MaterialSettings
+    surface: PassSettings = field(default_factory=PassSettings)
+    materials: MeshMaterialSettings = field(default_factory=MeshMaterialSettings)
     mesh_surfels: MeshFitSettings = field(default_factory=MeshFitSettings)
-    """For binding mesh: its fine-tuning. There the mesh has as many faces at most as surfels are allowed (fit.densify.budget)."""
+    """For binding mesh: its fine-tuning."""
+    materials_on: Literal["mesh", "surfels"] = "mesh"
+    """surfels: the mesh stays as it was extracted, and materials are fitted on surfels, as in the paper; then `surface` and `materials` are idle."""
+    surfel_materials: MaterialSettings = field(default_factory=MaterialSettings)
+    """Of materials_on surfels. Bound to the mesh, that one has as many faces at most as surfels are allowed (fit.densify.budget)."""
 
 
 BINDINGS = tuple(STAGE_SHARES)
@@ -90,24 +104,30 @@ PRESETS = {
         256,
         FitSettings(iterations=400, half_size_share=0.6, densify=DensifySettings(budget=12_000)),
         replace(FAST_MESH, resolution=160, face_limit=30_000),
-        MaterialSettings(iterations=80, points_a_step=512),
+        PassSettings(3, SurfaceSettings(rounds=1, steps_a_round=50), replace(PASS_MESH, resolution=120, face_limit=30_000)),
+        MeshMaterialSettings(iterations=80, points_a_step=1024),
         MeshFitSettings(iterations=150),
+        surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
     ),
     "fast": Preset(
         15_000,
         512,
-        FitSettings(iterations=1400, densify=DensifySettings(budget=30_000)),
+        FitSettings(iterations=1000, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
-        MaterialSettings(iterations=300),
+        PassSettings(5),
+        MeshMaterialSettings(iterations=200),
         MeshFitSettings(iterations=300),
+        surfel_materials=MaterialSettings(iterations=300),
     ),
     "full": Preset(
         25_000,
         1024,
         FitSettings(iterations=2500, half_size_share=0.25, densify=DensifySettings(budget=40_000)),
         FULL_MESH,
-        MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
+        PassSettings(20, mesh=replace(PASS_MESH, resolution=256, face_limit=100_000)),
+        MeshMaterialSettings(iterations=1000),
         MeshFitSettings(iterations=500),
+        surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
     ),
 }
 
@@ -149,7 +169,6 @@ def build_stages(
     preset = PRESETS[settings.preset]
     device = device_from_name(settings.device)
     seconds: dict[str, float] = {}
-    on_mesh = settings.binding == "mesh"
     reporter = BuildReporter(progress, STAGE_SHARES[settings.binding])
 
     @contextmanager
@@ -186,33 +205,110 @@ def build_stages(
     if place.should_stop():
         raise BuildStopped
 
-    light, binding = fit.parameters, None
-    if on_mesh:
+    built = _Built(place, views, points, preset, settings, fit, gaussians, mesh, timed)
+    asset, thumbnail = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
+    provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
+    asset = replace(asset, provenance=provenance, cameras=views.cameras)
+    save_asset(asset, out, thumbnail, kept_photographs(photographs))
+    reporter.report("pack", 1.0, "done")
+    yield "pack", asset
+
+
+@dataclass(frozen=True, eq=False)
+class _Built:
+    """What the stages up to `mesh` gave, and what those after it need."""
+
+    place: Workplace
+    views: Views
+    points: InitialPoints
+    preset: Preset
+    settings: BuildSettings
+    fit: FitState
+    gaussians: Gaussians
+    mesh: TriangleMesh
+    """As it was extracted."""
+    timed: Callable[[str], AbstractContextManager[None]]
+
+    @property
+    def radius(self) -> float:
+        """Of the object's bounding sphere [world units]."""
+        return self.points.bounds_radius
+
+    @property
+    def materials_preset(self) -> Preset:
+        """By which material and light are separated."""
+        return self.preset if self.settings.materials is None else PRESETS[self.settings.materials]
+
+    def materials_place(self, place: Workplace) -> Workplace:
+        """`place` for the stage `materials`."""
+        return place if self.settings.materials is None else place.of(materials=self.settings.materials)
+
+
+def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, bytes]]:
+    """The mesh becomes the surface that the photographs show, its materials are fitted on it, and surfels are laid on its faces."""
+    place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
+    with timed("surface"):
+        passes = built.preset.surface
+        passes = replace(passes, surface=replace(passes.surface, seed=seed))
+        surface = surface_stage(place, views, built.gaussians, built.mesh, built.fit.parameters, built.radius, passes)
+    yield "surface", None
+
+    surfels, binding = surfels_on_faces_of(surface.mesh)
+    if built.settings.binding == "mesh":
+        with timed("bind"):
+            bind_settings = replace(built.preset.mesh_surfels, seed=seed)
+            bound = bind_stage(
+                place.of(binding="mesh"), views, (surfels, binding), surface.mesh, surface.state.parameters, built.radius, bind_settings
+            )
+            surfels, binding = gaussians_from_mesh_fit(bound)
+        yield "bind", None
+
+    with timed("materials"):
+        materials_settings = replace(built.materials_preset.materials, seed=seed)
+        decoupled = mesh_materials_stage(built.materials_place(place), views, surface, built.radius, materials_settings)
+    yield "materials", None
+
+    with timed("pack"):
+        place.reporter.report("pack", 0.0, "writing the asset")
+        mesh, environment = decoupled.mesh, Environment(environment_table(decoupled.state.parameters).detach())
+        surfels = radiating_surfels(surfels, binding, mesh, environment)
+        asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh")
+    return asset, surface_preview(decoupled, views.cameras)
+
+
+def _on_surfels(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, bytes]]:
+    """The paper's way: materials of the surfels, by rays from where they lie; the mesh takes them over."""
+    place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
+    gaussians, mesh, light, binding = built.gaussians, built.mesh, built.fit.parameters, None
+    yield "surface", None
+    if built.settings.binding == "mesh":
         with timed("bind"):
             place = place.of(binding="mesh")
-            mesh = reduced_mesh(mesh, preset.fit.densify.budget, points.bounds_radius)
-            bind_settings = replace(preset.mesh_surfels, seed=settings.seed)
-            bound = bind_stage(place, views, gaussians, mesh, fit, points.bounds_radius, bind_settings)
+            mesh = reduced_mesh(mesh, built.preset.fit.densify.budget, built.radius)
+            bind_settings = replace(built.preset.mesh_surfels, seed=seed)
+            bound = bind_stage(place, views, mesh_surfels(gaussians, mesh), mesh, light, built.radius, bind_settings)
             gaussians, binding = gaussians_from_mesh_fit(bound)
-            seen = seen_surfels(gaussians, views.cameras, points.bounds_radius)
+            seen = seen_surfels(gaussians, views.cameras, built.radius)
             gaussians, binding, light = chosen_surfels(gaussians, seen), chosen_surfels(binding, seen), bound.fit.parameters
         yield "bind", None
 
     with timed("materials"):
-        material_settings = replace(PRESETS[settings.materials or settings.preset].materials, seed=settings.seed)
-        if settings.materials is not None:
-            place = place.of(materials=settings.materials)
-        materials = materials_stage(place, views, gaussians, light, mesh, points.bounds_radius, material_settings)
+        material_settings = replace(built.materials_preset.surfel_materials, seed=seed)
+        materials = surfel_materials_stage(built.materials_place(place), views, gaussians, light, mesh, built.radius, material_settings)
     yield "materials", None
 
     with timed("pack"):
-        reporter.report("pack", 0.0, "baking materials and writing the asset")
-        origin = {"source": views.source, "dataset": dataset.name}
-        asset = _packed(materials, mesh, binding, views.cameras, origin | _provenance(settings, device, mesh, seconds))
-    thumbnail = stage_two_preview(materials.parameters, views.cameras, points.bounds_radius)
-    save_asset(asset, out, thumbnail, kept_photographs(photographs))
-    reporter.report("pack", 1.0, "done")
-    yield "pack", asset
+        place.reporter.report("pack", 0.0, "baking materials and writing the asset")
+        gaussians = gaussians_from_materials(materials)
+        baked = bake_materials(mesh, gaussians)
+        bound_to = bind_gaussians(gaussians.centers, baked) if binding is None else binding  # where they were fitted, or on their faces
+        environment = Environment(environment_table(materials.parameters).detach())
+        asset = Asset(gaussians, baked, bound_to, environment, horizons=_horizons(baked))
+    return asset, stage_two_preview(materials.parameters, views.cameras, built.radius)
+
+
+def _horizons(mesh: TriangleMesh) -> UInt8[Tensor, "face 8"]:
+    return stored_horizons(find_horizons(mesh, mesh_extent(mesh)[1]))
 
 
 def _check(settings: BuildSettings) -> None:
@@ -223,29 +319,13 @@ def _check(settings: BuildSettings) -> None:
         raise ValueError(f"binding {settings.binding!r} is unknown; expected one of {', '.join(BINDINGS)}")
 
 
-def _packed(
-    materials: FitState, mesh: TriangleMesh, binding: Binding | None, cameras: tuple[Camera, ...], provenance: dict[str, Any]
-) -> Asset:
-    """The asset of what the stages left. Without a binding, surfels are bound where they were fitted."""
-    gaussians = gaussians_from_materials(materials)
-    baked = bake_materials(mesh, gaussians)
-    return Asset(
-        gaussians=gaussians,
-        mesh=baked,
-        binding=bind_gaussians(gaussians.centers, baked) if binding is None else binding,
-        environment=Environment(environment_table(materials.parameters).detach()),
-        cameras=cameras,
-        provenance=provenance,
-        horizons=stored_horizons(find_horizons(baked, mesh_extent(baked)[1])),
-    )
-
-
 def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMesh, seconds: dict[str, float]) -> dict[str, Any]:
     """How the asset came about; `seconds` goes in as it is, for packing takes its own."""
     return {
         "preset": settings.preset,
         "binding": settings.binding,
         "materials": settings.materials or settings.preset,
+        "materials_on": PRESETS[settings.preset].materials_on,
         "seed": settings.seed,
         "device": str(device),
         "torch": torch.__version__,

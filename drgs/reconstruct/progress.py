@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 STAGE_SHARES = {
-    "particles": {"read": 0.02, "fit": 0.62, "mesh": 0.04, "materials": 0.3, "pack": 0.02},
-    "mesh": {"read": 0.02, "fit": 0.53, "mesh": 0.04, "bind": 0.12, "materials": 0.27, "pack": 0.02},
+    "particles": {"read": 0.02, "fit": 0.35, "mesh": 0.03, "surface": 0.33, "materials": 0.25, "pack": 0.02},
+    "mesh": {"read": 0.02, "fit": 0.31, "mesh": 0.03, "surface": 0.3, "bind": 0.1, "materials": 0.22, "pack": 0.02},
 }
 """The stages of a build with each binding, in their order, and their shares of its time, for the progress bar."""
 

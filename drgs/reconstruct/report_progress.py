@@ -15,6 +15,8 @@ from drgs.reconstruct.progress import Progress
 PREVIEW_SECONDS = 3.0
 """Between preview pictures."""
 CHECKPOINT_SECONDS = 30.0
+REPORT_SECONDS = 0.2
+"""Between reports of steps."""
 
 
 class BuildReporter:
@@ -39,7 +41,9 @@ class BuildReporter:
         if checkpoint is not None and now - self.last_checkpoint > CHECKPOINT_SECONDS:
             checkpoint()
             self.last_checkpoint = now
-        if self.progress is None or (report is not None and report.iteration < report.iterations and now - self.last_report < 0.2):
+        if self.progress is None or (
+            report is not None and report.iteration < report.iterations and now - self.last_report < REPORT_SECONDS
+        ):
             return
         self.last_report = now
         jpeg = None

@@ -21,26 +21,33 @@ from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.fit_materials import MaterialSettings, fit_materials, start_materials
+from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings, fit_mesh_materials, start_mesh_materials
 from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings, MeshFitState, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
+from drgs.reconstruct.fit.fit_surface import start_surface
+from drgs.reconstruct.fit.mesh_light import corner_weights, hit_radiance
 from drgs.reconstruct.fit.render_stage_one import render_stage_one
 from drgs.reconstruct.fit.render_stage_two import render_stage_two
 from drgs.reconstruct.fit.split_sum import filter_environment
+from drgs.reconstruct.fit.surface_passes import PassSettings, SurfaceFit, fit_surface_in_passes
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen, mesh_from_gaussians
-from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.report_progress import BuildReporter, encode_preview
+from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.visible.rasterize.near_plane import near_plane
-from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.binding import Binding
+from drgs.scene.camera import Camera, pixel_rays_world, scaled_camera
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 
 MASKS = "masks.safetensors"
 """Of a capture that has none of its own."""
-FIT, MESH, MATERIALS = "stage1.safetensors", "mesh.safetensors", "stage2.safetensors"
-SURFELS_ON_MESH, MATERIALS_ON_MESH = "mesh_surfels.safetensors", "stage2_mesh.safetensors"
-CHECKPOINTS = (FIT, MESH, MATERIALS, SURFELS_ON_MESH, MATERIALS_ON_MESH)
-"""In the order of the stages, first those of either binding and of particles."""
+FIT, MESH, SURFACE, MATERIALS = "stage1.safetensors", "mesh.safetensors", "surface.safetensors", "stage2.safetensors"
+SURFELS_ON_MESH = "mesh_surfels.safetensors"
+"""With binding mesh."""
+SURFEL_MATERIALS, MATERIALS_OF_BOUND = "stage2_surfels.safetensors", "stage2_mesh.safetensors"
+"""Where materials are fitted on surfels (Preset.materials_on): of particles, and of surfels bound to faces."""
+CHECKPOINTS = (FIT, MESH, SURFACE, MATERIALS, SURFELS_ON_MESH, SURFEL_MATERIALS, MATERIALS_OF_BOUND)
 PREVIEW_SIDE = 256
 """[pixels]"""
 
@@ -150,11 +157,66 @@ def _geometry(tensors: dict[str, Tensor]) -> tuple[Gaussians, TriangleMesh]:
     return Gaussians(**fields_of(Gaussians)), TriangleMesh(**fields_of(TriangleMesh))
 
 
+def surface_stage(
+    place: Workplace,
+    views: Views,
+    gaussians: Gaussians,
+    mesh: TriangleMesh,
+    light: dict[str, Tensor],
+    radius: float,
+    settings: PassSettings,
+) -> SurfaceFit:
+    """fit_surface_in_passes; `light` are the parameters of stage 1."""
+    fit, path = SurfaceFit(start_surface(gaussians, mesh, light, settings.surface, radius), mesh.faces), place.folder / SURFACE
+    kept = _kept(place, path, mesh.vertices.device)
+    if kept is not None:
+        restore_fit(kept, fit.state)
+        fit.faces, fit.index = kept["faces"], int(kept["pass"])
+
+    def save() -> None:
+        write_tensors(path, fit_tensors(fit.state) | {"faces": fit.faces, "pass": torch.tensor(fit.index)}, place.identity)
+
+    def report(r: FitReport) -> None:
+        message = f"pass {fit.index + 1} of {settings.passes}, {len(fit.faces)} faces"
+        place.reporter.report("surface", r.iteration / r.iterations, message, r, lambda: surface_preview(fit, views.cameras), save)
+
+    done = fit_surface_in_passes(views, fit, settings, radius, report, place.should_stop)
+    save()
+    if not done:
+        raise BuildStopped
+    return fit
+
+
+def mesh_materials_stage(place: Workplace, views: Views, surface: SurfaceFit, radius: float, settings: MeshMaterialSettings) -> SurfaceFit:
+    """fit_mesh_materials on the surface as it was fitted."""
+    state = start_mesh_materials(surface.state, settings, radius)
+    fit = SurfaceFit(state, surface.faces, surface.index)
+    _checkpointed_fit(
+        place,
+        FitStage(
+            "materials",
+            MATERIALS,
+            state,
+            settings.iterations,
+            lambda report: fit_mesh_materials(views, surface.faces, state, settings, report, place.should_stop),
+            lambda _: "materials and light",
+            lambda: surface_preview(fit, views.cameras),
+        ),
+    )
+    return fit
+
+
 def bind_stage(
-    place: Workplace, views: Views, gaussians: Gaussians, mesh: TriangleMesh, fit: FitState, radius: float, settings: MeshFitSettings
+    place: Workplace,
+    views: Views,
+    surfels: tuple[Gaussians, Binding],
+    mesh: TriangleMesh,
+    light: dict[str, Tensor],
+    radius: float,
+    settings: MeshFitSettings,
 ) -> MeshFitState:
-    """mesh_surfels and fit_mesh_surfels; `fit` gives the light."""
-    state = start_mesh_fit(*mesh_surfels(gaussians, mesh), mesh, fit.parameters, settings)
+    """fit_mesh_surfels of surfels that sit on the mesh; `light` are the parameters of a fit before."""
+    state = start_mesh_fit(*surfels, mesh, light, settings)
     _checkpointed_fit(
         place,
         FitStage(
@@ -170,7 +232,7 @@ def bind_stage(
     return state
 
 
-def materials_stage(
+def surfel_materials_stage(
     place: Workplace,
     views: Views,
     gaussians: Gaussians,
@@ -188,7 +250,7 @@ def materials_stage(
         place,
         FitStage(
             "materials",
-            MATERIALS_ON_MESH if on_mesh else MATERIALS,
+            MATERIALS_OF_BOUND if on_mesh else SURFEL_MATERIALS,
             state,
             settings.iterations,
             lambda report: fit_materials(views, mesh, state, settings, radius, report, place.should_stop),
@@ -223,7 +285,7 @@ def _checkpointed_fit(place: Workplace, stage: FitStage) -> None:
         ValueError: there is a checkpoint, but it is damaged, or of another build or version.
     """
     state, path = stage.state, place.folder / stage.file
-    kept = _kept(place, path, state.parameters["opacity_logits"].device)
+    kept = _kept(place, path, state.parameters["albedo_logits"].device)
     if kept is not None:
         restore_fit(kept, state)
 
@@ -278,6 +340,22 @@ def stage_two_preview(parameters: dict[str, Tensor], cameras: tuple[Camera, ...]
         camera = preview_camera(cameras).to(parameters["centers"].device)
         maps = render_stage_two(parameters, camera, near_plane(radius))
         return encode_preview(maps.splat_radiance, maps.coverage)
+
+
+def surface_preview(fit: SurfaceFit, cameras: tuple[Camera, ...]) -> bytes:
+    """JPEG of the first view of the surface under its light, by split sum."""
+    with torch.no_grad():
+        mesh, parameters = fit.mesh, fit.state.parameters
+        camera = preview_camera(cameras).to(mesh.vertices.device)
+        origin, directions = pixel_rays_world(camera)
+        direction = directions.reshape(-1, 3)
+        hits = trace_rays(origin.expand_as(direction), direction, build_tracer(mesh))
+        met = hits.hit.nonzero().squeeze(1)
+        corners, weights = mesh.faces[hits.face[met].long()].long(), corner_weights(hits.barycentric[met])
+        tables = filter_environment(environment_table(parameters))
+        radiance = torch.zeros_like(direction)
+        radiance[met] = hit_radiance(mesh, corners, weights, -direction[met], parameters["open_share"], tables)
+        return encode_preview(radiance.reshape(directions.shape), hits.hit.float().reshape(directions.shape[:2]))
 
 
 def preview_camera(cameras: tuple[Camera, ...]) -> Camera:

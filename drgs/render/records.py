@@ -12,11 +12,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.scene.camera import Camera
-from drgs.scene.posed_scene import PosedScene
+from drgs.scene.posed_scene import PosedScene, PrimarySurface
 from drgs.scene.tone_curve import ToneCurve
 
-PrimarySurface = Literal["gaussians", "mesh"]
-"""What a camera sees."""
 DenoiseMethod = Literal["none", "svgf", "oidn"]
 
 # ---- what is asked for ---------------------------------------------------------------------------------------------------
@@ -50,7 +48,7 @@ class RenderSettings:
     split_indirect: bool = False
     """Sum the light that comes from other surfaces once more by itself (Radiance.indirect)."""
     primary: PrimarySurface | None = None
-    """What the camera sees; None: the Gaussians where the scene has any."""
+    """What the camera sees; None: what the scene prefers (PosedScene.primary)."""
     denoise: DenoiseMethod = "none"
     """Of what resolve_frame shows; the sums stay as they are."""
     target_error: float | None = None
@@ -96,7 +94,7 @@ class FrameInputs:
     @property
     def primary(self) -> PrimarySurface:
         """What the camera sees."""
-        return self.settings.primary or ("gaussians" if self.scene.surfels is not None else "mesh")
+        return self.settings.primary or self.scene.primary
 
 
 @dataclass(frozen=True)

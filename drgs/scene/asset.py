@@ -22,6 +22,7 @@ from drgs.scene.edits import LARGEST, SMALLEST
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
+from drgs.scene.posed_scene import PRIMARY_SURFACES, PrimarySurface
 
 SCHEMA_VERSION = 1
 """Of the asset folder; a reader refuses a larger one."""
@@ -57,6 +58,8 @@ class Asset:
     """Plain JSON: source, preset, seed, versions, seconds per stage, quality."""
     horizons: UInt8[Tensor, "face 8"] | None = None
     """How high the mesh rises around each of its faces (drgs.render.intersect.horizon.stored_horizons); None: found out while rendering."""
+    primary: PrimarySurface | None = None
+    """What cameras see unless they are told otherwise; None: the Gaussians where there are some."""
 
 
 def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = None, photographs_zip: bytes | None = None) -> None:
@@ -98,6 +101,7 @@ def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = No
         "schema_version": SCHEMA_VERSION,
         "meters_per_unit": asset.meters_per_unit,
         "conventions": CONVENTIONS,
+        **({} if asset.primary is None else {"primary": asset.primary}),
         "counts": {"surfels": surfels, "vertices": len(mesh.vertices), "faces": len(mesh.faces), "cameras": len(asset.cameras)},
         "provenance": asset.provenance,
     }
@@ -131,8 +135,11 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     meters, provenance = manifest.get("meters_per_unit"), manifest.get("provenance", {})
     if not isinstance(meters, float | int) or not SMALLEST <= meters <= LARGEST or not isinstance(provenance, dict):
         raise ValueError(f"{path}: asset.json has meters_per_unit {str(meters)[:40]}; expected {SMALLEST:g} to {LARGEST:g}")
+    primary = manifest.get("primary")
+    if primary is not None and primary not in PRIMARY_SURFACES:
+        raise ValueError(f"{path}: asset.json has primary {str(primary)[:40]!r}; expected {' or '.join(PRIMARY_SURFACES)}")
     environment = Environment(torch.from_numpy(radiance).to(device))
-    asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons)
+    asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons, primary)
     _check(asset, str(path))
     return asset
 
@@ -158,6 +165,8 @@ def _check(asset: Asset, name: str) -> None:
         raise ValueError(f"{name}: the mesh's vertex attributes differ in length ({vertices} vertices)")
     if asset.horizons is not None and asset.horizons.shape != (len(faces), 8):
         raise ValueError(f"{name}: the horizons are of {len(asset.horizons)} faces, there are {len(faces)}")
+    if asset.primary == "gaussians" and gaussians is None:
+        raise ValueError(f"{name}: its primary surface is gaussians, but it has none")
     if binding is not None:
         if gaussians is None or len(binding.face) != len(gaussians.centers):
             found = 0 if gaussians is None else len(gaussians.centers)

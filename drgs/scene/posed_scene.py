@@ -1,6 +1,7 @@
 """The scene after edits and deformation: what a frame is rendered from."""
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -8,6 +9,9 @@ from torch import Tensor
 from drgs.scene.environment import Environment
 from drgs.scene.materials import Materials
 from drgs.scene.mesh import TriangleMesh
+
+PrimarySurface = Literal["gaussians", "mesh"]
+PRIMARY_SURFACES: tuple[PrimarySurface, ...] = get_args(PrimarySurface)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,3 +38,10 @@ class PosedScene:
     environment_intensity: float = 1.0
     horizons: UInt8[Tensor, "face 8"] | None = None
     """The asset's, while its mesh is at rest."""
+    preferred: PrimarySurface | None = None
+    """The asset's `primary`."""
+
+    @property
+    def primary(self) -> PrimarySurface:
+        """What cameras see unless they are told otherwise."""
+        return self.preferred or ("mesh" if self.surfels is None else "gaussians")

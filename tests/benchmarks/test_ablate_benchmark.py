@@ -24,6 +24,8 @@ TINY = {
     "fit.densify.budget": 400,
     "mesh.resolution": 32,
     "mesh.face_limit": 500,
+    "surface.passes": 1,
+    "surface.surface.steps_a_round": 2,
     "materials.iterations": 2,
     "materials.points_a_step": 32,
 }
@@ -33,7 +35,11 @@ def test_overrides_reach_nested_settings_and_nothing_else() -> None:
     fast = PRESETS["fast"]
     changed = apply_overrides(fast, {"fit.densify.budget": 60_000, "materials.samples.cosine": 128, "fit.rates.centers": 1})
     assert (changed.fit.densify.budget, changed.materials.samples.cosine, changed.fit.rates.centers) == (60_000, 128, 1.0)
-    back = {"fit.densify.budget": fast.fit.densify.budget, "materials.samples.cosine": 64, "fit.rates.centers": fast.fit.rates.centers}
+    back = {
+        "fit.densify.budget": fast.fit.densify.budget,
+        "materials.samples.cosine": fast.materials.samples.cosine,
+        "fit.rates.centers": fast.fit.rates.centers,
+    }
     assert apply_overrides(changed, back) == fast
     assert apply_overrides(fast, {"mesh.voxel_size": 0.01}).mesh.voxel_size == 0.01  # None before
 
@@ -43,11 +49,11 @@ def test_overrides_reach_nested_settings_and_nothing_else() -> None:
     [
         ("fit.densify.budgets", 1, "DensifySettings has no 'budgets'; it has every, start, stop"),
         ("fits.iterations", 1, "Preset has no 'fits'; it has points, image_side, fit"),
-        ("fit.iterations", "many", "'many' is no int; now it is 1400"),
+        ("fit.iterations", "many", f"'many' is no int; now it is {PRESETS['fast'].fit.iterations}"),
         ("fit.iterations", 1.5, "1.5 is no int"),
         ("fit.iterations", True, "True is no int"),
         ("fit.densify", 3, "is a DensifySettings; expected a path into it: fit.densify.every"),
-        ("fit.iterations.half", 3, "iterations is 1400, a value"),
+        ("fit.iterations.half", 3, f"iterations is {PRESETS['fast'].fit.iterations}, a value"),
     ],
 )
 def test_a_wrong_override_is_one_sentence(path: str, value: object, sentence: str) -> None:

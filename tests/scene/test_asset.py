@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from drgs.deform.pose_scene import pose_scene
 from drgs.scene.asset import Asset, load_asset, save_asset
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, camera_from_opengl
@@ -61,6 +62,23 @@ def test_horizons_of_another_mesh_are_refused(tmp_path):
     asset = replace(small_asset(), horizons=torch.zeros(5, 8, dtype=torch.uint8))
     with pytest.raises(ValueError, match="the horizons are of 5 faces, there are 4"):
         save_asset(asset, tmp_path / "a")
+
+
+def test_what_cameras_see_is_kept_and_decides_what_a_scene_shows(tmp_path):
+    asset = small_asset()
+    assert load_asset(saved(asset, tmp_path / "older")).primary is None and pose_scene(asset, []).primary == "gaussians"
+    for primary in ("gaussians", "mesh"):
+        chosen = replace(asset, primary=primary)
+        assert load_asset(saved(chosen, tmp_path / primary)).primary == primary and pose_scene(chosen, []).primary == primary
+    imported = replace(asset, gaussians=None, binding=None)
+    assert pose_scene(imported, []).primary == "mesh"
+    with pytest.raises(ValueError, match="its primary surface is gaussians, but it has none"):
+        save_asset(replace(imported, primary="gaussians"), tmp_path / "none")
+
+
+def saved(asset: Asset, path):
+    save_asset(asset, path)
+    return path
 
 
 def test_an_asset_without_gaussians_and_cameras_survives_saving_and_loading(tmp_path):
@@ -155,6 +173,7 @@ def flip_a_byte(file):
         (lambda a: (a / "asset.json").write_text('{"schema_version": 1,'), r"asset\.json is damaged"),
         (lambda a: edit_manifest(a, schema_version=2), "written by a newer drgs"),
         (lambda a: edit_manifest(a, schema_version="1"), "schema version '1'"),
+        (lambda a: edit_manifest(a, primary="voxels"), "primary 'voxels'; expected gaussians or mesh"),
         (lambda a: edit_manifest(a, files={"../mesh.glb": {}}), "expected plain file names"),
         (lambda a: edit_manifest(a, files={}), r"does not list mesh\.glb"),
         (lambda a: edit_manifest(a, meters_per_unit=-1), "meters_per_unit -1"),

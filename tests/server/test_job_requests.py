@@ -34,7 +34,7 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     assert service.client.get("/api/jobs").json()["jobs"] == infos[::-1]
     assert (infos[2]["name"], infos[3]["name"], infos[3]["priority"]) == ("fall", "ball", 3)
     steps = {info["kind"]: jobs._RUNS[info["kind"]](jobs._job_context(info["id"])).steps for info in infos}
-    assert steps["build"] == ("read", "fit", "mesh", "materials", "pack", "register")
+    assert steps["build"] == ("read", "fit", "mesh", "surface", "materials", "pack", "register")
     assert steps["redecouple"] == ("copy", *steps["build"])
     assert (steps["simulate"], steps["export"]) == (("simulate",), ("export glb", "export ply"))
     assert steps["render"] == ("render asset ",)
@@ -42,7 +42,7 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     service.add_asset(meshed["id"], "meshed")
     again = service.client.post("/api/jobs", json={"kind": "redecouple", "asset": meshed["id"]}).json()
     found = [jobs._RUNS[info["kind"]](jobs._job_context(info["id"])).steps for info in (meshed, again)]
-    assert found[0] == ("read", "fit", "mesh", "bind", "materials", "pack", "register") and found[1] == ("copy", *found[0])
+    assert found[0] == ("read", "fit", "mesh", "surface", "bind", "materials", "pack", "register") and found[1] == ("copy", *found[0])
     redecoupled = jobs._job_context(infos[1]["id"])
     assert redecoupled.parameters["built_preset"] == "draft" and redecoupled.dataset == service.settings.sample_capture.resolve()
 

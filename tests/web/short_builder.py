@@ -18,6 +18,7 @@ def build(request: BuildRequest, tell: Tell, should_stop: Callable[[], bool]) ->
 
     draft = PRESETS["draft"]
     fit = replace(draft.fit, iterations=FIT_ITERATIONS)
+    passes = replace(draft.surface, passes=1, surface=replace(draft.surface.surface, steps_a_round=MATERIAL_ITERATIONS))
     materials = replace(draft.materials, iterations=MATERIAL_ITERATIONS)
-    with patch.dict(PRESETS, draft=replace(draft, fit=fit, materials=materials)):
+    with patch.dict(PRESETS, draft=replace(draft, fit=fit, surface=passes, materials=materials)):
         yield from build_with_drgs(request, tell, should_stop)

@@ -298,7 +298,7 @@ def test_an_upload_of_one_machine_is_built_by_a_worker_of_another_and_waits_for_
         assert (artifacts.fetch_asset(machines.first, job) / "asset.json").is_file()
         artifacts.refresh_job(machines.first, job)
         log = machines.first.job_log(job).read_text()
-        assert log.count("finished") == 6 and bench.row(job).attempts == 1
+        assert log.count("finished") == 7 and bench.row(job).attempts == 1
         assert machines.first.preview(job).read_bytes() == b"\xff\xd8tiny"
         assert not (machines.second.job(job) / "asset").exists()
     finally:

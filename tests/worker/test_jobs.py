@@ -112,9 +112,13 @@ def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:
     assert (row.asset_id, row.fraction, row.attempts, row.error) == (job, 1.0, 1, None)
     assert row.preview_version == 3 and bench.directory.preview(job).read_bytes() == b"\xff\xd8tiny"
     assert (bench.directory.asset(job) / "asset.json").exists()
-    assert {path.name for path in (bench.directory.job(job) / "asset.build").iterdir()} == {"stage1.safetensors", "mesh.safetensors"}
+    assert {path.name for path in (bench.directory.job(job) / "asset.build").iterdir()} == {
+        "stage1.safetensors",
+        "mesh.safetensors",
+        "surface.safetensors",
+    }
     log = bench.directory.job_log(job).read_text()
-    assert [line.split()[1] for line in log.splitlines()[::2]] == ["read:", "fit:", "mesh:", "materials:", "pack:", "register:"]
+    assert [line.split()[1] for line in log.splitlines()[::2]] == ["read:", "fit:", "mesh:", "surface:", "materials:", "pack:", "register:"]
 
 
 @pytest.mark.slow
@@ -148,12 +152,12 @@ def test_kill_9_in_any_stage_repeats_no_finished_one_and_gives_the_same_asset(be
     bench.wait_for(job, "done")
     begun = [name for name, what in bench.stages_run(job) if what == "begins"]
     assert begun.count("read") == 3, begun  # every process reads the capture; nothing else that was finished is done again
-    for name in ("mesh", "materials", "pack"):
+    for name in ("mesh", "surface", "materials", "pack"):
         assert begun.count(name) == 1 + (name in killed_in), begun
     assert [iteration for _, iteration in bench.iterations_run(job)] == [0, 1]
     assert json.loads((bench.directory.asset(job) / "asset.json").read_text())["counts"]["faces"] == 20
     steps = [line.split(" ", 1)[1] for line in bench.directory.job_log(job).read_text().splitlines()]
-    for name in ("read", "fit", "mesh", "materials", "pack", "register"):
+    for name in ("read", "fit", "mesh", "surface", "materials", "pack", "register"):
         assert sum(step.startswith(f"{name}: started") for step in steps) == 1 + (name in killed_in), steps
         assert sum(step.startswith(f"{name}: finished") for step in steps) == 1, steps
 

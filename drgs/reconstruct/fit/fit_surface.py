@@ -164,8 +164,6 @@ class _Steps:
         self.outlines: list[MaskOutline | None] = mask_outlines(views) if views.has_masks else [None] * len(self.cameras)
         self.edges = mesh_edges(faces)
         self.tracer = build_tracer(mesh_from_surface_fit(state, faces))
-        if state.iteration == 0 and settings.rounds > 0:
-            self.move_surface()
 
     def end_round(self, done: int) -> None:
         if done % self.settings.steps_a_round == 0:
@@ -199,6 +197,8 @@ class _Steps:
             parameters["metal"].copy_(metal_evidence(self.tracer, self.targets, share, filter_environment(radiance), self.edges))
 
     def step(self, iteration: int) -> StepLoss:
+        if iteration == 0:
+            self.move_surface()
         target = self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
         parameters = self.state.parameters
         environment = environment_table(parameters)

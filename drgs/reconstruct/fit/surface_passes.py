@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
@@ -19,6 +20,9 @@ from drgs.reconstruct.geometry.remesh import remesh
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 
+PASS_MESH = MeshSettings(resolution=200, face_limit=60_000, smoothing_passes=0, keep_component_fraction=0.01)
+"""How fine the surface is meshed before a pass."""
+
 
 @dataclass(frozen=True)
 class PassSettings:
@@ -27,9 +31,24 @@ class PassSettings:
     passes: int = 7
     surface: SurfaceSettings = field(default_factory=lambda: SurfaceSettings(rounds=1, steps_a_round=80))
     """Of one pass; weights that change over a fit change over all passes."""
-    mesh: MeshSettings = field(
-        default_factory=lambda: MeshSettings(resolution=200, face_limit=60_000, smoothing_passes=0, keep_component_fraction=0.01)
-    )
+    mesh: MeshSettings = PASS_MESH
+
+
+@dataclass(eq=False)
+class SurfaceFit:
+    """The surface's fit between and within passes: everything to go on with."""
+
+    state: FitState
+    """Of the pass under way."""
+    faces: Int[Tensor, "face 3"]
+    """Of the state's vertices."""
+    index: int = 0
+    """Of the pass under way."""
+
+    @property
+    def mesh(self) -> TriangleMesh:
+        """As it is now."""
+        return mesh_from_surface_fit(self.state, self.faces)
 
 
 def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
@@ -51,45 +70,49 @@ def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
     )
 
 
-def remeshed_surface(state: FitState, faces: Tensor, settings: PassSettings, index: int, radius: float) -> tuple[FitState, Tensor]:
-    """The state that pass `index` starts from, and its faces (face, 3).
+def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> None:
+    """Mesh the surface anew and start the next pass on it.
 
     Args:
-        state: of the pass before, on `faces`. radius: of the object's bounding sphere [world units].
+        radius: of the object's bounding sphere [world units].
     """
-    new = remesh(state.parameters["vertices"].detach(), faces, settings.mesh)
+    new = remesh(fit.state.parameters["vertices"].detach(), fit.faces, settings.mesh)
     values = {}
-    for name, value in state.parameters.items():
+    for name, value in fit.state.parameters.items():
         if name.startswith("environment_"):
             values[name] = value.detach().clone()
         else:
             values[name] = new.vertices if name == "vertices" else new.carried(value.detach())
     values = leaves(values, frozen=("vertices", "open_share", "metal"))
-    own = settings_of_pass(settings, index)
-    return FitState(values, make_optimizer(values, own.rates, radius), torch.Generator().manual_seed(own.seed + 2)), new.faces
+    fit.index += 1
+    own = settings_of_pass(settings, fit.index)
+    fit.state = FitState(values, make_optimizer(values, own.rates, radius), torch.Generator().manual_seed(own.seed + 2))
+    fit.faces = new.faces
 
 
 def fit_surface_in_passes(
     views: Views,
-    mesh: TriangleMesh,
-    state: FitState,
+    fit: SurfaceFit,
     settings: PassSettings,
     radius: float,
-    report: Callable[[int, FitReport], None] | None = None,
-) -> tuple[FitState, Tensor]:
-    """All passes, the first on the mesh as it is; the last state and its faces.
+    report: Callable[[FitReport], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> bool:
+    """Run (or go on with) all passes; False: should_stop(), asked before each step, said so.
 
     Args:
-        state: start_surface, on mesh. report: is told the pass and how far its fit is.
+        fit: start_surface on the mesh as it was extracted, or what an earlier call left. report: is told of the steps of all passes.
     """
-    faces = mesh.faces
-    for index in range(settings.passes):
-        if index:
-            state, faces = remeshed_surface(state, faces, settings, index, radius)
+    steps = settings.surface.iterations
+    while True:
 
-        def tell(r: FitReport, index: int = index) -> None:
+        def tell(r: FitReport) -> None:
             if report is not None:
-                report(index, r)
+                report(replace(r, iteration=fit.index * steps + r.iteration, iterations=settings.passes * steps))
 
-        fit_surface(views, mesh_from_surface_fit(state, faces), state, settings_of_pass(settings, index), tell)
-    return state, faces
+        fit_surface(views, fit.mesh, fit.state, settings_of_pass(settings, fit.index), tell, should_stop)
+        if fit.state.iteration < steps:
+            return False
+        if fit.index + 1 >= settings.passes:
+            return True
+        start_next_pass(fit, settings, radius)

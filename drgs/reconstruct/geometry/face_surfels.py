@@ -1,6 +1,6 @@
 """Surfels on the faces of a mesh: one each, with the mesh's shading normal and materials, wide enough that together they close the surface.
 
-In: a mesh with materials. Out: Gaussians and their Binding; with a light, their outgoing radiance as harmonics. So the Gaussians are the surface that rays
+In: a mesh with materials. Out: Gaussians and their Binding; with a light, their materials and outgoing radiance as harmonics. So the Gaussians are the surface that rays
 meet, that is exported and that moves. (mesh_surfels is drgs2026's Alg. 1, which asks surfels fitted elsewhere.)
 """
 
@@ -50,7 +50,12 @@ def surfels_on_faces_of(mesh: TriangleMesh) -> tuple[Gaussians, Binding]:
     return gaussians, Binding(kept.int(), barycentric, torch.zeros(count, device=device))
 
 
-def radiating_surfels(mesh: TriangleMesh, environment: Environment) -> tuple[Gaussians, Binding]:
-    """surfels_on_faces_of, with the harmonics of what they send out under the environment, by split sum."""
-    gaussians, binding = surfels_on_faces_of(mesh)
-    return replace(gaussians, sh=bake_outgoing_radiance(gaussians, gaussians.sh, outward_normals(gaussians, mesh), environment)), binding
+def radiating_surfels(gaussians: Gaussians, binding: Binding, mesh: TriangleMesh, environment: Environment) -> Gaussians:
+    """Surfels that sit on the mesh, with its materials and the harmonics of what they send out under the environment, by split sum."""
+    corners = mesh.faces[binding.face.long()].long()
+    albedo, roughness, metallic = (
+        torch.einsum("sk,sk...->s...", binding.barycentric, values[corners]) for values in (mesh.albedo, mesh.roughness, mesh.metallic)
+    )
+    dressed = replace(gaussians, albedo=albedo, roughness=roughness, metallic=metallic)
+    nothing = torch.zeros_like(gaussians.sh)
+    return replace(dressed, sh=bake_outgoing_radiance(dressed, nothing, outward_normals(dressed, mesh), environment))

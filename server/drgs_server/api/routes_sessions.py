@@ -9,6 +9,7 @@ from fastapi.responses import FileResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drgs.exchange.export_formats import DownloadFormat
+from drgs.maths.constants import STILL_BOUNCES
 from drgs.scene.edits import EnvironmentEdit
 from drgs.scene.tone_curve import ToneCurve
 from drgs_server.api.answers import session_info, snapshot_info
@@ -154,7 +155,7 @@ class FrameQuery(BaseModel):
     width: Annotated[int, Field(ge=16, le=MAX_SIDE)] = 512
     height: Annotated[int, Field(ge=16, le=MAX_SIDE)] = 512
     spp: Annotated[int, Field(ge=1, le=65535)] = 128
-    bounces: Annotated[int, Field(ge=0, le=8)] = 1
+    bounces: Annotated[int, Field(ge=0, le=8)] = STILL_BOUNCES
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
     tone_curve: ToneCurve = "standard"
     background: Literal["environment", "blurred", "transparent"] = "environment"

@@ -178,8 +178,7 @@ class Pose(AbstractPose):
         seen = _camera(camera, width, height)
         if settings.channel == "surfels":
             return SurfelStill(self.scene, seen)
-        primary = "gaussians" if self.scene.surfels is not None else "mesh"
-        rendered = replace(_render_settings(settings), samples_per_pixel=_samples_wanted(settings, primary))
+        rendered = replace(_render_settings(settings), samples_per_pixel=_samples_wanted(settings, self.scene.primary))
         bands = render_bands(self._scene_of(settings), seen, rendered, self.tracer, SLICE_SECONDS)
         return Still(bands, height, width, settings, linear)
 

@@ -5,8 +5,8 @@ from itertools import pairwise
 import pytest
 import torch
 
-from drgs.reconstruct.fit.fit_surface import SurfaceSettings, mesh_from_surface_fit, start_surface
-from drgs.reconstruct.fit.surface_passes import PassSettings, fit_surface_in_passes, settings_of_pass
+from drgs.reconstruct.fit.fit_surface import SurfaceSettings, start_surface
+from drgs.reconstruct.fit.surface_passes import PassSettings, SurfaceFit, fit_surface_in_passes, settings_of_pass
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
 from tests.reconstruct.surfel_spheres import surfel_sphere
@@ -34,14 +34,10 @@ def test_a_sphere_that_is_too_small_is_as_large_as_its_photographs_after_two_pas
     surfels = surfel_sphere(600, radius=SHRUNK * SPHERE_RADIUS, center=tuple(CENTER.tolist()))
     start = placed_sphere(SHRUNK)
     told: list[int] = []
-    state, faces = fit_surface_in_passes(
-        painted_views(tmp_path),
-        start,
-        start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS),
-        settings,
-        SPHERE_RADIUS,
-        lambda index, _: told.append(index),
-    )
-    mesh = mesh_from_surface_fit(state, faces)
-    assert abs(float((mesh.vertices - CENTER).norm(dim=1).mean()) / SPHERE_RADIUS - 1) < 0.01
-    assert not torch.equal(faces, start.faces) and set(told) == {0, 1}
+    fit = SurfaceFit(start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS), start.faces)
+    views = painted_views(tmp_path)
+    assert not fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, should_stop=lambda: fit.state.iteration == 2)
+    assert (fit.index, fit.state.iteration) == (0, 2)
+    assert fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, lambda r: told.append(r.iteration))
+    assert abs(float((fit.mesh.vertices - CENTER).norm(dim=1).mean()) / SPHERE_RADIUS - 1) < 0.01
+    assert not torch.equal(fit.faces, start.faces) and told == list(range(3, 13))

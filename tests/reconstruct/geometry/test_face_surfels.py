@@ -53,6 +53,9 @@ def test_faces_without_area_get_none():
 
 
 def test_under_a_constant_sky_white_surfels_send_out_the_sky():
-    gaussians, _ = radiating_surfels(sphere_mesh(subdivisions=2, albedo=1.0, roughness=0.9), constant_sky(0.8, 128))
+    mesh = sphere_mesh(subdivisions=2, albedo=1.0, roughness=0.9)
+    grey, binding = surfels_on_faces_of(dataclasses.replace(mesh, albedo=torch.full_like(mesh.albedo, 0.5)))
+    gaussians = radiating_surfels(grey, binding, mesh, constant_sky(0.8, 128))
+    assert torch.allclose(gaussians.albedo, torch.ones_like(gaussians.albedo)) and torch.equal(gaussians.centers, grey.centers)
     towards = -torch.nn.functional.normalize(gaussians.centers, dim=-1)
     assert float((radiance_from_sh(gaussians.sh, towards) - 0.8).abs().max()) < 0.08

@@ -1,6 +1,6 @@
 /** The REST calls of the viewer, each once. Every failure is an ApiError whose message is a sentence for the user. */
 
-import type { DownloadFormat } from './constants.gen';
+import { STILL_BOUNCES, type DownloadFormat } from './constants.gen';
 import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest, TrainingViewList, WeightsInfo } from './protocol.gen';
 import type { View } from './view';
 
@@ -140,13 +140,16 @@ export const getSession = (id: string) => call<SessionInfo>('GET', `/api/session
 export const saveVersion = (session: string) => call<AssetInfo>('POST', `/api/sessions/${part(session)}/save`);
 export const appendEdit = (session: string, edit: Edit) => call<unknown>('POST', `/api/sessions/${part(session)}/edits`, { edit });
 
+/** Of pictures that are waited for: moving ones have one, which is left to them; another choice is the user's own. */
+export const stillBounces = (settings: Settings) => (settings.bounces === 1 ? STILL_BOUNCES : settings.bounces);
+
 /** Query of `frame.png` and its like for a camera. A background colour can only be streamed. */
 export function frameQuery(view: View, { width, height }: { width: number; height: number }, settings: Settings, transparent: boolean): string {
   const query = new URLSearchParams({
     width: String(width),
     height: String(height),
     spp: String(settings.spp_target),
-    bounces: String(settings.bounces),
+    bounces: String(stillBounces(settings)),
     exposure_stops: String(settings.exposure_stops),
     tone_curve: settings.tone_curve ?? 'standard',
     channel: settings.channel ?? 'final',

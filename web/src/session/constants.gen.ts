@@ -11,6 +11,7 @@ export const SRGB_SCALE = 1.055;
 export const SRGB_OFFSET = 0.055;
 export const SRGB_GAMMA = 2.4;
 export const MIDDLE_GREY = 0.18;
+export const STILL_BOUNCES = 4;
 
 export type DownloadFormat = "glb" | "ply" | "ply3" | "usd" | "env" | "zip";
 

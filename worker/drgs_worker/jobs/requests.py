@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drgs.exchange.export_formats import FILE_KINDS, DownloadFormat
+from drgs.maths.constants import STILL_BOUNCES
 from drgs.scene.edits import Coordinate, Edit, Triple
 from drgs.scene.tone_curve import ToneCurve
 from drgs_worker.store.user_names import UserName
@@ -175,7 +176,7 @@ class RenderRequest(_Job):
     width: Annotated[int, Field(ge=16, le=4096)] = 800
     height: Annotated[int, Field(ge=16, le=4096)] = 600
     spp: Annotated[int, Field(ge=1, le=65535)] = 256
-    bounces: Annotated[int, Field(ge=0, le=8)] = 1
+    bounces: Annotated[int, Field(ge=0, le=8)] = STILL_BOUNCES
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
     denoise: bool = True
     tone_curve: ToneCurve = "standard"

@@ -5,6 +5,7 @@ import { jobName, startJob } from '../../session/jobs';
 import { appliedEdits } from '../../session/edit_log';
 import { notify } from '../../session/notices';
 import type { RenderRequest } from '../../session/protocol.gen';
+import { stillBounces } from '../../session/api';
 import { session, settings } from '../../session/session';
 import { aimNow } from '../../session/view';
 import { asTransforms, pathFrames } from '../../stage/camera/camera_path';
@@ -34,7 +35,7 @@ async function renderFilm(what: string, way: Pick<RenderRequest, 'turntable' | '
     video_fps: FPS,
     ...SIZES[size.value],
     spp: Number(quality.value),
-    bounces: settings.value.bounces,
+    bounces: stillBounces(settings.value),
     exposure_stops: settings.value.exposure_stops,
     tone_curve: settings.value.tone_curve,
     background: Array.isArray(settings.value.background) ? 'transparent' : settings.value.background,

@@ -1,5 +1,6 @@
 /** What the picture shows, and how well. */
 
+import { STILL_BOUNCES } from '../../session/constants.gen';
 import { isAnalytic } from '../../edit/shape/deform_maps';
 import { edits } from '../../session/edit_log';
 import { assets } from '../../session/library';
@@ -68,7 +69,7 @@ export function ViewPanel() {
           options={['64', '256', '1024'].map((value) => ({ value, text: value }))}
           onChange={(value) => changeSettings({ spp_target: Number(value) })}
         />
-        <Choice label="Indirect bounces" value={String(bounces)} options={['0', '1', '2', '4'].map((value) => ({ value, text: value }))} onChange={(value) => changeSettings({ bounces: Number(value) })} />
+        <Choice label="Indirect bounces" value={String(bounces)} options={['0', '1', '2', '4'].map((value) => ({ value, text: value, title: value === '1' ? `Of moving pictures; saved ones and films then have ${STILL_BOUNCES}` : undefined }))} onChange={(value) => changeSettings({ bounces: Number(value) })} />
         <Switch label="Denoise" title="Filter what is left of the noise; fades as samples add up" value={denoise} onChange={(value) => changeSettings({ denoise: value })} />
         <Switch label="Instant local picture" title={titleFor('local', 'Draw the mesh in the browser while the traced picture is on its way')} value={localPicture.value} onChange={(value) => (localPicture.value = value)} />
       </Section>

@@ -13,8 +13,8 @@ from drgs_worker.store.artifacts import fetch_capture, refresh_job
 from drgs_worker.store.register_asset import register_asset
 
 KEPT_CHECKPOINTS = {
-    "particles": ("stage1.safetensors", "mesh.safetensors"),
-    "mesh": ("stage1.safetensors", "mesh.safetensors", "mesh_surfels.safetensors"),
+    "particles": ("stage1.safetensors", "mesh.safetensors", "surface.safetensors"),
+    "mesh": ("stage1.safetensors", "mesh.safetensors", "surface.safetensors", "mesh_surfels.safetensors"),
 }
 """Of a finished build of either binding: what a re-decoupling starts from."""
 
