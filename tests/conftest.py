@@ -29,8 +29,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     metafunc.parametrize("device", [asked] if asked else ["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
 
 
-HALF_WAY = "tests/web/test_par"
+HALF_WAY = "tests/web/test_s"
 """Tests of the browser before and behind this name take about equally long."""
+
+
+WAITING = ("tests/benchmarks/", "tests/worker/", "tests/server/")
+"""Folders whose tests wait for processes that they start about as long as they compute."""
 
 
 def is_in_browser(nodeid: str) -> bool:
@@ -38,19 +42,20 @@ def is_in_browser(nodeid: str) -> bool:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the browser's tests as slow; where two processes share the tests, they come first."""
+    """Mark the browser's tests as slow; where processes share the tests, those that wait come before those that compute."""
     for item in items:
         if is_in_browser(item.nodeid):
             item.add_marker(pytest.mark.slow)
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: not is_in_browser(item.nodeid))
+        items.sort(key=lambda item: (not is_in_browser(item.nodeid), not item.nodeid.startswith(WAITING)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """How `./run test` shares the tests out among three processes: file by file, those that use the browser in two lots.
+    """How `./run test` shares the tests out among four processes: file by file, those that use the browser in two lots.
 
-    One server and one Chromium serve a lot; the lots wait more than they compute, and the third process takes what is left meanwhile.
+    One server and one Chromium serve a lot. The lots wait more than they compute; the other two processes take what is left meanwhile, and
+    begin with what waits, too, so that at the end there are many small files that keep every core busy.
     """
     from xdist.scheduler import LoadScopeScheduling
 

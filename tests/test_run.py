@@ -42,6 +42,35 @@ def test_an_unknown_command_is_refused_with_those_there_are():
     assert "'nonsense'" in result.stderr and "setup, demo, test, lint, docs, bench or wheel" in result.stderr
 
 
+FAKE_PYTHON = """#!/bin/sh
+echo "$*" >>calls
+case "$*" in *"$FAILING"*) echo "a fault of $FAILING"; exit 3 ;; esac
+"""
+
+
+@posix
+@pytest.mark.parametrize("failing", ["nothing", "-m mypy", "--numprocesses"])
+def test_a_fault_of_lint_or_of_a_test_is_shown_and_fails_the_run(tmp_path: Path, failing: str):
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_speed.py").write_text("@pytest.mark.alone")
+    shutil.copy(ROOT / "run", tmp_path)
+    for name in ("pyproject.toml", "constraints.txt"):
+        (tmp_path / name).touch()
+    python = tmp_path / ".venv" / "bin" / "python"
+    python.write_text(FAKE_PYTHON)
+    python.chmod(0o755)
+    installed = subprocess.run(["cksum"], input=(ROOT / "run").read_bytes(), capture_output=True, check=True).stdout
+    (tmp_path / ".venv" / ".installed-dev").write_bytes(installed)
+    environment = os.environ | {"FAILING": failing}
+    result = subprocess.run([str(tmp_path / "run"), "test"], env=environment, capture_output=True, text=True, timeout=60)
+    called = (tmp_path / "calls").read_text()
+    assert "-m ruff check" in called and "--numprocesses" in called
+    assert (result.returncode == 0) == (failing == "nothing"), result.stderr
+    assert failing == "nothing" or f"a fault of {failing}" in result.stdout
+    assert ("-m pytest -m alone tests/test_speed.py" in called) == (failing == "nothing"), "time is measured when all the rest is well"
+
+
 def test_every_dependency_has_a_tested_version():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     name_of = lambda requirement: re.match(r"[\w.-]+", requirement)[0].lower().replace("_", "-")  # noqa: E731
