@@ -1,6 +1,7 @@
 """A server in this process, with a painter instead of a renderer and no worker."""
 
 import json
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,8 +13,10 @@ from starlette.testclient import TestClient
 from drgs_server.api.context import ServerContext
 from drgs_server.app import create_app
 from drgs_server.settings import ServerSettings
+from drgs_worker.jobs.file_tool import make_asset
 from drgs_worker.store.data_directory import read_token
 from drgs_worker.store.database import AssetRow, now
+from drgs_worker.store.register_asset import register_asset
 
 
 class Service:
@@ -38,6 +41,12 @@ class Service:
                 AssetRow(id=asset_id, name=name, created_at=now(), source="upload", bytes=10, surfel_count=0, vertex_count=8, face_count=12)
             )
         return asset_id
+
+    def add_mesh(self, source: Path) -> str:
+        """A real asset, as the upload of a mesh file makes it; in this process, since another would take two seconds to load what is here."""
+        asset_id = uuid.uuid4().hex
+        make_asset(source, self.context.directory.asset(asset_id))
+        return register_asset(self.context.directory, self.context.engine, asset_id, source.stem, "upload").id
 
     def open_session(self) -> str:
         response = self.client.post("/api/sessions", json={"asset": self.add_asset()})

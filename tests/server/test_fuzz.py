@@ -14,8 +14,6 @@ from test_stream import Talk, camera, material
 
 from drgs_server.live.messages import ClientMessage
 
-schemathesis = pytest.importorskip("schemathesis", reason="needs the package schemathesis: pip install -e '.[dev]'")
-
 QUIET = settings(
     deadline=None,
     database=None,
@@ -48,6 +46,8 @@ def send(service: Service, case: Any) -> Any:
 
 @pytest.mark.slow
 def test_no_request_that_the_openapi_document_allows_ends_in_a_server_error(service: Service) -> None:
+    # Here, and not above: it takes as long to import as all of the service, and processes that share the tests import every file.
+    schemathesis = pytest.importorskip("schemathesis", reason="needs the package schemathesis: pip install -e '.[dev]'")
     document = json.loads(json.dumps(service.app.openapi()))
     schema = schemathesis.openapi.from_dict(document)
     session = service.open_session()

@@ -13,9 +13,10 @@ from drgs.scene.asset import load_asset
 TETRAHEDRON = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
-def opened(service: Service) -> tuple[str, str]:
+def opened(service: Service, folder: Path) -> tuple[str, str]:
     """Ids of a real asset and of a session on it with one edit."""
-    asset = service.client.post("/api/assets", files={"file": ("four.obj", TETRAHEDRON)}).json()["id"]
+    (folder / "four.obj").write_bytes(TETRAHEDRON)
+    asset = service.add_mesh(folder / "four.obj")
     session = service.client.post("/api/sessions", json={"asset": asset}).json()["id"]
     edit = {"op": "material", "select": {"all": True}, "set": {"roughness": 0.25}}
     assert service.client.post(f"/api/sessions/{session}/edits", json={"edit": edit}).status_code == 200
@@ -24,7 +25,7 @@ def opened(service: Service) -> tuple[str, str]:
 
 @pytest.mark.slow
 def test_an_export_of_a_session_holds_its_edits_and_keeps_no_version(service: Service, tmp_path: Path) -> None:
-    asset, session = opened(service)
+    asset, session = opened(service, tmp_path)
     plain, edited = (service.client.get(f"/api/{which}/export?format=zip") for which in (f"assets/{asset}", f"sessions/{session}"))
     assert edited.status_code == 200, edited.text
     assert "four.zip" in edited.headers["content-disposition"]
@@ -67,8 +68,8 @@ def test_a_disk_that_is_full_while_something_comes_in_is_said_and_leaves_nothing
 
 
 @pytest.mark.slow
-def test_a_saved_session_is_a_new_version_with_its_edits_and_a_full_disk_leaves_all_as_it_was(service: Service) -> None:
-    asset, session = opened(service)
+def test_a_saved_session_is_a_new_version_with_its_edits_and_a_full_disk_leaves_all_as_it_was(service: Service, tmp_path: Path) -> None:
+    asset, session = opened(service, tmp_path)
     folder = service.context.directory.asset(asset)
     before = files_of(folder)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -51,8 +51,9 @@ def bench(tmp_path: Path) -> Iterator[PostgresBench]:
 
 @pytest.mark.slow
 def test_two_workers_share_the_jobs_and_one_takes_over_when_the_other_is_killed(bench: PostgresBench) -> None:
-    jobs = [bench.submit(iterations=12, seconds=0.4) for _ in range(3)]  # long enough for both workers to start
     workers = [bench.start_worker(), bench.start_worker()]
+    bench.wait(lambda: len(bench.queue.alive_workers()) == 2)
+    jobs = [bench.submit(iterations=12, seconds=0.2) for _ in range(3)]
     bench.wait(lambda: len({bench.row(job).worker_id for job in jobs[:2]} - {None}) == 2)
     for job in jobs[:2]:
         bench.wait(lambda job=job: bench.row(job).iteration >= 1)
