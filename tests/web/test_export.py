@@ -62,6 +62,22 @@ def test_a_picture_that_the_server_would_refuse_is_not_asked_for(ball: Viewer) -
     expect(ball.page.get_by_role("button", name="Render PNG")).to_be_enabled()
 
 
+def test_a_picture_that_takes_long_is_given_up_and_the_server_is_free_for_another(ball: Viewer, tmp_path: Path) -> None:
+    page = ball.page
+    page.get_by_role("radio", name="3840×2160").check()
+    page.get_by_role("radio", name="512", exact=True).check()
+    page.get_by_role("button", name="Render PNG").click()
+    page.get_by_role("button", name="Cancel", exact=True).click()
+    expect(page.get_by_role("button", name="Render PNG")).to_be_enabled()
+    assert page.locator(".notices").get_by_text("server").count() == 0
+    page.get_by_role("radio", name="32", exact=True).check()
+    enter(page, "Width", "64")
+    enter(page, "Height", "64")
+    downloaded(ball, "button", "Render PNG", tmp_path / "small.png")
+    page.get_by_role("radio", name="Window").check()
+    page.get_by_role("radio", name="128", exact=True).check()
+
+
 def test_what_was_made_gold_is_exported_as_gold_or_as_captured(ball: Viewer, tmp_path: Path) -> None:
     ball.open_tab("Material")
     ball.page.get_by_role("button", name="Gold").click()

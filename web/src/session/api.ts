@@ -166,19 +166,19 @@ export const capturedPicture = async (session: string, query: string) => (await 
 
 export type StillFormat = 'png' | 'exr';
 
-export const stillPicture = async (session: string, query: string, format: StillFormat) => (await file(`/api/sessions/${part(session)}/frame.${format}?${query}`)).blob();
+export const stillPicture = async (session: string, query: string, format: StillFormat, leaving: AbortSignal) => (await file(`/api/sessions/${part(session)}/frame.${format}?${query}`, leaving)).blob();
 
-/** A file that the server writes on request, with the name that it gives it. */
-export async function exportedFile(address: string): Promise<{ content: Blob; name: string }> {
-  const response = await file(address);
+/** A file that the server writes on request, with the name that it gives it; it stops when the page leaves. */
+export async function exportedFile(address: string, leaving: AbortSignal): Promise<{ content: Blob; name: string }> {
+  const response = await file(address, leaving);
   const said = response.headers.get('Content-Disposition') ?? '';
   const name = /filename\*=utf-8''([^;]+)/i.exec(said)?.[1] ?? /filename="([^"]+)"/.exec(said)?.[1] ?? 'asset';
   return { content: await response.blob(), name: decodeURIComponent(name) };
 }
 
-async function file(address: string): Promise<Response> {
-  const response = await fetch(address).catch(() => {
-    throw new ApiError(0, UNREACHABLE);
+async function file(address: string, leaving?: AbortSignal): Promise<Response> {
+  const response = await fetch(address, { signal: leaving }).catch((error: unknown) => {
+    throw leaving?.aborted ? error : new ApiError(0, UNREACHABLE);
   });
   if (!response.ok) throw new ApiError(response.status, sentenceFor(response.status, await response.text()));
   return response;

@@ -21,12 +21,13 @@ export function dismiss(id: number): void {
   notices.value = notices.value.filter((notice) => notice.id !== id);
 }
 
-/** Run something that may fail; a failure becomes a notice, and the answer is null. */
+/** Run something that may fail; a failure becomes a notice, and the answer is null. What the user gave up has no notice. */
 export async function attempt<T>(work: Promise<T>): Promise<T | null> {
   try {
     return await work;
   } catch (error) {
-    notify(error instanceof Error ? error.message : String(error));
+    const givenUp = error instanceof DOMException && error.name === 'AbortError';
+    if (!givenUp) notify(error instanceof Error ? error.message : String(error));
     return null;
   }
 }

@@ -3,6 +3,7 @@
 import { batch, computed, signal } from '@preact/signals';
 import * as api from './api';
 import { attachStream, editsToRestore, forgetUnsent, receiveAccepted, receiveChange, receiveLog, receiveRejected, resetLog, sendSplice } from './edit_log';
+import { noteWaiting } from './long_change';
 import { attempt, notify } from './notices';
 import type { EditLog, FrameHeader, PickedMessage, ServerHello, SessionInfo, Settings, StatusMessage } from './protocol.gen';
 import { Stream, type Connection, type StreamEvents } from './stream';
@@ -36,6 +37,9 @@ export function listen(onHello: HelloListener, onFrame: FrameListener): void {
 
 const storageKey = (asset: string) => `drgs.session.${asset}`;
 
+/** Have the server give up the change that it is computing. */
+export const cancelChange = () => stream?.cancelChange();
+
 /** Open an asset in the session that this browser last had on it, else in a new one. */
 export async function openAsset(id: string): Promise<void> {
   const earlier = localStorage.getItem(storageKey(id));
@@ -44,6 +48,7 @@ export async function openAsset(id: string): Promise<void> {
   if (!info) return;
   localStorage.setItem(storageKey(id), info.id);
   stream?.close();
+  noteWaiting(0);
   lastHello = null;
   batch(() => {
     session.value = { id: info.id, asset: info.asset, assetName: info.asset_name };
@@ -74,6 +79,7 @@ async function freshSession(asset: string): Promise<SessionInfo> {
 function events(asset: string): StreamEvents {
   return {
     connection: (state) => (connection.value = state),
+    waiting: noteWaiting,
     hello: (hello) => {
       receiveLog(hello.log);
       queueMicrotask(sendSplice); // one that waited for a connection

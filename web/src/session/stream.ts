@@ -22,6 +22,8 @@ export interface StreamEvents {
   connection(state: Connection): void;
   hello(message: ServerHello): void;
   message(message: Exclude<ServerMessage, ServerHello | PickedMessage>): void;
+  /** So many changes are sent and not answered; said after each that is sent, answered or dropped. */
+  waiting(count: number): void;
   /** The decoded picture; the receiver closes it. `cameraNumber`: low 8 bits of the number of the camera that it shows. */
   frame(header: FrameHeader, picture: ImageBitmap, cameraNumber: number): void;
   /** The server will not take this client back; `reason` is for the user. */
@@ -134,8 +136,14 @@ export class Stream {
     this.send({ type: 'log' });
   }
 
+  /** Have the server give up the change that it is computing, such as a long simulation; it is then rejected. */
+  cancelChange(): void {
+    this.send({ type: 'cancel' });
+  }
+
   private order(message: Ordered): number {
     this.outbox.push(message);
+    this.events.waiting(this.outbox.length);
     if (this.ready) this.send(message);
     return message.id;
   }
@@ -199,6 +207,7 @@ export class Stream {
       case 'accepted':
       case 'rejected':
         this.outbox = this.outbox.filter((waiting) => waiting.id !== message.id);
+        this.events.waiting(this.outbox.length);
         break;
       case 'error':
         if (message.fatal) {
@@ -230,6 +239,7 @@ export class Stream {
     const largest = this.outbox[sizes.indexOf(Math.max(...sizes))];
     if (!largest) return;
     this.outbox = this.outbox.filter((waiting) => waiting !== largest);
+    this.events.waiting(this.outbox.length);
     this.events.message({ type: 'rejected', id: largest.id, reason: 'This change is larger than the server takes; nothing was changed.', overtaken: false });
   }
 
@@ -254,6 +264,7 @@ export class Stream {
     if (session && session !== this.session) {
       this.session = session;
       this.outbox = []; // the new session was given the whole log
+      this.events.waiting(0);
     }
     this.connect();
   }

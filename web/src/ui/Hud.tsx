@@ -1,9 +1,17 @@
 /** What the picture is right now: samples, size, speed, and whether the server is there. */
 
-import { connection, session, settings, status } from '../session/session';
+import { playing } from '../edit/shape/simulation';
+import { computing } from '../session/long_change';
+import { cancelChange, connection, session, settings, status } from '../session/session';
 import { entryOf } from '../stage/channels';
 
 const PHASE_TEXT = { loading: 'Loading the asset…', moving: 'Moving', still: 'Refining', converged: 'Converged', paused: 'Paused' };
+
+/** A film would ask for the same moment again. */
+function giveUp(): void {
+  playing.value = false;
+  cancelChange();
+}
 
 export function Hud() {
   if (!session.value) return null;
@@ -15,7 +23,12 @@ export function Hud() {
   return (
     <section class="hud" aria-label="State of the picture" data-state={link === 'open' ? (now?.phase ?? 'loading') : link}>
       <span class={`lamp ${kind}`} aria-hidden="true" />
-      <span role="status">{state}</span>
+      <span role="status">{link === 'open' && computing.value ? 'Computing the change…' : state}</span>
+      {link === 'open' && computing.value && (
+        <button class="ghost" title="Give up the change; everything stays as it was" onClick={giveUp}>
+          Cancel
+        </button>
+      )}
       {now && now.width > 0 && link === 'open' && (
         <>
           {entryOf(settings.value.channel).lit && (

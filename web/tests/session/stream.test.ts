@@ -44,7 +44,7 @@ const pose = (width: number) => ({ world_from_camera: [[1, 0, 0, 0], [0, 1, 0, 0
 const settings = { exposure_stops: 0, background: 'environment' as const, spp_target: 8, bounces: 1, channel: 'final' as const, denoise: true };
 type Change = Extract<ClientMessage, { key?: unknown }>;
 const isChange = (message: ClientMessage): message is Change => 'key' in message;
-const silent = { connection: () => {}, hello: () => {}, message: () => {}, frame: () => {}, refused: () => {}, lost: async () => null };
+const silent = { connection: () => {}, hello: () => {}, message: () => {}, waiting: () => {}, frame: () => {}, refused: () => {}, lost: async () => null };
 let stream: Stream;
 
 beforeEach(() => {
@@ -176,4 +176,19 @@ it('gives up the change that the server finds too large, and only that', async (
   const second = FakeSocket.all.at(-1)!;
   second.greet();
   expect(second.take().filter(isChange).map((message) => message.type)).toEqual(['undo']);
+});
+
+it('says how many changes wait for an answer, and has the server give up the one that it computes', () => {
+  const waiting: number[] = [];
+  stream.close();
+  stream = new Stream('s', { ...silent, waiting: (count) => waiting.push(count) });
+  const socket = FakeSocket.all.at(-1)!;
+  socket.greet();
+  socket.take();
+  const long = stream.sendEdit({ op: 'simulate', scene: {}, time: 20 }, null);
+  stream.undo();
+  stream.cancelChange();
+  expect(socket.take().map((message) => message.type)).toEqual(['edit', 'undo', 'cancel']);
+  socket.say({ type: 'rejected', id: long, reason: 'This change was cancelled.', overtaken: false });
+  expect(waiting).toEqual([1, 2, 1]);
 });

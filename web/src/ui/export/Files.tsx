@@ -13,7 +13,7 @@ import { Icon } from '../icons';
 
 const withEdits = signal(true);
 /** The file that the server is writing; null while there is none. */
-const writing = signal<DownloadFormat | null>(null);
+const writing = signal<{ format: DownloadFormat; leaving: AbortController } | null>(null);
 
 export function Files() {
   const open = session.value!;
@@ -21,8 +21,9 @@ export function Files() {
   const address = (format: DownloadFormat) => (edited && withEdits.value ? api.sessionExport(open.id, format) : api.assetExport(open.asset, format));
   const save = async (format: DownloadFormat) => {
     if (writing.value) return;
-    writing.value = format;
-    const file = await attempt(api.exportedFile(address(format)));
+    const leaving = new AbortController();
+    writing.value = { format, leaving };
+    const file = await attempt(api.exportedFile(address(format), leaving.signal));
     writing.value = null;
     if (file) download(file.content, file.name);
   };
@@ -46,8 +47,13 @@ export function Files() {
               }}
             >
               <Icon name="download" /> {title}
-              {writing.value === format && <span class="dim">is being written…</span>}
+              {writing.value?.format === format && <span class="dim">is being written…</span>}
             </a>
+            {writing.value?.format === format && (
+              <button class="ghost" aria-label={`Cancel ${title}`} onClick={() => writing.value?.leaving.abort()}>
+                Cancel
+              </button>
+            )}
           </li>
         ))}
       </ul>

@@ -26,7 +26,8 @@ const chosenSize = signal<Size | null>(null);
 const samples = signal('128');
 const format = signal<api.StillFormat>('png');
 const transparent = signal(false);
-const rendering = signal(false);
+/** Ends the picture that the server is rendering; null while there is none. */
+const rendering = signal<AbortController | null>(null);
 
 const FORMATS: { value: api.StillFormat; text: string; title: string }[] = [
   { value: 'png', text: 'PNG', title: 'As on screen: 8 bits, sRGB, with exposure and tone curve' },
@@ -37,10 +38,10 @@ async function saveStill(size: Size): Promise<void> {
   const open = session.value;
   const view = chosenSize.value && aimNow.value ? { ...size, fov_y_degrees: aimNow.value.fov_y_degrees, world_from_camera: worldFromCamera(aimNow.value) } : viewNow.value;
   if (!view || !open) return;
-  rendering.value = true;
+  const leaving = (rendering.value = new AbortController());
   const wanted = { ...settings.value, spp_target: Number(samples.value), ...(format.value === 'exr' && { exposure_stops: 0 }) };
-  const picture = await attempt(api.stillPicture(open.id, api.frameQuery(view, size, wanted, transparent.value), format.value));
-  rendering.value = false;
+  const picture = await attempt(api.stillPicture(open.id, api.frameQuery(view, size, wanted, transparent.value), format.value, leaving.signal));
+  rendering.value = null;
   if (picture) download(picture, `${open.assetName}.${format.value}`);
 }
 
@@ -62,9 +63,14 @@ export function Still() {
       <Choice label="File" value={format.value} options={FORMATS} onChange={(value) => (format.value = value)} />
       <Switch label="Transparent background" title="With alpha; in an EXR colours are multiplied with it, as compositing programs want them" value={transparent.value} onChange={(value) => (transparent.value = value)} />
       <div class="buttons">
-        <button class="primary" disabled={rendering.value || !viewNow.value || trouble !== null} onClick={() => void saveStill(size)}>
+        <button class="primary" disabled={rendering.value !== null || !viewNow.value || trouble !== null} onClick={() => void saveStill(size)}>
           <Icon name="camera" /> {rendering.value ? 'Rendering…' : `Render ${format.value.toUpperCase()}`}
         </button>
+        {rendering.value && (
+          <button title="The server stops rendering it" onClick={() => rendering.value?.abort()}>
+            Cancel
+          </button>
+        )}
       </div>
       <p class="hint">{titleFor('still', 'What is on screen is saved at once')}.</p>
     </Section>
