@@ -16,6 +16,9 @@ import json
 import statistics
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from playwright.sync_api import Browser, Page, sync_playwright
@@ -69,7 +72,23 @@ def main(arguments: list[str]) -> None:
 
 
 def measure(mesh: Path | None, repeats: int, turn_seconds: float) -> dict[str, float]:
-    """Start a server and a browser, and take all figures.
+    """Start a server and a browser, and take all figures; raises as `started` does."""
+    with started(mesh) as viewer:
+        result = measure_edits_and_local(viewer, repeats, turn_seconds)
+        result |= measure_traced(viewer, turn_seconds)
+    return result | {"bundle_gz_kb": round(bundle_bytes() / 1000, 1)}
+
+
+@dataclass(frozen=True)
+class StartedViewer:
+    browser: Browser
+    server: RunningServer
+    mesh: Path
+
+
+@contextmanager
+def started(mesh: Path | None) -> Iterator[StartedViewer]:
+    """A server and a browser, and what is looked at: a ball where None.
 
     Raises:
         ValueError: the viewer is not built, or no Chromium is there.
@@ -84,14 +103,12 @@ def measure(mesh: Path | None, repeats: int, turn_seconds: float) -> dict[str, f
             server.start()
             with sync_playwright() as playwright:
                 browser = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
-                result = _measure_edits_and_local(browser, server, mesh, repeats, turn_seconds)
-                result |= _measure_traced(browser, server, turn_seconds)
+                yield StartedViewer(browser, server, mesh)
                 browser.close()
         except RuntimeError as error:
             raise ValueError(str(error)) from error
         finally:
             server.stop()
-    return result | {"bundle_gz_kb": round(bundle_bytes() / 1000, 1)}
 
 
 def bundle_bytes() -> int:
@@ -147,9 +164,11 @@ def _turn(page: Page, counter: str, seconds: float) -> float:
     return rate
 
 
-def _measure_edits_and_local(browser: Browser, server: RunningServer, mesh: Path, repeats: int, turn_seconds: float) -> dict[str, float]:
-    page = _open(browser, server, 800, 600, local=True)
-    page.get_by_label("Capture or mesh").set_input_files(mesh)
+def measure_edits_and_local(viewer: StartedViewer, repeats: int, turn_seconds: float) -> dict[str, float]:
+    """What the page does by itself, and after the server was away; the mesh is in the library afterwards."""
+    server = viewer.server
+    page = _open(viewer.browser, server, 800, 600, local=True)
+    page.get_by_label("Capture or mesh").set_input_files(viewer.mesh)
     page.locator("#slider-roughness").wait_for(timeout=WAIT_MS)
     page.get_by_role("button", name="Library").click()
     _settle(page)
@@ -178,8 +197,9 @@ def _measure_edits_and_local(browser: Browser, server: RunningServer, mesh: Path
     }
 
 
-def _measure_traced(browser: Browser, server: RunningServer, turn_seconds: float) -> dict[str, float]:
-    page = _open(browser, server, 400, 400, local=False)
+def measure_traced(viewer: StartedViewer, turn_seconds: float) -> dict[str, float]:
+    """What the server sends of the newest object in the library."""
+    page = _open(viewer.browser, viewer.server, 400, 400, local=False)
     page.locator(".asset").first.click()
     page.locator(".hud").wait_for(timeout=WAIT_MS)
     page.keyboard.press("l")

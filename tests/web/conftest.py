@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, expect, sync_playwright
 
 from drgs_server.client import Client
 from tests.web.browser import CHROMIUM_ARGUMENTS, ROOT, RunningServer, chromium_path, write_ball
@@ -56,6 +57,26 @@ class Viewer:
     def session_path(self) -> str:
         asset = self.page.evaluate("new URLSearchParams(location.hash.slice(1)).get('asset')")
         return "/api/sessions/" + self.page.evaluate(f"localStorage.getItem('drgs.session.{asset}')")
+
+    def hint(self, words: str) -> Locator:
+        """What a panel says in small letters. The picture's own notes, its state and messages may use the same words at any moment."""
+        return self.page.locator(".inspector .hint", has_text=words)
+
+    def undo(self) -> None:
+        self._press_when_heard("Undo", "Control+z")
+
+    def redo(self) -> None:
+        self._press_when_heard("Redo", "Control+Shift+Z")
+
+    def _press_when_heard(self, button: str, keys: str) -> None:
+        """Press the keys once the page has heard from the server that they do something: the log is ahead of the page."""
+        expect(self.page.get_by_role("button", name=button, exact=True)).to_be_enabled()
+        self.page.keyboard.press(keys)
+
+    def close_library(self) -> None:
+        button = self.page.get_by_role("button", name="Library", exact=True)
+        if button.get_attribute("aria-pressed") == "true":
+            button.click()
 
     def open_tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()
@@ -121,8 +142,13 @@ def patient_page(browser: Browser, **options: Any) -> Page:
 
 
 @pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+def built() -> None:
+    """The viewer is that of the sources."""
     subprocess.run([sys.executable, ROOT / "web" / "build.py"], check=True)
+
+
+@pytest.fixture(scope="session")
+def server(built: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
     running = RunningServer(tmp_path_factory.mktemp("data"))
     running.start()
     yield running
@@ -144,18 +170,45 @@ def ball_asset(server: RunningServer, ball_file: Path) -> str:
         return client.upload_asset(ball_file).id
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """A Chromium for each module: while Playwright runs, so does its event loop, and tests behind these could run none of their own."""
-    with sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
-        yield running
-        running.close()
+class _Browsing:
+    """One Chromium for all modules that follow one another. It ends with the last of them: while Playwright runs, so does its event loop, and
+    tests behind these could run none of their own."""
+
+    def __init__(self) -> None:
+        self._running: Browser | None = None
+        self._open = ExitStack()
+
+    def browser(self) -> Browser:
+        if self._running is None or not self._running.is_connected():
+            self.end()
+            playwright = self._open.enter_context(sync_playwright())
+            self._running = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
+            self._open.callback(self._running.close)
+        return self._running
+
+    def end(self) -> None:
+        self._open.close()
+        self._running = None
+
+
+_browsing = _Browsing()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(nextitem: pytest.Item | None) -> None:
+    if nextitem is None or not nextitem.nodeid.startswith("tests/web/"):
+        _browsing.end()
 
 
 @pytest.fixture(scope="module")
-def viewer(server: RunningServer, browser: Browser) -> Iterator[Viewer]:
-    """One page for all tests of a module: each leaves the edit log empty."""
+def browser() -> Browser:
+    return _browsing.browser()
+
+
+@contextmanager
+def shown_page(server: RunningServer, browser: Browser, asset: str = "") -> Iterator[Viewer]:
+    """A page of its own that opens the asset of this id, or none. Each object that a page opens costs about six seconds of a core: software GL lights it
+    anew."""
     # Half a device pixel per CSS pixel: these tests are about the way there and back, not about the renderer's speed.
     page = patient_page(browser, viewport={"width": 760, "height": 420}, device_scale_factor=0.5, color_scheme="dark")
     shown = Viewer(page, server)
@@ -167,20 +220,30 @@ def viewer(server: RunningServer, browser: Browser) -> Iterator[Viewer]:
 
     page.on("console", heard)
     page.on("pageerror", lambda error: shown.complaints.append(str(error)))
-    page.goto(f"{server.address}/#token={server.token}")
+    page.goto(f"{server.address}/#token={server.token}" + (f"&asset={asset}" if asset else ""))
     yield shown
     page.close()
 
 
-@pytest.fixture(scope="module")
-def ball(viewer: Viewer, ball_asset: str) -> Viewer:
-    """The page with the ball open, its left panel away."""
-    viewer.page.goto(f"{viewer.server.address}/#asset={ball_asset}")
-    viewer.page.reload()
-    expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
-    viewer.page.get_by_role("button", name="Library").click()
+def frame_alone(viewer: Viewer) -> None:
+    """Frame the object in what is free without the left panel, which may have been there when it came."""
+    viewer.close_library()
     viewer.settle()
-    # The object may have come before or after the panel went: frame it in what is free now.
     viewer.page.keyboard.press("Shift+F")
     viewer.settle()
-    return viewer
+
+
+@pytest.fixture(scope="module")
+def viewer(server: RunningServer, browser: Browser) -> Iterator[Viewer]:
+    """One page for all tests of a module: each leaves the edit log empty."""
+    with shown_page(server, browser) as viewer:
+        yield viewer
+
+
+@pytest.fixture(scope="module")
+def ball(server: RunningServer, browser: Browser, ball_asset: str) -> Iterator[Viewer]:
+    """The page with the ball open, its left panel away."""
+    with shown_page(server, browser, ball_asset) as viewer:
+        expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
+        frame_alone(viewer)
+        yield viewer

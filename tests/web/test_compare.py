@@ -5,6 +5,7 @@ The photographs are pictures that our own renderer took of the ball, so that the
 
 import base64
 import io
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
 from drgs.convert.import_mesh import import_mesh
 from drgs.deform.pose_scene import pose_scene
@@ -22,7 +23,8 @@ from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.asset import Asset, save_asset
 from drgs.scene.camera import Camera, camera_from_opengl
-from tests.web.conftest import Viewer, wait_until
+from tests.web.browser import RunningServer
+from tests.web.conftest import Viewer, frame_alone, shown_page, wait_until
 
 WIDTH, HEIGHT = 120, 90
 INTRINSICS = torch.tensor([[150.0, 0, 42], [0, 150, 55], [0, 0, 1]])
@@ -53,7 +55,9 @@ def photographs() -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def captured(viewer: Viewer, ball_file: Path, photographs: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Viewer:
+def captured(
+    server: RunningServer, browser: Browser, ball_file: Path, photographs: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Viewer]:
     """The page with the ball open as if it had been built from three photographs, one of them taken with a tilted camera."""
     cameras = (camera_at(-60, 0, "front"), camera_at(60, 25, "tilted"), camera_at(180, 0, "back"))
     asset = replace(import_mesh(ball_file), cameras=cameras)
@@ -61,20 +65,17 @@ def captured(viewer: Viewer, ball_file: Path, photographs: list[np.ndarray], tmp
     path = tmp_path_factory.mktemp("captured") / "captured.zip"
     save_asset(asset, path, None, encode_photographs(photographs))
     answer = httpx.post(
-        f"{viewer.server.address}/api/assets",
+        f"{server.address}/api/assets",
         files={"file": ("captured.zip", path.read_bytes())},
-        headers={"Authorization": f"Bearer {viewer.server.token}"},
+        headers={"Authorization": f"Bearer {server.token}"},
         timeout=60,
     )
     assert answer.status_code == 201, answer.text
-    viewer.page.goto(f"{viewer.server.address}/#asset={answer.json()['id']}")
-    viewer.page.reload()
-    viewer.page.get_by_role("button", name="Library").click()
-    viewer.settle()
-    viewer.page.keyboard.press("Shift+F")
-    viewer.settle()
-    viewer.open_tab("View")
-    return viewer
+    with shown_page(server, browser, answer.json()["id"]) as viewer:
+        expect(viewer.page.get_by_role("heading", name="captured", exact=True)).to_be_visible()
+        frame_alone(viewer)
+        viewer.open_tab("View")
+        yield viewer
 
 
 def shown_where_the_photograph_lies(viewer: Viewer) -> np.ndarray:
@@ -172,7 +173,7 @@ def test_the_split_shows_the_object_as_captured_beside_the_present_one(captured:
     expect(divider).to_have_attribute("aria-valuenow", str(first + 10))
     captured.page.keyboard.press("Shift+B")
     expect(divider).to_have_count(0)
-    captured.page.keyboard.press("Control+z")
+    captured.undo()
     captured.wait_for_edits(0)
 
 
@@ -188,7 +189,7 @@ def test_number_keys_show_what_lies_behind_the_picture_with_a_legend(captured: V
     shown = captured.page.get_by_role("group", name="Show")
     captured.page.keyboard.press("7")
     expect(shown.get_by_role("radio", name="Open sky")).to_be_checked()
-    expect(captured.page.get_by_text("White sees all of the sky")).to_be_visible()
+    expect(captured.hint("White sees all of the sky")).to_be_visible()
     wait_until(lambda: middle(captured).min() > 250, "a ball that sees all of the sky")
     captured.page.keyboard.press("8")
     wait_until(lambda: middle(captured).max() < 4, "a ball without indirect light")
@@ -197,9 +198,7 @@ def test_number_keys_show_what_lies_behind_the_picture_with_a_legend(captured: V
     # From the dark blue of the scale's beginning on; the ball's own red is not on it.
     wait_until(lambda: (color := middle(captured))[2] > color[0] and color.max() > 8, "blue for little noise")
     captured.page.keyboard.press("0")
-    # The picture's own notes say so too, as soon as it has come.
-    hint = captured.page.locator("p.hint", has_text="it has no surfels to show")
-    expect(hint).to_be_visible()
+    expect(captured.hint("it has no surfels to show")).to_be_visible()
     wait_until(lambda: middle(captured).max() < 4, "nothing")
     captured.page.keyboard.press("1")
     wait_until(lambda: middle(captured)[0] > 100, "the final picture")
@@ -229,5 +228,5 @@ def test_an_imported_mesh_says_that_it_has_no_photographs(captured: Viewer, ball
     captured.page.get_by_role("button", name="Library").click()
     captured.page.get_by_label("Capture or mesh").set_input_files(ball_file)
     expect(captured.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
-    expect(captured.page.get_by_text("this asset was made from a mesh")).to_be_visible()
+    expect(captured.hint("no photographs to compare with: this asset was made from a mesh")).to_be_visible()
     assert captured.complaints == []

@@ -79,9 +79,9 @@ def test_a_twist_can_be_changed_in_place_and_undone_to_the_value_before(ball: Vi
     type_number(ball, "Twist", "180")
     wait_until(lambda: [round(edit["map"]["rate"], 2) for edit in ball.edits()] == [3.14], "the new twist in place of the old one")
     ball.page.keyboard.press("Escape")
-    ball.page.keyboard.press("Control+z")
+    ball.undo()
     wait_until(lambda: [round(edit["map"]["rate"], 2) for edit in ball.edits()] == [1.57], "the twist before")
-    ball.page.keyboard.press("Control+Shift+Z")
+    ball.redo()
     wait_until(lambda: [round(edit["map"]["rate"], 2) for edit in ball.edits()] == [3.14], "the twist again")
 
 
@@ -169,9 +169,10 @@ def test_scripts_hold_the_edits_and_the_camera(ball: Viewer) -> None:
     ball.open_tab("Material")
     ball.page.get_by_role("button", name="Rubber").click()
     ball.wait_for_edits(1)
+    expect(ball.page.get_by_role("list", name="Edits in force").get_by_role("button", name="Rubber")).to_be_visible()
     ball.open_tab("Export")
     ball.page.get_by_role("button", name="Copy as Python").click()
-    expect(ball.page.get_by_text("Python for this picture is on the clipboard.")).to_be_visible()
+    expect(ball.page.get_by_role("log").get_by_text("Python for this picture is on the clipboard.")).to_be_visible()
     script = ball.page.evaluate("navigator.clipboard.readText()")
     compile(script, "script", "exec")
     assert '"roughness": 0.85' in script and "world_from_camera=camera" in script

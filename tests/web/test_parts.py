@@ -38,9 +38,9 @@ def type_number(viewer: Viewer, label: str, value: str) -> None:
 def test_a_clicked_region_alone_turns_to_gold(ball: Viewer) -> None:
     before = ball.settled_picture()
     choose(ball, "Region")
-    expect(ball.page.get_by_text("Click on the object to select")).to_be_visible()
+    expect(ball.hint("Click on the object to select")).to_be_visible()
     click_middle(ball)
-    expect(ball.page.get_by_text("% of the object is selected")).to_be_visible()
+    expect(ball.hint("% of the object is selected")).to_be_visible()
     ball.page.get_by_role("button", name="Gold").click()
     (edit,) = ball.wait_for_edits(1)
     assert edit["select"]["region"] is not None
@@ -86,7 +86,7 @@ def test_reset_takes_that_value_back_and_nothing_else(ball: Viewer) -> None:
     expect(ball.page.get_by_label("Roughness, exact value")).to_have_value(captured)
     # Taking back is an edit like any other: it can be undone.
     ball.page.keyboard.press("Escape")
-    ball.page.keyboard.press("Control+z")
+    ball.undo()
     wait_until(lambda: any(edit["set"].get("roughness") == 0.1 for edit in ball.edits()), "roughness again")
 
 
@@ -119,12 +119,13 @@ def test_multiplying_keeps_what_was_captured_apart(ball: Viewer) -> None:
 def test_a_copied_material_is_pasted_on_another_part(ball: Viewer) -> None:
     ball.page.get_by_role("button", name="Chrome").click()
     ball.wait_for_edits(1)
+    expect(ball.page.get_by_label("Metallic, exact value")).to_have_value("1.00")  # the page has heard of it, too
     ball.page.keyboard.press("Control+c")
     ball.page.get_by_role("button", name="As captured").click()
     ball.wait_for_edits(0)
     choose(ball, "Similar")
     click_middle(ball)
-    expect(ball.page.get_by_text("% of the object is selected")).to_be_visible()
+    expect(ball.hint("% of the object is selected")).to_be_visible()
     ball.page.keyboard.press("Control+v")
     (edit,) = ball.wait_for_edits(1)
     assert edit["select"]["similar"]["tolerance"] == 0.1
@@ -137,7 +138,7 @@ def test_painting_selects_and_edits_only_what_was_painted(ball: Viewer) -> None:
     ball.page.mouse.down()
     ball.page.mouse.move(262, 226, steps=3)
     ball.page.mouse.up()
-    expect(ball.page.get_by_text("% of the object is selected")).to_be_visible()
+    expect(ball.hint("% of the object is selected")).to_be_visible()
     type_number(ball, "Metallic", "1")
     (edit,) = ball.wait_for_edits(1)
     weights = np.array(edit["select"]["vertex_weights"])

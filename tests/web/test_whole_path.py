@@ -184,7 +184,7 @@ def test_a_part_picked_by_a_click_alone_turns_to_gold(path: Viewer, first: np.nd
     # Not a region: where those end depends on how well the few iterations told materials apart.
     path.page.get_by_role("radio", name="Sphere", exact=True).check()
     click_pixel(path, first, x, y)
-    expect(path.page.get_by_text("% of the object is selected")).to_be_visible()
+    expect(path.hint("% of the object is selected")).to_be_visible()
     path.page.get_by_role("button", name="Gold", exact=True).click()
     (edit,) = path.wait_for_edits(1)
     assert edit["op"] == "material" and edit["select"]["sphere"]["radius"] > 0 and edit["set"]["metallic"] == 1
