@@ -65,7 +65,7 @@ def test_a_picture_that_the_server_would_refuse_is_not_asked_for(ball: Viewer) -
 def test_a_picture_that_takes_long_is_given_up_and_the_server_is_free_for_another(ball: Viewer, tmp_path: Path) -> None:
     page = ball.page
     page.get_by_role("radio", name="3840×2160").check()
-    page.get_by_role("radio", name="512", exact=True).check()
+    page.get_by_role("radio", name="128", exact=True).check()
     page.get_by_role("button", name="Render PNG").click()
     page.get_by_role("button", name="Cancel", exact=True).click()
     expect(page.get_by_role("button", name="Render PNG")).to_be_enabled()

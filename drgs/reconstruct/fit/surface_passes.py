@@ -12,12 +12,16 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from drgs.reconstruct.fit.carve_hollows import CarveSettings, carved_depths
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.fit_surface import SurfaceSettings, fit_surface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
+from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
+from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.remesh import remesh
-from drgs.scene.mesh import TriangleMesh
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.scene.mesh import TriangleMesh, vertex_normals
 from drgs.scene.views import Views
 
 PASS_MESH = MeshSettings(resolution=200, face_limit=60_000, smoothing_passes=0, keep_component_fraction=0.01)
@@ -32,6 +36,9 @@ class PassSettings:
     surface: SurfaceSettings = field(default_factory=lambda: SurfaceSettings(rounds=1, steps_a_round=80))
     """Of one pass; weights that change over a fit change over all passes."""
     mesh: MeshSettings = PASS_MESH
+    carve: CarveSettings = field(default_factory=CarveSettings)
+    carvings: int = 4
+    """Passes after which hollows are looked for."""
 
 
 @dataclass(eq=False)
@@ -68,6 +75,16 @@ def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
         fall_from=given.fall_from if last else 1.0,
         seed=given.seed + index,
     )
+
+
+@torch.no_grad()
+def carve_hollows(fit: SurfaceFit, targets: list[ViewTarget], settings: CarveSettings, radius: float) -> None:
+    """Move the surface to where the photographs agree; what moved gets the moved surface's normals."""
+    parameters, mesh = fit.state.parameters, fit.mesh
+    inward, depth = carved_depths(build_tracer(mesh), parameters["metal"], targets, mesh_edges(fit.faces), radius, settings)
+    parameters["vertices"] += depth[:, None] * inward
+    moved = (depth > settings.step * radius)[:, None]
+    parameters["normals"].copy_(torch.where(moved, vertex_normals(parameters["vertices"], fit.faces), parameters["normals"]))
 
 
 def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> None:
@@ -115,4 +132,6 @@ def fit_surface_in_passes(
             return False
         if fit.index + 1 >= settings.passes:
             return True
+        if fit.index < settings.carvings:
+            carve_hollows(fit, view_targets(views, 1.0, fit.faces.device), settings.carve, radius)
         start_next_pass(fit, settings, radius)

@@ -1,0 +1,203 @@
+"""Hollows that no outline shows: where photographs agree behind the surface and not on it, the surface is moved there.
+
+The mesh begins on the visual hull, which fills what lies between parts of an object; shading cannot empty it, for a bump of the right paint
+explains most pictures. But paint looks alike from all sides: at its true depth the views that would see it agree. So each vertex is looked at
+in steps along its inward normal. A view sees a place behind the surface if its ray enters the mesh near the vertex and does not leave it
+before. The step where colours differ least is the vertex's wish, if they differ much less there than on the surface. Wishes are averaged with what
+the surroundings want, by a sparse linear solve, in which vertices that have no wish hold their place.
+
+Mirrors agree nowhere, so metal and smooth surfaces hold their place: their shape is told by what they mirror (fit_surface). Source: the idea is
+space carving's (Kutulakos and Seitz 2000, docs/sources.md: kutulakos2000), with a surface's normals in place of voxels.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.sparse import csr_matrix, diags, identity
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.mesh import vertex_normals
+
+FACING = 0.2
+"""Least cosine between the outward normal and the direction to the eye."""
+INSIDE = 0.9
+"""Least coverage of a place in the photograph."""
+TRIMMED = 2 / 3
+"""Share of the views whose difference counts."""
+THROUGH = 0.7
+"""Share of the object's thickness that may be carved at once: more could tear a hole."""
+NEARBY = 0.02
+"""Of the radius: how far beyond three depths from the vertex a ray may enter."""
+
+
+@dataclass(frozen=True)
+class CarveSettings:
+    """How far is looked, and what counts as agreement."""
+
+    step: float = 0.01
+    """Of the object's radius."""
+    steps: int = 20
+    smoothest: float = 0.3
+    """Roughness below which a surface may be a mirror."""
+    most_metallic: float = 0.3
+    most_evidence: float = -0.2
+    """Of metal, -1..1 (metal_evidence)."""
+    better: float = 0.8
+    """Share of the difference on the surface that is left at the wish, at most."""
+    margin: float = 0.01
+    """Least gain of the difference, of display values 0..1."""
+    shallowest: int = 3
+    """Steps: what lies nearer is for normals and outlines to find."""
+    agreeing: float = 0.5
+    """Share of a neighbourhood that must have wishes, too."""
+    fewest_views: int = 5
+    direction_rings: int = 10
+    """Neighbourhoods over which normals are averaged for the direction."""
+    cost_rings: int = 4
+    """And differences."""
+    together: float = 2.0
+    """Weight of neighbours' moves being equal, against a wish."""
+    hold: float = 1.0
+    """Weight of staying in place, against a wish: of those who have none, mirrors among them ..."""
+    hold_unsure: float = 0.1
+    """... but of paint that views do not agree about, or that too few see."""
+    disagreeing: float = 0.035
+    """Difference of display values above which views do not agree."""
+
+
+def carved_depths(
+    tracer: AbstractTracer,
+    evidence: Float[Tensor, "vertex"],
+    targets: list[ViewTarget],
+    edges: MeshEdges,
+    radius: float,
+    settings: CarveSettings,
+) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "vertex"]]:
+    """(vertex, 3) unit inward directions and (vertex,) how far each vertex of the tracer's mesh should move along them [world units].
+
+    Args:
+        evidence: of metal_evidence. radius: of the object's bounding sphere [world units].
+    """
+    mesh = tracer.mesh
+    around = _averaging(edges, len(mesh.vertices))
+    outward = _averaged(around, vertex_normals(mesh.vertices, mesh.faces), settings.direction_rings)
+    inward = -torch.nn.functional.normalize(outward, dim=-1)
+    matt = (mesh.metallic < settings.most_metallic) & (mesh.roughness > settings.smoothest) & (evidence < settings.most_evidence)
+    matt = matt.nonzero().squeeze(1)
+    if len(matt) == 0:
+        return inward, torch.zeros_like(mesh.roughness)
+    costs = []
+    for step in range(settings.steps + 1):
+        difference, views = _differences(tracer, targets, matt, inward[matt], step * settings.step * radius, radius)
+        known = views >= settings.fewest_views
+        sums = torch.zeros(len(mesh.vertices), 2, device=matt.device)
+        sums[matt[known]] = torch.stack([difference * views, views], -1)[known]
+        total, weight = _averaged(around, sums, settings.cost_rings)[matt].unbind(-1)
+        costs.append(torch.where(weight > 1e-3 * settings.fewest_views, total / weight.clamp(min=1e-9), torch.full_like(total, torch.inf)))
+    cost = torch.stack(costs)
+    least, at = cost.min(0)
+    wishes = (least < settings.better * cost[0]) & (cost[0] - least > settings.margin) & torch.isfinite(cost[0])
+    wishes &= at >= settings.shallowest
+    alike = torch.zeros(len(mesh.vertices), 2, device=matt.device)
+    alike[matt[wishes]] = torch.stack([torch.ones_like(least), at * settings.step * radius], -1)[wishes]
+    share, common = _averaged(around, alike, settings.cost_rings)[matt].unbind(-1)
+    wishes &= share > settings.agreeing
+    common = torch.minimum(common / share.clamp(min=1e-9), THROUGH * _thickness(tracer, matt, inward[matt]))
+    weight, wish = torch.full_like(mesh.roughness, settings.hold), torch.zeros_like(mesh.roughness)
+    weight[matt[cost[0] > settings.disagreeing]] = settings.hold_unsure  # also where too few views see them, for then it is endless
+    weight[matt[wishes]], wish[matt[wishes]] = 1.0, common[wishes]
+    depth = _agreed(edges, weight, wish, settings.together)
+    return inward, depth
+
+
+def _differences(
+    tracer: AbstractTracer, targets: list[ViewTarget], vertices: Tensor, inward: Tensor, depth: float, radius: float
+) -> tuple[Tensor, Tensor]:
+    """(n,) mean difference from the median colour among views that would see the places `depth` behind the vertices (n,), and how many those are.
+
+    The third that differs most is left out: highlights.
+    """
+    place = tracer.mesh.vertices[vertices] + depth * inward
+    shown = torch.full((len(targets), len(vertices), 3), torch.nan, device=place.device)
+    for index, target in enumerate(targets):
+        camera = target.camera
+        offset = place - camera.center_world
+        distance = offset.norm(dim=1)
+        direction = offset / distance[:, None]
+        at = place @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+        homogeneous = at @ camera.intrinsics.T
+        pixel = homogeneous[:, :2] / homogeneous[:, 2:]
+        size = torch.tensor([camera.width, camera.height], device=place.device)
+        seen = ((direction * inward).sum(1) > FACING) & (at[:, 2] > 0) & (pixel > 1).all(1) & (pixel < size - 1).all(1)
+        seen = seen.nonzero().squeeze(1)
+        seen = seen[_would_be_seen(tracer, camera.center_world, direction[seen], distance[seen], vertices[seen], depth, radius)]
+        grid = (2 * pixel[seen] / size - 1)[None, None]
+        picture = torch.cat([target.saturation, target.mask[..., None]], -1).permute(2, 0, 1)[None]
+        sampled = torch.nn.functional.grid_sample(picture, grid, mode="bilinear", align_corners=False)[0, :, 0].T
+        inside = sampled[:, 3] > INSIDE
+        shown[index, seen[inside]] = sampled[inside, :3]
+    difference = (shown - shown.nanmedian(0).values).abs().mean(-1)
+    count = (~torch.isnan(difference)).sum(0)
+    ordered = difference.nan_to_num(nan=torch.inf).sort(0).values
+    kept = torch.arange(len(targets), device=place.device)[:, None] < (TRIMMED * count).ceil()
+    total = torch.where(kept, ordered, torch.zeros_like(ordered)).sum(0)
+    return total / kept.sum(0).clamp(min=1), count.float()
+
+
+def _would_be_seen(
+    tracer: AbstractTracer, eye: Tensor, direction: Tensor, distance: Tensor, vertices: Tensor, depth: float, radius: float
+) -> Tensor:
+    """(n,) whether a ray from the eye comes to its place through nothing but what would be carved: matter near the vertex, entered once."""
+    first = trace_rays(eye.expand_as(direction), direction, tracer)
+    if depth == 0:
+        return first.distance > distance - 8 * tracer.lift
+    start = first.distance + 4 * tracer.lift
+    entry = eye + direction * start.clamp(max=2 * float(distance.max()) if len(distance) else 1.0)[:, None]
+    second = trace_rays(entry, direction, tracer)
+    stays = ~second.hit | (second.distance + start > distance)
+    near = (entry - tracer.mesh.vertices[vertices]).norm(dim=1) < 3 * depth + NEARBY * radius
+    return first.hit & (first.distance < distance) & stays & near
+
+
+def _thickness(tracer: AbstractTracer, vertices: Tensor, inward: Tensor) -> Tensor:
+    """(n,) how far it is from the vertices (n,) to the other side of the object [world units]."""
+    hits = trace_rays(tracer.mesh.vertices[vertices] + 8 * tracer.lift * inward, inward, tracer)
+    return torch.where(hits.hit, hits.distance, torch.zeros_like(hits.distance))
+
+
+def _agreed(edges: MeshEdges, weight: Tensor, wish: Tensor, together: float) -> Tensor:
+    """(vertex,) moves s: sum weight (s - wish)^2 + together sum_edges (s_i - s_j)^2 at its least."""
+    count = len(weight)
+    start, end = edges.vertices.cpu().numpy().T
+    row = np.arange(len(start))
+    difference = csr_matrix(
+        (np.concatenate([np.ones(len(start)), -np.ones(len(start))]), (np.tile(row, 2), np.concatenate([start, end]))),
+        shape=(len(start), count),
+    )
+    strength, wanted = (values.cpu().double().numpy() for values in (weight, wish))
+    matrix = (diags(strength) + together * difference.T @ difference).tocsc()
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return torch.from_numpy(factors.solve(strength * wanted).clip(0)).to(wish)
+
+
+def _averaging(edges: MeshEdges, count: int) -> csr_matrix:
+    """Matrix that takes the mean over each vertex and its neighbours."""
+    start, end = edges.vertices.cpu().numpy().T
+    ones = np.ones(2 * len(start))
+    adjacency = csr_matrix((ones, (np.concatenate([start, end]), np.concatenate([end, start]))), shape=(count, count)) + identity(count)
+    return diags(1 / np.asarray(adjacency.sum(1)).ravel()) @ adjacency
+
+
+def _averaged(around: csr_matrix, values: Tensor, rings: int) -> Tensor:
+    """Values (vertex, k), averaged `rings` times."""
+    result = values.cpu().double().numpy()
+    for _ in range(rings):
+        result = around @ result
+    return torch.from_numpy(result).to(values)
