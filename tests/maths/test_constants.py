@@ -55,7 +55,6 @@ OTHERS = {
     ("drgs/deform/mpm/conditions.py", 1e30): "the end of conditions that never end [s]",
     ("drgs/deform/mpm/records.py", 1e30): "the yield stress of matter that never yields [Pa]",
     ("drgs/exchange/gltf_accessors.py", 1e30): "a bound on the numbers of a file",
-    ("drgs/reconstruct/progress.py", 0.04): "a stage's share of a build",
     ("drgs/reconstruct/fit/surfel_parameters.py", 0.04): "a learning rate",
     ("drgs/reconstruct/geometry/extract_mesh/fuse_depth.py", 1e30): "an inverse depth beyond all others",
     ("drgs/render/intersect/horizon.h", 1e30): "the tangent of a horizon that nothing is below, and corners of empty boxes",
