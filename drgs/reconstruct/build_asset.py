@@ -112,10 +112,10 @@ PRESETS = {
     "fast": Preset(
         15_000,
         512,
-        FitSettings(iterations=600, densify=DensifySettings(budget=30_000)),
+        FitSettings(iterations=800, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
-        PassSettings(8, SurfaceSettings(rounds=1, steps_a_round=60)),
-        MeshMaterialSettings(iterations=150),
+        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carvings=2),
+        MeshMaterialSettings(iterations=180),
         MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
     ),
