@@ -279,6 +279,22 @@ def test_an_unknown_job_is_not_done(bench: Bench) -> None:
 
 
 @pytest.mark.slow
+def test_a_job_on_its_way_to_the_queue_is_read_as_queued(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def look_then_fail(*_: object) -> None:
+        seen.append(bench.state("on-its-way"))
+        raise ConnectionError("the queue's database went away")
+
+    monkeypatch.setattr(bench.queue._client, "enqueue", look_then_fail)
+    row = JobRow(id="on-its-way", kind="build", name="tiny", dataset="nowhere", preset="draft", seed=0, created_at=now())
+    with pytest.raises(ConnectionError):
+        bench.queue.submit(row)
+    assert seen == ["queued"]
+    assert bench.state("on-its-way") == "unknown"
+
+
+@pytest.mark.slow
 def test_a_job_that_never_reached_the_queue_is_unknown_until_it_is_retried(bench: Bench) -> None:
     row = JobRow(id="stored-only", kind="build", name="tiny", dataset="nowhere", preset="draft", seed=0, created_at=now())
     with Session(bench.engine) as session, session.begin():

@@ -60,6 +60,7 @@ class JobQueue:
     def __init__(self, directory: DataDirectory, engine: Engine) -> None:
         refuse_pickled_rows()
         self._engine = engine
+        self._on_their_way: set[str] = set()
         migrate_queue(directory)
         self._client = DBOSClient(
             system_database_url=directory.queue_url, serializer=DBOSPortableJSONSerializer(), application_name=APPLICATION_NAME
@@ -69,10 +70,18 @@ class JobQueue:
         self._client.destroy()
 
     def submit(self, row: JobRow) -> None:
-        """Store the job and enqueue it; a job that was stored but not enqueued reads `unknown`, never done."""
-        with Session(self._engine, expire_on_commit=False) as session, session.begin():
-            session.add(row)
-        self._enqueue(row)
+        """Store the job and enqueue it; a job that was stored but not enqueued reads `unknown`, never done.
+
+        The two lie in two databases, and others may read the job between them: until this call ends it reads `queued`.
+        """
+        job_id = row.id
+        self._on_their_way.add(job_id)
+        try:
+            with Session(self._engine, expire_on_commit=False) as session, session.begin():
+                session.add(row)
+            self._enqueue(row)
+        finally:
+            self._on_their_way.discard(job_id)
 
     def _enqueue(self, row: JobRow) -> None:
         self._client.enqueue(
@@ -96,6 +105,8 @@ class JobQueue:
         wanted = list(job_ids)
         if not wanted:
             return {}
+        # Before the queue is asked: a job that arrives there meanwhile is then in one of the two.
+        on_their_way = self._on_their_way.intersection(wanted)
         # Three columns of DBOS's table: its own list reads thirty, which is most of what listing 500 jobs costs.
         query = select(_STATUS.c.workflow_uuid, _STATUS.c.status, _STATUS.c.executor_id).where(_STATUS.c.workflow_uuid.in_(wanted))
         with self._client._sys_db.engine.connect() as connection:
@@ -104,7 +115,8 @@ class JobQueue:
         answer = {}
         for job_id in wanted:
             row = found.get(job_id)
-            state = _STATES.get(row.status, "unknown") if row else "unknown"
+            missing = "queued" if job_id in on_their_way else "unknown"
+            state = _STATES.get(row.status, "unknown") if row else missing
             if row and state == "running" and row.executor_id in dead:
                 state = "stalled"
             answer[job_id] = JobStatus(state)
