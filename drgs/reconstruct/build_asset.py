@@ -124,8 +124,8 @@ PRESETS = {
         1024,
         FitSettings(iterations=1400, half_size_share=0.25, densify=DensifySettings(budget=40_000)),
         FULL_MESH,
-        PassSettings(18, mesh=replace(PASS_MESH, resolution=224, face_limit=80_000), carvings=8),
-        MeshMaterialSettings(iterations=800),
+        PassSettings(24, mesh=replace(PASS_MESH, resolution=224, face_limit=80_000), carvings=10),
+        MeshMaterialSettings(iterations=1200, rounds=3),
         MeshFitSettings(iterations=500),
         surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
     ),
@@ -253,14 +253,13 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         surface = surface_stage(place, views, built.gaussians, built.mesh, built.fit.parameters, built.radius, passes)
     yield "surface", None
 
-    surfels, binding = surfels_on_faces_of(surface.mesh)
+    bound = None
     if built.settings.binding == "mesh":
         with timed("bind"):
             bind_settings = replace(built.preset.mesh_surfels, seed=seed)
-            bound = bind_stage(
-                place.of(binding="mesh"), views, (surfels, binding), surface.mesh, surface.state.parameters, built.radius, bind_settings
-            )
-            surfels, binding = gaussians_from_mesh_fit(bound)
+            on_faces = surfels_on_faces_of(surface.mesh)
+            light = surface.state.parameters
+            bound = bind_stage(place.of(binding="mesh"), views, on_faces, surface.mesh, light, built.radius, bind_settings)
         yield "bind", None
 
     with timed("materials"):
@@ -271,6 +270,8 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
     with timed("pack"):
         place.reporter.report("pack", 0.0, "writing the asset")
         mesh, environment = decoupled.mesh, Environment(environment_table(decoupled.state.parameters).detach())
+        # Faces moved once more with the materials; surfels stay where they are on them.
+        surfels, binding = surfels_on_faces_of(mesh) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=mesh))
         surfels = radiating_surfels(surfels, binding, mesh, environment)
         asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh")
     return asset, surface_preview(decoupled, views.cameras)

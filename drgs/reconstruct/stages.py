@@ -177,7 +177,7 @@ def surface_stage(
         write_tensors(path, fit_tensors(fit.state) | {"faces": fit.faces, "pass": torch.tensor(fit.index)}, place.identity)
 
     def report(r: FitReport) -> None:
-        message = f"pass {fit.index + 1} of {settings.passes}, {len(fit.faces)} faces"
+        message = "; ".join(filter(None, (f"pass {fit.index + 1} of {settings.passes}, {len(fit.faces)} faces", fit.remark)))
         place.reporter.report("surface", r.iteration / r.iterations, message, r, lambda: surface_preview(fit, views.cameras), save)
 
     done = fit_surface_in_passes(views, fit, settings, radius, report, place.should_stop)
@@ -189,7 +189,7 @@ def surface_stage(
 
 def mesh_materials_stage(place: Workplace, views: Views, surface: SurfaceFit, radius: float, settings: MeshMaterialSettings) -> SurfaceFit:
     """fit_mesh_materials on the surface as it was fitted."""
-    state = start_mesh_materials(surface.state, settings, radius)
+    state = start_mesh_materials(surface.state, surface.faces, settings, radius)
     fit = SurfaceFit(state, surface.faces, surface.index)
     _checkpointed_fit(
         place,

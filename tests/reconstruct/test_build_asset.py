@@ -21,6 +21,7 @@ from drgs.reconstruct.fit.fit_materials import MaterialSettings
 from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings
 from drgs.reconstruct.fit.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.moving_surface import MoveSettings
 from drgs.reconstruct.fit.surface_passes import PASS_MESH, PassSettings
 from drgs.reconstruct.fit.surfel_parameters import parameters_from_gaussians
 from drgs.reconstruct.geometry.bind_gaussians import points_from_binding
@@ -40,7 +41,9 @@ TINY = Preset(
     image_side=72,
     fit=FitSettings(iterations=20, densify=DensifySettings(every=5, budget=700)),
     mesh=MeshSettings(resolution=48, face_limit=2000),
-    surface=PassSettings(2, SurfaceSettings(rounds=1, steps_a_round=3, share_rays=4), replace(PASS_MESH, resolution=32, face_limit=2000)),
+    surface=PassSettings(
+        2, SurfaceSettings(rounds=1, steps_a_round=3, moves=MoveSettings(share_rays=4)), replace(PASS_MESH, resolution=32, face_limit=2000)
+    ),
     materials=MeshMaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
     mesh_surfels=MeshFitSettings(iterations=6),
     surfel_materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),

@@ -13,6 +13,7 @@ from drgs.reconstruct.fit.fit_gaussians import FitSettings
 from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings
 from drgs.reconstruct.fit.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.moving_surface import MoveSettings
 from drgs.reconstruct.fit.surface_passes import PASS_MESH, PassSettings
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.progress import STAGE_SHARES, Progress
@@ -31,7 +32,9 @@ TINY = Preset(
     image_side=72,
     fit=FitSettings(iterations=12, densify=DensifySettings(every=5, budget=700)),
     mesh=MeshSettings(resolution=48, face_limit=2000),
-    surface=PassSettings(2, SurfaceSettings(rounds=1, steps_a_round=2, share_rays=4), replace(PASS_MESH, resolution=32, face_limit=2000)),
+    surface=PassSettings(
+        2, SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)), replace(PASS_MESH, resolution=32, face_limit=2000)
+    ),
     materials=MeshMaterialSettings(iterations=4, points_a_step=64, samples=SampleCounts(4, 2, 2)),
     mesh_surfels=MeshFitSettings(iterations=3),
 )

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.sparse import csr_matrix, diags, identity
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -53,6 +53,8 @@ class CarveSettings:
     """Share of the difference on the surface that is left at the wish, at most."""
     margin: float = 0.01
     """Least gain of the difference, of display values 0..1."""
+    equal: float = 0.1
+    """Share of the gain by which a nearer place may be worse than the best."""
     shallowest: int = 3
     """Steps: what lies nearer is for normals and outlines to find."""
     agreeing: float = 0.5
@@ -102,7 +104,10 @@ def carved_depths(
         total, weight = _averaged(around, sums, settings.cost_rings)[matt].unbind(-1)
         costs.append(torch.where(weight > 1e-3 * settings.fewest_views, total / weight.clamp(min=1e-9), torch.full_like(total, torch.inf)))
     cost = torch.stack(costs)
-    least, at = cost.min(0)
+    least = cost.min(0).values
+    # Plain paint agrees nearly as well in front of where it is as there, and behind as well: the nearest of equals is chosen.
+    near = cost <= least + settings.equal * (cost[0] - least).clamp(min=0)
+    at = near.to(torch.uint8).argmax(0)
     wishes = (least < settings.better * cost[0]) & (cost[0] - least > settings.margin) & torch.isfinite(cost[0])
     wishes &= at >= settings.shallowest
     alike = torch.zeros(len(mesh.vertices), 2, device=matt.device)
@@ -113,7 +118,7 @@ def carved_depths(
     weight, wish = torch.full_like(mesh.roughness, settings.hold), torch.zeros_like(mesh.roughness)
     weight[matt[cost[0] > settings.disagreeing]] = settings.hold_unsure  # also where too few views see them, for then it is endless
     weight[matt[wishes]], wish[matt[wishes]] = 1.0, common[wishes]
-    depth = _agreed(edges, weight, wish, settings.together)
+    depth = agree_along_edges(edges, weight, wish, settings.together).clamp(min=0)
     return inward, depth
 
 
@@ -170,21 +175,6 @@ def _thickness(tracer: AbstractTracer, vertices: Tensor, inward: Tensor) -> Tens
     """(n,) how far it is from the vertices (n,) to the other side of the object [world units]."""
     hits = trace_rays(tracer.mesh.vertices[vertices] + 8 * tracer.lift * inward, inward, tracer)
     return torch.where(hits.hit, hits.distance, torch.zeros_like(hits.distance))
-
-
-def _agreed(edges: MeshEdges, weight: Tensor, wish: Tensor, together: float) -> Tensor:
-    """(vertex,) moves s: sum weight (s - wish)^2 + together sum_edges (s_i - s_j)^2 at its least."""
-    count = len(weight)
-    start, end = edges.vertices.cpu().numpy().T
-    row = np.arange(len(start))
-    difference = csr_matrix(
-        (np.concatenate([np.ones(len(start)), -np.ones(len(start))]), (np.tile(row, 2), np.concatenate([start, end]))),
-        shape=(len(start), count),
-    )
-    strength, wanted = (values.cpu().double().numpy() for values in (weight, wish))
-    matrix = (diags(strength) + together * difference.T @ difference).tocsc()
-    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return torch.from_numpy(factors.solve(strength * wanted).clip(0)).to(wish)
 
 
 def _averaging(edges: MeshEdges, count: int) -> csr_matrix:

@@ -10,7 +10,9 @@ Value and derivative come from different sets, 1/2 [l'(A) dB + l'(B) dA]: with o
 leans towards low variance, that is to rough and dim. Source: the paper's stage 2 with the parameters of Gu et al. 2025 where it is silent;
 independent halves after Nicolet et al. 2023 (docs/sources.md: gu2025irgs, nicolet2023). Exact densities and one definition of F0 throughout.
 
-In: the state of fit_surface, whose vertices stay. Out: the same, further.
+In rounds: between two the surface follows the normals, which this estimate knows better than split sum does (moving_surface).
+
+In: the state of fit_surface. Out: the same, further.
 """
 
 from collections.abc import Callable
@@ -21,21 +23,23 @@ from torch import Tensor
 
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
-from drgs.reconstruct.fit.fit_surface import SOLID, SurfaceRates, mesh_from_surface_fit, prior_terms
+from drgs.reconstruct.fit.fit_surface import SOLID, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.losses import display_image
 from drgs.reconstruct.fit.mesh_light import at_corners, corner_weights, radiance_along
+from drgs.reconstruct.fit.metal_evidence import metal_evidence
+from drgs.reconstruct.fit.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.split_sum import filter_environment
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
-from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.integrate.environment_table import build_environment_table
 from drgs.render.integrate.integrate_samples import integrate_samples
 from drgs.render.integrate.sample_rays import sample_rays
-from drgs.render.intersect.trace_rays import build_tracer, trace_rays
+from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Rays, SampleCounts, ShadingPoints
 from drgs.scene.camera import world_from_pixel
 from drgs.scene.environment import Environment
+from drgs.scene.mesh import vertex_normals
 from drgs.scene.views import Views
 
 
@@ -44,6 +48,9 @@ class MeshMaterialSettings:
     """Stage 2."""
 
     iterations: int = 300
+    rounds: int = 2
+    """After each the surface follows its normals, and what is metal is looked at again; but not after the last one."""
+    moves: MoveSettings = field(default_factory=MoveSettings)
     points_a_step: int = 2048
     samples: SampleCounts = field(default_factory=lambda: SampleCounts(32, 16, 16))
     """Rays a point in each of two sets: cosine, GGX, environment (the paper: 256, 128, 128 in one)."""
@@ -56,9 +63,10 @@ class MeshMaterialSettings:
     seed: int = 0
 
 
-def start_mesh_materials(surface: FitState, settings: MeshMaterialSettings, radius: float) -> FitState:
-    """The surface as it was fitted, with this stage's rates."""
-    values = leaves(surface.parameters, frozen=("vertices", "open_share", "metal"))
+def start_mesh_materials(surface: FitState, faces: Tensor, settings: MeshMaterialSettings, radius: float) -> FitState:
+    """The surface as it was fitted, with its own normals, which are smoother than the fitted ones, and this stage's rates."""
+    own = {"normals": vertex_normals(surface.parameters["vertices"].detach(), faces)}
+    values = leaves(surface.parameters | own, frozen=("vertices", "open_share", "metal"))
     return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 1))
 
 
@@ -76,7 +84,9 @@ def fit_mesh_materials(
     def rates(iteration: int) -> dict[str, float]:
         return cosine_rates(state.optimizer, iteration, settings.iterations)
 
-    return run_fit(FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates), report, should_stop)
+    return run_fit(
+        FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, after_step=steps.end_round), report, should_stop
+    )
 
 
 def crossed_halves(first: Tensor, second: Tensor, photo: Tensor) -> Tensor:
@@ -114,9 +124,17 @@ class _Steps:
         self.state, self.settings, self.faces = state, settings, faces
         self.targets = view_targets(views, 1.0, faces.device)
         self.solid = [(target.mask.flatten() > SOLID).nonzero().squeeze(1) for target in self.targets]
-        self.edges = mesh_edges(faces)
-        self.tracer = build_tracer(mesh_from_surface_fit(state, faces))
-        _ = self.tracer.face_normals  # computed once, shared by the copies with other materials
+        self.surface = MovingSurface(views, faces, state)
+
+    def end_round(self, done: int) -> None:
+        total, rounds = self.settings.iterations, self.settings.rounds
+        if done < total and done * rounds // total > (done - 1) * rounds // total:
+            self.surface.move(self.settings.moves)
+            parameters = self.state.parameters
+            with torch.no_grad():
+                tables = filter_environment(environment_table(parameters))
+                evidence = metal_evidence(self.surface.tracer, self.targets, parameters["open_share"], tables, self.surface.edges)
+                parameters["metal"].copy_(evidence)
 
     def step(self, iteration: int) -> StepLoss:
         parameters, settings = self.state.parameters, self.settings
@@ -135,7 +153,7 @@ class _Steps:
             mean = 0.5 * (first + second).detach()
             squared_error = float((mean.clamp(0, 1) - photo).square().mean())
         terms |= prior_terms(
-            self.edges, environment, normals, materials, parameters["metal"], settings.weight_bend, settings.weight_smooth,
+            self.surface.edges, environment, normals, materials, parameters["metal"], settings.weight_bend, settings.weight_smooth,
             settings.weight_metal, settings.weight_white_light, settings.weight_rough_light,
         )  # fmt: skip
         return StepLoss(terms, target.camera, squared_error)
@@ -153,12 +171,12 @@ class _Steps:
             direction = torch.cat([at, torch.ones_like(at[:, :1])], -1) @ world_from_pixel(target.camera).T
             direction = torch.nn.functional.normalize(direction, dim=-1)
             origin = target.camera.center_world
-            hits = trace_rays(origin.expand_as(direction), direction, self.tracer)
+            hits = trace_rays(origin.expand_as(direction), direction, self.surface.tracer)
             hit = hits.hit.nonzero().squeeze(1)
             face = hits.face[hit].long()
             corners, weights = self.faces[face].long(), corner_weights(hits.barycentric[hit])
         points = ShadingPoints(
-            position_world=at_corners(self.tracer.mesh.vertices, corners, weights),
+            position_world=at_corners(self.surface.tracer.mesh.vertices, corners, weights),
             normal_world=torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1),
             wo_world=-direction[hit],
             albedo=at_corners(materials["albedo"], corners, weights),
@@ -166,14 +184,14 @@ class _Steps:
             metallic=at_corners(materials["metallic"], corners, weights),
             pixel=chosen[hit].int(),
         )
-        return points, self.tracer.face_normals[face]
+        return points, self.surface.tracer.face_normals[face]
 
     def _shown(self, points: ShadingPoints, face_normal: Tensor, environment: Tensor, photo: Tensor, draw: int) -> Tensor:
         """(point, 3) colour in display space by one set of rays; gradients reach materials, normals and the light."""
         with torch.no_grad():
             table = build_environment_table(Environment(environment.detach()))
             rays = sample_rays(points, table, self.settings.samples, self.settings.seed * 1_000_003 + draw)
-            tracer = self.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
+            tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
             light = IncidentLight(tracer, self.state.parameters["open_share"], filter_environment(environment.detach()))
             transmittance, met = traced_light(light, points, face_normal, rays)
         radiance = integrate_samples(points, rays, transmittance, met, environment)

@@ -23,20 +23,18 @@ from drgs.maths.brdf import f0_from_base
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.losses import display_image, rough_light, white_light
-from drgs.reconstruct.fit.mesh_light import at_corners, corner_weights, irradiance_share, mirrored_light
+from drgs.reconstruct.fit.mesh_light import at_corners, corner_weights, mirrored_light
 from drgs.reconstruct.fit.metal_evidence import metal_evidence
+from drgs.reconstruct.fit.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
-from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, integrate_normals
-from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outlines, outline_residuals
-from drgs.reconstruct.geometry.mesh_edges import MeshEdges, mesh_edges
-from drgs.render.intersect.trace_rays import build_tracer, trace_rays
+from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.render.intersect.trace_rays import trace_rays
 from drgs.scene.camera import pixel_rays_world
-from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
-from drgs.scene.mesh import TriangleMesh, vertex_normals
+from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 
 SOLID = 0.995
@@ -72,13 +70,7 @@ class SurfaceSettings:
     rates: SurfaceRates = field(default_factory=SurfaceRates)
     fall_from: float = 0.5
     """Share of the steps after which rates fall, by a cosine to a twentieth; 1: they do not."""
-    integration: IntegrationSettings = field(default_factory=IntegrationSettings)
-    solves: int = 2
-    """Positions a round: outlines are found anew between."""
-    to_surface: float = 0.5
-    """Share by which normals return to the surface's own after a solve."""
-    share_rays: int = 48
-    """Rays a vertex for the irradiance that arrives there."""
+    moves: MoveSettings = field(default_factory=MoveSettings)
     weight_bend: float = 0.05
     weight_bend_end: float = 0.005
     """Of the mean difference of normals along edges, at the start and at the end."""
@@ -117,19 +109,6 @@ def start_surface(
     return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 2))
 
 
-def mesh_from_surface_fit(state: FitState, faces: Tensor) -> TriangleMesh:
-    """The mesh as it is now; its normals are the fitted ones."""
-    p = {name: value.detach() for name, value in state.parameters.items()}
-    return TriangleMesh(
-        p["vertices"].contiguous(),
-        faces,
-        torch.nn.functional.normalize(p["normals"], dim=-1),
-        torch.sigmoid(p["albedo_logits"]),
-        torch.sigmoid(p["roughness_logits"]),
-        torch.sigmoid(p["metallic_logits"]),
-    )
-
-
 def fit_surface(
     views: Views,
     mesh: TriangleMesh,
@@ -160,10 +139,7 @@ class _Steps:
     def __init__(self, views: Views, faces: Tensor, state: FitState, settings: SurfaceSettings) -> None:
         self.state, self.settings, self.faces = state, settings, faces
         self.targets = view_targets(views, 1.0, faces.device)
-        self.cameras = tuple(target.camera for target in self.targets)
-        self.outlines: list[MaskOutline | None] = mask_outlines(views) if views.has_masks else [None] * len(self.cameras)
-        self.edges = mesh_edges(faces)
-        self.tracer = build_tracer(mesh_from_surface_fit(state, faces))
+        self.surface = MovingSurface(views, faces, state)
 
     def end_round(self, done: int) -> None:
         if done % self.settings.steps_a_round == 0:
@@ -171,30 +147,13 @@ class _Steps:
 
     @torch.no_grad()
     def move_surface(self) -> None:
-        """Positions from normals and outlines, then light that the moved surface blocks and sends back."""
-        parameters, settings = self.state.parameters, self.settings
-        normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
-        for _ in range(settings.solves):
-            residuals = outline_residuals(self.edges, self.tracer, self.cameras, self.outlines)
-            moved = integrate_normals(parameters["vertices"], self.faces, normals, self.edges, residuals, settings.integration)
-            parameters["vertices"].copy_(moved)
-            self.tracer = build_tracer(mesh_from_surface_fit(self.state, self.faces))
-        own = vertex_normals(parameters["vertices"], self.faces)
-        back = (1 - settings.to_surface) * normals + settings.to_surface * own
-        parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))
-        self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
-        radiance = environment_table(parameters)
-        share = irradiance_share(
-            self.tracer,
-            Environment(radiance),
-            filter_environment(radiance),
-            parameters["open_share"],
-            settings.share_rays,
-            self.state.generator,
-        )
-        parameters["open_share"].copy_(share)
-        if self.state.iteration > settings.metal_from * settings.iterations:
-            parameters["metal"].copy_(metal_evidence(self.tracer, self.targets, share, filter_environment(radiance), self.edges))
+        """Where normals and outlines say, and what is metal there."""
+        self.surface.move(self.settings.moves)
+        parameters = self.state.parameters
+        if self.state.iteration > self.settings.metal_from * self.settings.iterations:
+            tables = filter_environment(environment_table(parameters))
+            evidence = metal_evidence(self.surface.tracer, self.targets, parameters["open_share"], tables, self.surface.edges)
+            parameters["metal"].copy_(evidence)
 
     def step(self, iteration: int) -> StepLoss:
         if iteration == 0:
@@ -215,7 +174,7 @@ class _Steps:
         bend = settings.weight_bend ** (1 - progress) * settings.weight_bend_end**progress
         smooth = settings.weight_smooth ** (1 - progress) * settings.weight_smooth_end**progress
         terms |= prior_terms(
-            self.edges, environment, normals, materials, parameters["metal"], bend, smooth, settings.weight_metal,
+            self.surface.edges, environment, normals, materials, parameters["metal"], bend, smooth, settings.weight_metal,
             settings.weight_white_light, settings.weight_rough_light,
         )  # fmt: skip
         return StepLoss(terms, target.camera, squared_error)
@@ -226,7 +185,7 @@ class _Steps:
             origin, directions = pixel_rays_world(target.camera)
             solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
             direction = directions.reshape(-1, 3)[solid]
-            hits = trace_rays(origin.expand_as(direction), direction, self.tracer)
+            hits = trace_rays(origin.expand_as(direction), direction, self.surface.tracer)
             hit = hits.hit.nonzero().squeeze(1)
             pixels, wo, face = solid[hit], -direction[hit], hits.face[hit].long()
             corners, weights = self.faces[face].long(), corner_weights(hits.barycentric[hit])
@@ -237,7 +196,7 @@ class _Steps:
         tables = filter_environment(environment)
         share = self.state.parameters["open_share"]
         with torch.no_grad():
-            tracer = self.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
+            tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
             position = at_corners(tracer.mesh.vertices, corners, weights)
             transmittance, met = mirrored_light(
                 tracer, position, tracer.face_normals[face], normal.detach(), roughness.detach(), wo, share, tables.detach(),

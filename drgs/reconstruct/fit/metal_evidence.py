@@ -8,7 +8,10 @@ with d the diffuse albedo, f the reflectance at normal incidence, E the irradian
 Matter that is no metal has f = 0.04 and a free d, metal has d = 0 and a free f: three numbers each, so that their residuals compare fairly.
 Gradients never decide this: a darker light and a diffuse part trade places without a trace in the loss.
 
-In: the mesh through its tracer, photographs, light. Out: evidence in -1 (no metal) .. 1 (metal) a vertex, 0 where views say nothing.
+Errors of shape and light spoil the predicted mirror S_v, not the constant E, so they count against metal alone: real paint hardly ever says
+"metal", real metal says "paint" wherever its normals are off. So the benefit of the doubt is metal's, and each place hears its surroundings.
+
+In: the mesh through its tracer, photographs, light. Out: evidence in -1 (no metal) .. 1 (metal) a vertex, near 0 where nothing is known.
 """
 
 from functools import partial
@@ -22,6 +25,7 @@ from drgs.maths.constants import F0
 from drgs.reconstruct.fit.mesh_light import radiance_along
 from drgs.reconstruct.fit.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -37,8 +41,18 @@ NOISE = 0.02
 """Standard deviation of a photograph's radiance, relative above DARK, that explains nothing."""
 NEIGHBOURHOOD = 3
 """Times that residuals are averaged with the neighbours'."""
-DECISIVE = 0.7
-"""Difference of the residuals' logarithms at which evidence is 0.6."""
+DOUBT = 0.4
+"""Of the residuals' logarithms: by how much metal may explain worse and is believed, where it leaves much unexplained."""
+LOST = 0.45
+"""Relative error of the better explanation above which neither says much: there the shape is wrong, not the paint."""
+STRONGEST = 2.0
+"""Difference of the logarithms beyond which a place counts no more than that."""
+TOGETHER = 3.0
+"""Weight of neighbours being of one kind, against a difference of logarithms of 1."""
+UNSEEN = 1e-4
+"""Weight of a place of which views say nothing: it is what its surroundings are."""
+DECISIVE = 0.3
+"""Agreement of a place and its surroundings, -1..1, at which evidence is 0.76."""
 
 
 def metal_evidence(
@@ -76,8 +90,14 @@ def metal_evidence(
     metal = (yy - 2 * reflectance * ay + reflectance**2 * aa).clamp(min=0).sum(-1)
     floor = 3 * NOISE**2 * views
     plain, metal = (_averaged(error + floor, views, edges) for error in (plain, metal))
-    evidence = torch.tanh(torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) / DECISIVE)
-    return torch.where(views >= FEWEST_VIEWS, evidence, torch.zeros_like(evidence))
+    floor = _averaged(floor, views, edges)
+    unexplained = 1 - floor / metal.clamp(min=1e-12)
+    relative_error = ((torch.minimum(plain, metal) - floor).clamp(min=0) / 3).sqrt()
+    trust = 1 / (1 + (relative_error / LOST) ** 4)
+    better = torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) + DOUBT * trust * unexplained
+    strength = torch.where(views >= FEWEST_VIEWS, trust * better.abs().clamp(max=STRONGEST), torch.zeros_like(better))
+    kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER)
+    return torch.tanh(kind / DECISIVE)
 
 
 def _seen_vertices(tracer: AbstractTracer, target: ViewTarget) -> tuple[Tensor, Tensor, Tensor]:

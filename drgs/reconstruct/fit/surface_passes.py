@@ -14,12 +14,13 @@ from torch import Tensor
 
 from drgs.reconstruct.fit.carve_hollows import CarveSettings, carved_depths
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
-from drgs.reconstruct.fit.fit_surface import SurfaceSettings, fit_surface, mesh_from_surface_fit
+from drgs.reconstruct.fit.fit_surface import SurfaceSettings, fit_surface
+from drgs.reconstruct.fit.moving_surface import mesh_from_surface_fit
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
-from drgs.reconstruct.geometry.remesh import remesh
+from drgs.reconstruct.geometry.remesh import NothingEnclosed, remesh
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.mesh import TriangleMesh, vertex_normals
 from drgs.scene.views import Views
@@ -51,6 +52,8 @@ class SurfaceFit:
     """Of the state's vertices."""
     index: int = 0
     """Of the pass under way."""
+    remark: str = ""
+    """What went otherwise than planned, in a sentence."""
 
     @property
     def mesh(self) -> TriangleMesh:
@@ -92,6 +95,9 @@ def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> N
 
     Args:
         radius: of the object's bounding sphere [world units].
+
+    Raises:
+        NothingEnclosed: what is there has no inside; the fit is as it was.
     """
     new = remesh(fit.state.parameters["vertices"].detach(), fit.faces, settings.mesh)
     values = {}
@@ -100,11 +106,28 @@ def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> N
             values[name] = value.detach().clone()
         else:
             values[name] = new.vertices if name == "vertices" else new.carried(value.detach())
+    fit.faces = new.faces
+    _start_pass(fit, values, settings, radius)
+
+
+def _start_pass(fit: SurfaceFit, values: dict[str, Tensor], settings: PassSettings, radius: float) -> None:
+    """The pass after the one under way, from `values` of the fit's vertices."""
     values = leaves(values, frozen=("vertices", "open_share", "metal"))
     fit.index += 1
     own = settings_of_pass(settings, fit.index)
     fit.state = FitState(values, make_optimizer(values, own.rates, radius), torch.Generator().manual_seed(own.seed + 2))
-    fit.faces = new.faces
+
+
+def carve_and_start_next_pass(fit: SurfaceFit, targets: list[ViewTarget], settings: PassSettings, radius: float) -> None:
+    """The steps between two passes. A surface that carving and solves have undone is not meshed anew: the pass starts on the mesh before them."""
+    before = {name: value.detach().clone() for name, value in fit.state.parameters.items()}
+    if fit.index < settings.carvings:
+        carve_hollows(fit, targets, settings.carve, radius)
+    try:
+        start_next_pass(fit, settings, radius)
+    except NothingEnclosed as error:
+        fit.remark = f"after pass {fit.index + 1} the mesh before was kept, for {error}"
+        _start_pass(fit, before, settings, radius)
 
 
 def fit_surface_in_passes(
@@ -132,6 +155,5 @@ def fit_surface_in_passes(
             return False
         if fit.index + 1 >= settings.passes:
             return True
-        if fit.index < settings.carvings:
-            carve_hollows(fit, view_targets(views, 1.0, fit.faces.device), settings.carve, radius)
-        start_next_pass(fit, settings, radius)
+        targets = view_targets(views, 1.0, fit.faces.device) if fit.index < settings.carvings else []
+        carve_and_start_next_pass(fit, targets, settings, radius)

@@ -26,6 +26,10 @@ INSIDE = 0.5
 """Winding number."""
 
 
+class NothingEnclosed(ValueError):
+    """A mesh has no inside at the resolution asked for; the text is a sentence."""
+
+
 @dataclass(frozen=True, eq=False)
 class Remeshed:
     """Even triangles, and where their vertices lie on the old mesh."""
@@ -48,7 +52,8 @@ def remesh(vertices: Tensor, faces: Tensor, settings: MeshSettings) -> Remeshed:
         vertices: (vertex, 3). faces: (face, 3). settings: its resolution counts cells along the longest side.
 
     Raises:
-        ValueError: a vertex is not finite, or the mesh encloses nothing at this resolution.
+        ValueError: a vertex is not finite.
+        NothingEnclosed: the mesh encloses nothing at this resolution.
     """
     old = vertices.detach().cpu().double().numpy()
     lost = np.flatnonzero(~np.isfinite(old).all(1))
@@ -68,7 +73,9 @@ def remesh(vertices: Tensor, faces: Tensor, settings: MeshSettings) -> Remeshed:
     distance = np.ones(shape)
     distance[near] = np.where(inside, -1, 1) * np.sqrt(squared)
     if not inside.any():
-        raise ValueError(f"the mesh of {len(triangles)} faces encloses nothing at {settings.resolution} cells; expected a closed surface")
+        raise NothingEnclosed(
+            f"the mesh of {len(triangles)} faces encloses nothing at {settings.resolution} cells; expected a closed surface"
+        )
     # Cubes all of whose corners were computed; none of the surface lies in others.
     whole = binary_erosion(near, np.ones((3, 3, 3), bool))
     found, found_faces, _, _ = marching_cubes(distance, 0.0, spacing=(cell,) * 3, mask=whole)

@@ -15,7 +15,8 @@ from drgs.reconstruct.fit.fit_mesh_materials import (
     start_mesh_materials,
     traced_light,
 )
-from drgs.reconstruct.fit.fit_surface import SurfaceSettings, mesh_from_surface_fit, start_surface
+from drgs.reconstruct.fit.fit_surface import SurfaceSettings, start_surface
+from drgs.reconstruct.fit.moving_surface import MoveSettings, mesh_from_surface_fit
 from drgs.reconstruct.fit.split_sum import filter_environment
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.records import SampleCounts
@@ -65,7 +66,7 @@ def short(iterations: int, **changes) -> MeshMaterialSettings:
 def started(settings: MeshMaterialSettings) -> FitState:
     surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
     surface = start_surface(surfels, placed_sphere(), grey_light(), SurfaceSettings(), SPHERE_RADIUS)
-    return start_mesh_materials(surface, settings, SPHERE_RADIUS)
+    return start_mesh_materials(surface, placed_sphere().faces, settings, SPHERE_RADIUS)
 
 
 def fitted(
@@ -80,7 +81,7 @@ def fitted(
 
 @pytest.mark.slow
 def test_a_grey_sphere_takes_on_the_colours_of_its_photographs(views: Views):
-    state, reports = fitted(views, short(40))
+    state, reports = fitted(views, short(40, rounds=1))
     assert [r.iteration for r in reports] == list(range(1, 41))
     assert reports[-1].psnr > reports[0].psnr + 3.0
     mesh = mesh_from_surface_fit(state, placed_sphere().faces)
@@ -88,6 +89,13 @@ def test_a_grey_sphere_takes_on_the_colours_of_its_photographs(views: Views):
     normal = (mesh.vertices - CENTER) / SPHERE_RADIUS
     for channel in range(3):  # the paint's red grows with the normal's x, and so on
         assert float(torch.corrcoef(torch.stack([mesh.albedo[:, channel], normal[:, channel]]))[0, 1]) > 0.5
+
+
+def test_between_rounds_the_surface_follows_and_keeps_its_outline(views: Views):
+    once, twice = (fitted(views, short(4, rounds=rounds, moves=MoveSettings(share_rays=4)))[0].parameters for rounds in (1, 2))
+    assert torch.equal(once["vertices"], placed_sphere().vertices)
+    moved = (twice["vertices"] - once["vertices"]).norm(dim=-1)
+    assert float(moved.max()) > 0.001 * SPHERE_RADIUS and float(moved.mean()) < 0.02 * SPHERE_RADIUS
 
 
 def test_the_same_seed_gives_the_same_bits(views: Views):

@@ -7,7 +7,8 @@ import torch
 
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
-from drgs.reconstruct.fit.fit_surface import SurfaceSettings, fit_surface, mesh_from_surface_fit, start_surface
+from drgs.reconstruct.fit.fit_surface import SurfaceSettings, fit_surface, start_surface
+from drgs.reconstruct.fit.moving_surface import MoveSettings, mesh_from_surface_fit
 from drgs.scene.views import Views
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
 from tests.reconstruct.surfel_spheres import surfel_sphere
@@ -22,7 +23,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
 
 
 def short(**changes) -> SurfaceSettings:
-    return SurfaceSettings(**{"rounds": 2, "steps_a_round": 3, "share_rays": 4} | changes)
+    return SurfaceSettings(**{"rounds": 2, "steps_a_round": 3, "moves": MoveSettings(share_rays=4)} | changes)
 
 
 def started(settings: SurfaceSettings) -> FitState:

@@ -82,3 +82,22 @@ def test_what_no_view_shows_is_left_open():
         build_tracer(mesh), pictures(mesh, tables)[:1], torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces)
     )
     assert float(evidence.abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_wrong_normals_do_not_turn_one_into_the_other(metallic: float):
+    mesh = dataclasses.replace(sphere_mesh(subdivisions=4, albedo=0.6, roughness=0.25), metallic=torch.full((2562,), metallic))
+    tables = filter_environment(light())
+    targets = pictures(mesh, tables)
+    tilt = 0.15 * torch.sin(9 * mesh.vertices.roll(1, 1))
+    tilted = dataclasses.replace(mesh, normals=torch.nn.functional.normalize(mesh.normals + tilt, dim=-1))
+    evidence = metal_evidence(build_tracer(tilted), targets, torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces))
+    around = mesh.vertices[:, 2].abs() < 0.6
+    assert float(((2 * metallic - 1) * evidence > 0)[around].float().mean()) > 0.98
+
+
+def test_paint_that_looks_the_same_from_everywhere_is_not_called_metal_for_want_of_proof():
+    mesh = sphere_mesh(subdivisions=3, albedo=0.6, roughness=1.0)
+    tables = filter_environment(torch.ones(128, 256, 3))
+    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces))
+    assert float(evidence.max()) < 0.3

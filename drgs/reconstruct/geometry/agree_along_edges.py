@@ -1,0 +1,31 @@
+"""Wishes of single vertices, made to agree with their surroundings' by a sparse linear solve."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.sparse import csr_matrix, diags
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+
+
+def agree_along_edges(
+    edges: MeshEdges, weight: Float[Tensor, "vertex"], wish: Float[Tensor, "vertex"], together: float
+) -> Float[Tensor, "vertex"]:
+    """The values s that minimise sum weight (s - wish)^2 + together sum_edges (s_i - s_j)^2.
+
+    Args:
+        weight: at least one above 0 in each part of the mesh that hangs together, else the solve is singular.
+    """
+    count = len(weight)
+    start, end = edges.vertices.cpu().numpy().T
+    row = np.arange(len(start))
+    difference = csr_matrix(
+        (np.concatenate([np.ones(len(start)), -np.ones(len(start))]), (np.tile(row, 2), np.concatenate([start, end]))),
+        shape=(len(start), count),
+    )
+    strength, wanted = (values.cpu().double().numpy() for values in (weight, wish))
+    matrix = (diags(strength) + together * difference.T @ difference).tocsc()
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return torch.from_numpy(factors.solve(strength * wanted)).to(wish)
