@@ -47,7 +47,7 @@ class CarveSettings:
     smoothest: float = 0.3
     """Roughness below which a surface may be a mirror."""
     most_metallic: float = 0.3
-    most_evidence: float = -0.2
+    most_evidence: float = 0.2
     """Of metal, -1..1 (metal_evidence)."""
     better: float = 0.8
     """Share of the difference on the surface that is left at the wish, at most."""
