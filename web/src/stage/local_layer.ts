@@ -36,6 +36,8 @@ export class LocalLayer {
   private readonly resolution = new DynamicResolution();
   private meshOf = '';
   private environmentUrl = '';
+  /** Its light is there, or will not come. */
+  private lit = false;
   /** NaN: from the next picture on. */
   private flashedAt = -Infinity;
 
@@ -58,7 +60,7 @@ export class LocalLayer {
 
   /** Whether it may stand in for the traced picture: only for the final picture, of a shape that the browser knows. */
   get standsIn(): boolean {
-    return localPicture.value && this.picture !== null && this.picture.hasMesh && settings.value.channel === 'final' && session.value !== null && isAnalytic(edits.value);
+    return localPicture.value && this.picture !== null && this.picture.hasMesh && this.lit && settings.value.channel === 'final' && session.value !== null && isAnalytic(edits.value);
   }
 
   /** Left of this share of the width the object stands as captured; a photograph that stands there needs no picture of ours. */
@@ -89,7 +91,7 @@ export class LocalLayer {
   /** Once each animation frame. `resting`: the camera has been still for a while; `covered`: a fresh traced picture is over it. */
   draw(now: number, { resting, covered }: { resting: boolean; covered: boolean }): void {
     const { picture } = this;
-    if (!picture?.hasMesh) return;
+    if (!picture?.hasMesh || !this.lit) return;
     if (Number.isNaN(this.flashedAt)) this.flashedAt = now;
     const since = now - this.flashedAt;
     const flashing = since < FLASH_MS;
@@ -192,15 +194,16 @@ export class LocalLayer {
     try {
       await this.picture.loadEnvironment(url, /\.hdr$/i.test(file ?? ''));
       if (file === null) capturedEnvironmentThumbnail.value = this.picture.drawEnvironment(SKY_PIXELS);
-      this.drawMaterials();
     } catch {
       notify('The light for the instant local picture could not be loaded; traced pictures show the right one.', 'info');
     }
+    this.lit = this.dirty = true;
+    this.drawMaterials();
   }
 
   /** Thumbnails of materials under the present light. */
   private drawMaterials(): void {
-    if (!this.picture) return;
+    if (!this.picture || !this.lit) return;
     materialThumbnails.value = this.picture.drawMaterials(namedMaterials.value, MATERIAL_PIXELS);
     this.resize();
   }

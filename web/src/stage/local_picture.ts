@@ -100,7 +100,6 @@ export class LocalPicture {
     this.root.matrixAutoUpdate = false;
     this.eye.matrixAutoUpdate = false;
     this.scene.add(this.root);
-    this.showEnvironment(constantEnvironment());
   }
 
   resize(width: number, height: number, pixelRatio: number): void {
@@ -198,6 +197,11 @@ export class LocalPicture {
     this.showEnvironment(await loader.setDataType(FloatType).loadAsync(url));
   }
 
+  /** Light from everywhere, where nothing else came: filtering any environment costs seconds where the browser draws without a GPU. */
+  private ensureLight(): void {
+    if (!this.scene.environment) this.showEnvironment(constantEnvironment());
+  }
+
   private showEnvironment(sky: Texture): void {
     sky.mapping = EquirectangularReflectionMapping;
     sky.minFilter = sky.magFilter = LinearFilter;
@@ -233,6 +237,7 @@ export class LocalPicture {
   // ---- pictures ----------------------------------------------------------------------------------------------------------
 
   render(frame: LocalFrame): void {
+    this.ensureLight();
     const { camera, light, settings } = frame;
     this.uniforms.highlight.value = frame.highlight;
     this.uniforms.onlyHighlight.value = frame.onlyHighlight ? 1 : 0;
@@ -271,6 +276,7 @@ export class LocalPicture {
 
   /** Pictures of materials under the present light. The canvas must be sized and drawn anew afterwards. */
   drawMaterials(materials: MaterialMean[], side: number): string[] {
+    this.ensureLight();
     return drawMaterials(this.renderer, this.scene.environment, materials, side);
   }
 
