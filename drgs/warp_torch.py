@@ -8,6 +8,7 @@ them to a thread pool. Kernels launched this way take `first: int` as their firs
 import os
 import tempfile
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
@@ -36,6 +37,9 @@ def _init_warp() -> None:
                 if b"Could not find or load the NVIDIA CUDA driver" not in line:
                     os.write(2, line)
 
+
+GRADIENT_SLICES = 4
+"""Parts of a launch that add into a copy each of what many threads add to: fixed, so that sums do not depend on how many cores there are."""
 
 _init_warp()
 
@@ -126,3 +130,13 @@ def device_from_name(name: str) -> torch.device:
     if name not in ("cpu", "cuda"):
         raise ValueError(f"device {name!r} is unknown; expected auto, cpu or cuda")
     return torch.device(name)
+
+
+def in_gradient_slices(run: Callable[[int], None], device: wp.Device) -> None:
+    """run(k) for each of GRADIENT_SLICES parts: one after another on CUDA, by the thread pool on the CPU."""
+    if device.is_cuda:
+        for k in range(GRADIENT_SLICES):
+            run(k)
+    else:
+        for done in [thread_pool().submit(run, k) for k in range(GRADIENT_SLICES)]:
+            done.result()

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from drgs.maths.brdf import ggx_d, smith_v
 from drgs.scene.environment import direction_from_uv
-from drgs.warp_torch import load_kernel, thread_pool, warp_array, warp_device
+from drgs.warp_torch import GRADIENT_SLICES, in_gradient_slices, load_kernel, warp_array, warp_device
 
 ENVIRONMENT_SIZE = (128, 256)
 """Rows and columns of the learned table."""
@@ -36,8 +36,6 @@ _LEVEL_COUNT = wp.constant(len(LEVELS))
 _IRRADIANCE_ROWS = wp.constant(IRRADIANCE_ROWS)
 _IRRADIANCE_START = wp.constant(IRRADIANCE_START)
 _TABLE_SIZE = 32
-GRADIENT_SLICES = 4
-"""Points are cut into this many slices, each with its own gradient of the tables: the sum has the same bits for any thread count."""
 
 
 def texel_directions(rows: int) -> Float[Tensor, "{rows} 2*{rows} 3"]:
@@ -230,12 +228,7 @@ def _launch_slices(
             adj_inputs=[0, *adjoints, None, None, None, None, warp_array(table_gradients[k], wp.vec3), None], adj_outputs=[out],
         )  # fmt: skip
 
-    if device.is_cuda:
-        for k in range(GRADIENT_SLICES):
-            run(k)
-    else:
-        for done in [thread_pool().submit(run, k) for k in range(GRADIENT_SLICES)]:
-            done.result()
+    in_gradient_slices(run, device)
 
 
 def shade_split_sum(

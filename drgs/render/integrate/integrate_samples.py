@@ -17,10 +17,7 @@ from torch import Tensor
 from drgs.maths.constants import F0, MIN_ROUGHNESS
 from drgs.render.integrate.brdf_warp import PI, ggx_d, smith_v
 from drgs.render.records import Rays, ShadingPoints
-from drgs.warp_torch import load_kernel, thread_pool, warp_array, warp_device
-
-GRADIENT_SLICES = 4
-"""Points are cut into this many slices, each with its own gradient of the environment: same bits for any thread count."""
+from drgs.warp_torch import GRADIENT_SLICES, in_gradient_slices, load_kernel, warp_array, warp_device
 
 
 @wp.func
@@ -131,12 +128,7 @@ def _launch(height: int, inputs: Sequence[Tensor], contribution: Tensor, gradien
             adj_inputs=[0, 0, 0, *[None] * (len(arrays) - _DIFFERENTIABLE), *adjoints, warp_array(table_gradients[k], wp.vec3)], adj_outputs=[out],
         )  # fmt: skip
 
-    if device.is_cuda:
-        for k in range(GRADIENT_SLICES):
-            run(k)
-    else:
-        for done in [thread_pool().submit(run, k) for k in range(GRADIENT_SLICES)]:
-            done.result()
+    in_gradient_slices(run, device)
 
 
 def integrate_samples(
