@@ -223,12 +223,14 @@ def prior_terms(
     rough: float,
 ) -> dict[str, Tensor]:
     """Weighted loss terms that look at no photograph: normals and materials along edges, metallic against the evidence, the light."""
-    start, end = edges.vertices.unbind(1)
-    differences = [(values[start] - values[end]).abs().mean() for values in materials.values()]
+    start, end = (corner.contiguous() for corner in edges.vertices.unbind(1))
+    across = {
+        name: values.index_select(0, start) - values.index_select(0, end) for name, values in (materials | {"normals": normals}).items()
+    }
     decided = (evidence > 0).to(evidence)
     return {
-        "bend": bend * (normals[start] - normals[end]).norm(dim=-1).mean(),
-        "smooth": smooth * torch.stack(differences).sum(),
+        "bend": bend * across["normals"].norm(dim=-1).mean(),
+        "smooth": smooth * torch.stack([across[name].abs().mean() for name in materials]).sum(),
         "metal": metal * (evidence.abs() * (materials["metallic"] - decided).abs()).mean(),
         "white_light": white * white_light(environment),
         "rough_light": rough * rough_light(environment),

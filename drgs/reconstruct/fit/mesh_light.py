@@ -29,7 +29,9 @@ CLEAR_OF_FACE = 1e-3
 
 def at_corners(values: Tensor, corners: Tensor, weights: Tensor) -> Tensor:
     """(point, ...) of vertex values (vertex, ...) at corners (point, 3) by weights (point, 3)."""
-    return torch.einsum("pk,pk...->p...", weights, values[corners])
+    # index_select, whose gradient is one index_add: that of values[corners] takes five times as long on a CPU.
+    around = values.index_select(0, corners.reshape(-1)).view(*corners.shape, *values.shape[1:])
+    return (around * weights.view(*weights.shape, *[1] * (values.ndim - 1))).sum(1)
 
 
 def corner_weights(barycentric: Tensor) -> Tensor:

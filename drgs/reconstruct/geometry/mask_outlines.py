@@ -18,7 +18,7 @@ from torch import Tensor
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
-from drgs.scene.camera import Camera, pixel_rays_world
+from drgs.scene.camera import Camera, world_from_pixel
 from drgs.scene.views import Views
 
 FARTHEST = 6.0
@@ -84,13 +84,6 @@ def mask_outlines(views: Views) -> list[MaskOutline | None]:
     return [mask_outline(mask.float() / 255) for mask in views.coverage]
 
 
-def covered_pixels(camera: Camera, tracer: AbstractTracer) -> Tensor:
-    """(height, width) bool: pixels whose centre shows the mesh."""
-    origin, directions = pixel_rays_world(camera)
-    flat = directions.reshape(-1, 3)
-    return trace_rays(origin.expand_as(flat), flat, tracer).hit.view(camera.height, camera.width)
-
-
 def outline_residuals(
     edges: MeshEdges, tracer: AbstractTracer, cameras: tuple[Camera, ...], outlines: list[MaskOutline | None]
 ) -> OutlineResiduals:
@@ -98,7 +91,7 @@ def outline_residuals(
     vertices, face_normals = tracer.mesh.vertices, tracer.face_normals
     middle = 0.5 * (vertices[edges.vertices[:, 0]] + vertices[edges.vertices[:, 1]])
     parts = [
-        _residuals_of_view(edges, middle, vertices, face_normals, camera, covered_pixels(camera, tracer), outline)
+        _residuals_of_view(edges, middle, tracer, face_normals, camera, outline)
         for camera, outline in zip(cameras, outlines, strict=True)
         if outline is not None
     ]
@@ -111,9 +104,9 @@ def outline_residuals(
 
 
 def _residuals_of_view(
-    edges: MeshEdges, middle: Tensor, vertices: Tensor, face_normals: Tensor, camera: Camera, covered: Tensor, outline: MaskOutline
+    edges: MeshEdges, middle: Tensor, tracer: AbstractTracer, face_normals: Tensor, camera: Camera, outline: MaskOutline
 ) -> OutlineResiduals:
-    device = middle.device
+    device, vertices = middle.device, tracer.mesh.vertices
     rotation = camera.camera_from_world[:3, :3].to(device)
     translation = camera.camera_from_world[:3, 3].to(device)
     facing = (face_normals[edges.faces] * (middle - camera.center_world.to(device))[:, None]).sum(-1)
@@ -126,11 +119,12 @@ def _residuals_of_view(
     outward = torch.nn.functional.normalize(outward, dim=-1)
     margin = CLEAR[-1]
     size = torch.tensor([camera.width, camera.height], device=device)
-    outermost = (place > margin).all(1) & (place < size - margin).all(1)
+    within = (place > margin).all(1) & (place < size - margin).all(1)
+    edge, at, place, outward = (x[within] for x in (edge, at, place, outward))
     for step in CLEAR:
         beyond = torch.minimum((place + step * outward).floor().long().clamp(min=0), size - 1)
-        outermost &= ~covered[beyond[:, 1], beyond[:, 0]]
-    edge, at, place, outward = (x[outermost] for x in (edge, at, place, outward))
+        free = ~_covered(camera, tracer, beyond)
+        edge, at, place, outward = (x[free] for x in (edge, at, place, outward))
 
     distance, nearest = outline.tree.query(place.cpu().numpy())
     index = torch.from_numpy(nearest)
@@ -142,6 +136,13 @@ def _residuals_of_view(
     by_camera = torch.stack([normal[:, 0] * fx / z, normal[:, 1] * fy / z, -(normal[:, 0] * fx * x + normal[:, 1] * fy * y) / z**2], 1)
     ends = [_pixels(vertices[edges.vertices[edge, k]] @ rotation.T + translation, camera) for k in (0, 1)]
     return OutlineResiduals(edge[same], signed[same], (by_camera @ rotation)[same], (ends[0] - ends[1]).norm(dim=-1)[same])
+
+
+def _covered(camera: Camera, tracer: AbstractTracer, pixels: Tensor) -> Tensor:
+    """(n,) whether the centres of pixels (n, 2), column and row, show the mesh."""
+    center = torch.cat([pixels + 0.5, torch.ones_like(pixels[:, :1])], -1).to(tracer.mesh.vertices)
+    direction = torch.nn.functional.normalize(center @ world_from_pixel(camera).T, dim=-1)
+    return trace_rays(camera.center_world.expand_as(direction), direction, tracer).hit
 
 
 def _pixels(at_camera: Tensor, camera: Camera) -> Tensor:
