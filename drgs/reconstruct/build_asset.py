@@ -26,7 +26,10 @@ from drgs.reconstruct.fit.fit_materials import MaterialSettings, gaussians_from_
 from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings, gaussians_from_mesh_fit
 from drgs.reconstruct.fit.fit_surface import SurfaceSettings
-from drgs.reconstruct.fit.surface_passes import PASS_MESH, PassSettings
+from drgs.reconstruct.fit.split_sum import filter_environment
+from drgs.reconstruct.fit.surface_passes import PASS_MESH, PassSettings, SurfaceFit
+from drgs.reconstruct.fit.vertex_certainty import vertex_certainty
+from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
 from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, FULL_MESH, MeshSettings, mesh_report
@@ -52,9 +55,11 @@ from drgs.reconstruct.stages import (
     surfel_materials_stage,
 )
 from drgs.render.intersect.horizon import find_horizons, stored_horizons
+from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import mesh_extent
 from drgs.render.records import SampleCounts
 from drgs.scene.asset import Asset, save_asset
+from drgs.scene.certainty import Certainty
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
@@ -273,7 +278,8 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         # Faces moved once more with the materials; surfels stay where they are on them.
         surfels, binding = surfels_on_faces_of(mesh) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=mesh))
         surfels = radiating_surfels(surfels, binding, mesh, environment)
-        asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh")
+        certainty = _certainty(views, decoupled)
+        asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh", certainty=certainty)
     return asset, surface_preview(decoupled, views.cameras)
 
 
@@ -310,6 +316,14 @@ def _on_surfels(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset,
 
 def _horizons(mesh: TriangleMesh) -> UInt8[Tensor, "face 8"]:
     return stored_horizons(find_horizons(mesh, mesh_extent(mesh)[1]))
+
+
+@torch.no_grad()
+def _certainty(views: Views, fit: SurfaceFit) -> Certainty:
+    mesh, parameters = fit.mesh, fit.state.parameters
+    tables = filter_environment(environment_table(parameters))
+    targets = view_targets(views, 1.0, mesh.vertices.device)
+    return vertex_certainty(build_tracer(mesh), targets, parameters["open_share"], tables, parameters["metal"])
 
 
 def _check(settings: BuildSettings) -> None:

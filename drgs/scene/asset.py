@@ -18,6 +18,7 @@ from drgs.exchange.photographs import PHOTOGRAPHS
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, opengl_from_camera
+from drgs.scene.certainty import Certainty
 from drgs.scene.edits import LARGEST, SMALLEST
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
@@ -36,7 +37,15 @@ CONVENTIONS = {
     "environment": "lat-long; texel (u, v) holds radiance from d with u = 0.5 - atan2(d_y, d_x) / 2 pi, v = acos(d_z) / pi",
     "brdf": "metallic-roughness, GGX with alpha = roughness^2",
 }
-_FILES = ("gaussians.ply", "mesh.glb", "binding.safetensors", "environment.exr", "cameras.json", "horizons.safetensors")
+_FILES = (
+    "gaussians.ply",
+    "mesh.glb",
+    "binding.safetensors",
+    "environment.exr",
+    "cameras.json",
+    "horizons.safetensors",
+    "certainty.safetensors",
+)
 _REQUIRED = ("mesh.glb", "environment.exr", "cameras.json")
 THUMBNAIL = "thumb.jpg"
 
@@ -60,6 +69,8 @@ class Asset:
     """How high the mesh rises around each of its faces (drgs.render.intersect.horizon.stored_horizons); None: found out while rendering."""
     primary: PrimarySurface | None = None
     """What cameras see unless they are told otherwise; None: the Gaussians where there are some."""
+    certainty: Certainty | None = None
+    """What the photographs say of each vertex of the mesh, and what is a guess; None: nobody looked (imported meshes, older assets)."""
 
 
 def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = None, photographs_zip: bytes | None = None) -> None:
@@ -89,6 +100,8 @@ def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = No
         files["binding.safetensors"] = safetensors.numpy.save(_arrays(asset.binding))
     if asset.horizons is not None:
         files["horizons.safetensors"] = safetensors.numpy.save({"sine": _array(asset.horizons)})
+    if asset.certainty is not None:
+        files["certainty.safetensors"] = safetensors.numpy.save(_arrays(asset.certainty))
     files["environment.exr"] = encode_environment(_array(asset.environment.radiance))
     files["cameras.json"] = json.dumps({"camera_model": "PINHOLE", "frames": [_camera_json(c) for c in asset.cameras]}, indent=1).encode()
     if thumbnail_jpeg is not None:
@@ -130,6 +143,7 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     if "binding.safetensors" in files:
         binding = _read_binding(files["binding.safetensors"], path, device)
     horizons = _read_horizons(files["horizons.safetensors"], path, device) if "horizons.safetensors" in files else None
+    certainty = _read_certainty(files["certainty.safetensors"], path, device) if "certainty.safetensors" in files else None
     radiance = decode_environment(files["environment.exr"], f"{path}: environment.exr", clamp_negative=False)
     cameras = _read_cameras(files["cameras.json"], path, device)
     meters, provenance = manifest.get("meters_per_unit"), manifest.get("provenance", {})
@@ -139,7 +153,7 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     if primary is not None and primary not in PRIMARY_SURFACES:
         raise ValueError(f"{path}: asset.json has primary {str(primary)[:40]!r}; expected {' or '.join(PRIMARY_SURFACES)}")
     environment = Environment(torch.from_numpy(radiance).to(device))
-    asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons, primary)
+    asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons, primary, certainty)
     _check(asset, str(path))
     return asset
 
@@ -152,7 +166,7 @@ def load_photographs(path: Path | str) -> bytes | None:
 def _check(asset: Asset, name: str) -> None:
     """What must hold of an asset on either side of a file: finite numbers, equal counts, indices that exist."""
     mesh, binding, gaussians = asset.mesh, asset.binding, asset.gaussians
-    for record in (gaussians, mesh, binding, asset.environment, *asset.cameras):
+    for record in (gaussians, mesh, binding, asset.environment, asset.certainty, *asset.cameras):
         for entry in fields(record) if record is not None else ():
             value = getattr(record, entry.name)
             if isinstance(value, Tensor) and not torch.isfinite(value).all():
@@ -165,6 +179,13 @@ def _check(asset: Asset, name: str) -> None:
         raise ValueError(f"{name}: the mesh's vertex attributes differ in length ({vertices} vertices)")
     if asset.horizons is not None and asset.horizons.shape != (len(faces), 8):
         raise ValueError(f"{name}: the horizons are of {len(asset.horizons)} faces, there are {len(faces)}")
+    for entry in fields(Certainty) if asset.certainty is not None else ():
+        certainty = getattr(asset.certainty, entry.name)
+        if len(certainty) != vertices:
+            raise ValueError(f"{name}: the certainty of {entry.name} is of {len(certainty)} vertices, there are {vertices}")
+        low, high = float(certainty.min()), float(certainty.max())
+        if low < 0 or high > 1:
+            raise ValueError(f"{name}: the certainty of {entry.name} is {low:g} to {high:g}; expected numbers from 0 to 1")
     if asset.primary == "gaussians" and gaussians is None:
         raise ValueError(f"{name}: its primary surface is gaussians, but it has none")
     if binding is not None:
@@ -194,6 +215,17 @@ def _read_horizons(data: bytes, path: Path, device: torch.device | str) -> Tenso
     if sine.dtype != np.uint8 or sine.ndim != 2:
         raise ValueError(f"{path}: horizons.safetensors holds an array of the wrong shape")
     return torch.from_numpy(sine.copy()).to(device)
+
+
+def _read_certainty(data: bytes, path: Path, device: torch.device | str) -> Certainty:
+    try:
+        arrays = safetensors.numpy.load(data)
+        columns = {entry.name: arrays[entry.name] for entry in fields(Certainty)}
+    except (safetensors.SafetensorError, KeyError) as error:
+        raise ValueError(f"{path}: certainty.safetensors is damaged ({error})") from error
+    if any(values.dtype != np.float16 or values.ndim != 1 or len(values) != len(columns["shape"]) for values in columns.values()):
+        raise ValueError(f"{path}: certainty.safetensors holds arrays of the wrong shape or type; expected float16, one number a vertex")
+    return Certainty(**{name: torch.from_numpy(values.copy()).to(device) for name, values in columns.items()})
 
 
 def _camera_json(camera: Camera) -> dict:
@@ -227,5 +259,5 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().contiguous().numpy()
 
 
-def _arrays(record: Gaussians | Binding) -> dict[str, np.ndarray]:
+def _arrays(record: Gaussians | Binding | Certainty) -> dict[str, np.ndarray]:
     return {entry.name: _array(getattr(record, entry.name)) for entry in fields(record)}

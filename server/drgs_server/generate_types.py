@@ -48,6 +48,7 @@ _CONSTANTS = (
     "MAX_STILL_PIXELS",
     "MAX_STILL_SAMPLES",
     "LEAST_SHOWN_ERROR",
+    "NO_CERTAINTY",
 )
 _FRAME_CONSTANTS = (
     "FRAME_KIND_PICTURE",
@@ -190,7 +191,7 @@ def typescript_text() -> str:
     text = "// Written by `python -m drgs_server.generate_types` from messages.py and frame_header.py of server/drgs_server/live and server/drgs_server/api/rest_records.py. Do not edit.\n\n"
     for module, names_there in ((messages, _CONSTANTS), (frame_header, _FRAME_CONSTANTS)):
         for constant in names_there:
-            text += f"export const {constant} = {getattr(module, constant)};\n"
+            text += f"export const {constant} = {json.dumps(getattr(module, constant))};\n"
     text += "\n" + _HEADER_TYPE + "\n"
     for name in sorted(definitions):
         node = definitions[name]

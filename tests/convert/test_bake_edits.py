@@ -10,6 +10,7 @@ import torch
 from drgs.convert.bake_edits import bake_edits
 from drgs.deform.pose_scene import pose_scene
 from drgs.scene.asset import Asset, load_asset, save_asset
+from drgs.scene.certainty import Certainty
 from drgs.scene.edits import parse_edits
 from drgs.scene.gaussians import surfel_tangents
 from tests.reconstruct.surfel_spheres import surfel_sphere
@@ -50,3 +51,12 @@ def test_a_version_keeps_the_horizons_of_a_mesh_that_stayed_as_it_was(tmp_path: 
     painted, twisted = (parse_edits([edit]) for edit in (material(roughness=0.2), {"op": "deform", "map": {"type": "twist", "rate": 0.5}}))
     assert bake_edits(known, painted, tmp_path, 2).horizons is known.horizons
     assert bake_edits(known, twisted, tmp_path, 2).horizons is None
+
+
+def test_a_version_keeps_what_the_photographs_said_of_each_vertex(tmp_path: Path, cube: Asset) -> None:
+    values = torch.linspace(0, 1, len(cube.mesh.vertices)).half()
+    known = replace(cube, certainty=Certainty(values, values, values, values))
+    twisted = parse_edits([material(roughness=0.2), {"op": "deform", "map": {"type": "twist", "rate": 0.5}}])
+    save_asset(bake_edits(known, twisted, tmp_path, 2), tmp_path / "asset")
+    kept = load_asset(tmp_path / "asset").certainty
+    assert kept is not None and torch.equal(kept.roughness, values)

@@ -88,6 +88,7 @@ def stop_when(stage: str, progress: list[Progress], after: int = 1):
 
 def asset_tensors(asset: Asset) -> dict[str, torch.Tensor]:
     parts = {"gaussians": asset.gaussians, "mesh": asset.mesh, "binding": asset.binding, "environment": asset.environment}
+    parts |= {"certainty": asset.certainty}
     return {f"{part}.{f.name}": getattr(record, f.name) for part, record in parts.items() for f in fields(record)}
 
 
@@ -130,6 +131,19 @@ def test_the_mesh_is_the_sphere_and_its_vertices_carry_materials(build: Build):
     assert float(mesh.albedo.std()) > 0.02  # not the grey that a fresh mesh has
     assert len(build.asset.binding.face) == len(build.asset.gaussians.centers)
     assert float(build.asset.environment.radiance.min()) > 0
+
+
+def test_what_photographs_show_of_the_sphere_is_more_certain_than_what_they_do_not(build: Build):
+    mesh, certainty = build.asset.mesh, build.asset.certainty
+    assert certainty is not None
+    facing = torch.zeros(len(mesh.vertices))
+    for camera in build.asset.cameras:
+        towards = torch.nn.functional.normalize(camera.center_world - mesh.vertices, dim=-1)
+        facing = torch.maximum(facing, (mesh.normals * towards).sum(-1))
+    seen, unseen = facing > 0.7, facing < 0.2
+    for name, values in vars(certainty).items():
+        assert float(values[seen].float().mean()) > 0, name
+        assert not unseen.any() or float(values[unseen].max()) == 0, name
 
 
 def test_provenance_says_how_the_asset_came_about(build: Build, capture: Path):

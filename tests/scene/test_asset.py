@@ -1,3 +1,4 @@
+import hashlib
 import json
 import os
 import zipfile
@@ -5,15 +6,19 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 
 from drgs.deform.pose_scene import pose_scene
 from drgs.scene.asset import Asset, load_asset, save_asset
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, camera_from_opengl
+from drgs.scene.certainty import Certainty
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
+
+CERTAINTIES = ("shape", "albedo", "roughness", "metallic")
 
 
 def small_asset() -> Asset:
@@ -29,9 +34,10 @@ def small_asset() -> Asset:
     k = torch.tensor([[511.1, 0, 200.3], [0, 510.7, 199.9], [0, 0, 1]])
     cameras = (camera_from_opengl(pose, k, 400, 401, "r_000"), Camera(torch.eye(4), k, 7, 5, "nästa"))
     horizons = torch.randint(256, (4, 8), generator=random, dtype=torch.uint8)
-    return Asset(
-        gaussians, mesh, binding, Environment(uniform(4, 8, 3) * 1e3), cameras, 0.1, {"seed": 0, "quality": {"psnr": 30.1}}, horizons
-    )
+    environment = Environment(uniform(4, 8, 3) * 1e3)
+    certainty = Certainty(*(uniform(4).half() for _ in range(4)))
+    facts = {"seed": 0, "quality": {"psnr": 30.1}}
+    return Asset(gaussians, mesh, binding, environment, cameras, 0.1, facts, horizons, certainty=certainty)
 
 
 def assert_equal_bits(a, b):
@@ -64,6 +70,49 @@ def test_horizons_of_another_mesh_are_refused(tmp_path):
         save_asset(asset, tmp_path / "a")
 
 
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        (torch.zeros(5).half(), "the certainty of shape is of 5 vertices, there are 4"),
+        (torch.tensor([0.0, 1.5, -0.5, 1.0]).half(), "the certainty of shape is -0.5 to 1.5; expected numbers from 0 to 1"),
+        (torch.tensor([0.0, torch.nan, torch.inf, 1.0]).half(), "Certainty.shape holds 2 values that are not finite"),
+    ],
+)
+def test_a_certainty_that_means_nothing_is_refused_on_either_side_of_a_file(tmp_path, values, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        save_asset(replace(small_asset(), certainty=Certainty(values, values, values, values)), tmp_path / "a")
+    save_asset(small_asset(), tmp_path / "a")
+    arrays = {name: values.numpy() for name in CERTAINTIES}
+    rewrite_file(tmp_path / "a", "certainty.safetensors", safetensors.numpy.save(arrays))
+    with pytest.raises(ValueError, match=sentence):
+        load_asset(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        (b"nothing", r"certainty\.safetensors is damaged"),
+        (safetensors.numpy.save({"shape": np.zeros(4, np.float16)}), r"certainty\.safetensors is damaged \('albedo'\)"),
+        (safetensors.numpy.save({name: np.zeros((4, 1), np.float16) for name in CERTAINTIES}), "wrong shape or type; expected float16"),
+        (safetensors.numpy.save({name: np.zeros(4, np.float32) for name in CERTAINTIES}), "wrong shape or type; expected float16"),
+        (safetensors.numpy.save({name: np.zeros(k + 1, np.float16) for k, name in enumerate(CERTAINTIES)}), "wrong shape or type"),
+    ],
+)
+def test_a_damaged_certainty_is_refused_with_one_sentence(tmp_path, data, sentence):
+    save_asset(small_asset(), tmp_path / "a")
+    rewrite_file(tmp_path / "a", "certainty.safetensors", data)
+    with pytest.raises(ValueError, match=sentence) as caught:
+        load_asset(tmp_path / "a")
+    assert str(caught.value).startswith(str(tmp_path / "a")) and "\n" not in str(caught.value)
+
+
+def rewrite_file(folder, name, data):
+    """As whoever wrote it so would have: the manifest's hash fits."""
+    files = json.loads((folder / "asset.json").read_text())["files"]
+    (folder / name).write_bytes(data)
+    edit_manifest(folder, files=files | {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}})
+
+
 def test_what_cameras_see_is_kept_and_decides_what_a_scene_shows(tmp_path):
     asset = small_asset()
     assert load_asset(saved(asset, tmp_path / "older")).primary is None and pose_scene(asset, []).primary == "gaussians"
@@ -81,15 +130,16 @@ def saved(asset: Asset, path):
     return path
 
 
-def test_an_asset_without_gaussians_and_cameras_survives_saving_and_loading(tmp_path):
-    asset = replace(small_asset(), gaussians=None, binding=None, cameras=(), horizons=None)
+def test_an_asset_without_gaussians_cameras_and_what_older_ones_lack_survives_saving_and_loading(tmp_path):
+    asset = replace(small_asset(), gaussians=None, binding=None, cameras=(), horizons=None, certainty=None)
     save_asset(asset, tmp_path / "a")
     assert_equal_bits(asset, load_asset(tmp_path / "a"))
 
 
 def test_the_folder_holds_the_files_of_the_contract_and_a_described_manifest(tmp_path):
     save_asset(small_asset(), tmp_path / "a", thumbnail_jpeg=b"jpeg")
-    files = {"gaussians.ply", "mesh.glb", "binding.safetensors", "environment.exr", "cameras.json", "horizons.safetensors", "thumb.jpg"}
+    files = {"gaussians.ply", "mesh.glb", "binding.safetensors", "environment.exr", "cameras.json", "thumb.jpg"}
+    files |= {"horizons.safetensors", "certainty.safetensors"}
     assert set(os.listdir(tmp_path / "a")) == files | {"asset.json"}
     manifest = json.loads((tmp_path / "a" / "asset.json").read_text())
     assert manifest["schema_version"] == 1 and manifest["meters_per_unit"] == 0.1 and set(manifest["files"]) == files

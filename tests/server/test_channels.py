@@ -9,11 +9,15 @@ import torch
 import trimesh
 
 from drgs.maths.color import srgb_from_linear
+from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
 from drgs.render.film.resolve_frame import resolve_frame
 from drgs.scene.asset import Asset
+from drgs.scene.certainty import Certainty
+from drgs.scene.edits import parse_edits
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh
-from drgs_server.live.messages import LEAST_SHOWN_ERROR, CameraMessage, Channel, Settings
+from drgs.scene.posed_scene import PrimarySurface
+from drgs_server.live.messages import LEAST_SHOWN_ERROR, NO_CERTAINTY, CameraMessage, Channel, Settings
 from drgs_server.render.channels import HEAT_SRGB, heat
 from drgs_server.render.drgs_renderer import LoadedAsset, Picture, Pose
 from drgs_server.render.interface import AbstractPicture
@@ -117,6 +121,49 @@ def test_surfels_are_shown_in_many_colours_and_the_next_picture_goes_on_with_the
 def test_a_mesh_has_no_surfels_and_says_so() -> None:
     picture = picture_of(posed(sphere_mesh()), "surfels")
     assert picture.resolve().max() == 0 and picture.notes == (NO_SURFELS,)
+
+
+def half_known(count: int) -> Certainty:
+    """Shape known, albedo half, roughness well and metallic hardly."""
+    return Certainty(*(torch.full((count,), value, dtype=torch.float16) for value in (1.0, 0.5, 0.75, 0.25)))
+
+
+@pytest.mark.parametrize("primary", ["mesh", "gaussians"])
+def test_certainty_is_shown_in_red_green_and_blue_and_a_pick_still_finds_the_paint(primary: PrimarySurface) -> None:
+    mesh, surfels = sphere_mesh(), surfel_sphere(300)
+    binding = bind_gaussians(surfels.centers, mesh)
+    asset = Asset(surfels, mesh, binding, constant_sky(), primary=primary, certainty=half_known(len(mesh.vertices)))
+    pose = LoadedAsset(asset, Path("none")).pose([], None)
+    albedo = picture_of(pose, "albedo")
+    picture = picture_of(pose, "certainty", albedo)
+    np.testing.assert_allclose(seen(picture), np.broadcast_to([255, 127.5, 63.75], seen(picture).shape), atol=1)
+    values = picture.linear()
+    np.testing.assert_allclose(
+        values[picture.resolve()[..., 3] == 255][:, :3], np.broadcast_to([1, 0.5, 0.25], seen(picture).shape), atol=2e-3
+    )
+    painted, picked = albedo.pick(0.5, 0.5), picture.pick(0.5, 0.5)
+    assert painted is not None and picked is not None
+    assert picked.albedo == pytest.approx(painted.albedo, abs=1e-3) and picked.roughness == pytest.approx(painted.roughness, abs=1e-3)
+    np.testing.assert_array_equal(picture_of(pose, "albedo", picture).resolve(), albedo.resolve())
+
+
+def test_certainty_is_of_the_place_and_moves_with_it() -> None:
+    mesh = sphere_mesh()
+    low = (mesh.vertices[:, 2] < 0).half()
+    asset = Asset(None, mesh, None, constant_sky(), certainty=Certainty(low, low, low, low))
+    twisted = parse_edits([{"op": "deform", "map": {"type": "stretch", "factor": 1.2}}])
+    for edits in ([], twisted):
+        shown = picture_of(LoadedAsset(asset, Path("none")).pose(edits, None), "certainty").resolve()
+        assert shown[SIDE // 2 - 6, SIDE // 2, :3].max() == 0 and shown[SIDE // 2 + 6, SIDE // 2, :3].min() == 255
+
+
+def test_an_asset_without_certainty_says_so_and_shows_nothing() -> None:
+    pose = posed(sphere_mesh())
+    picture = picture_of(pose, "certainty")
+    assert picture.resolve().max() == 0 and picture.notes == (NO_CERTAINTY,)
+    message = CameraMessage(type="camera", world_from_camera=FRONT, fov_y_degrees=40, width=SIDE, height=SIDE)
+    with pytest.raises(ValueError, match="does not say what is certain"):
+        pose.still(message, Settings(channel="certainty"), SIDE, SIDE, linear=False)
 
 
 @pytest.mark.parametrize(

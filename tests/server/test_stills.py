@@ -1,5 +1,8 @@
 """Pictures over REST for further work: an EXR holds the light that a PNG shows."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +14,8 @@ from drgs.exchange.exr import decode_exr
 from drgs.maths.color import srgb_from_linear
 from drgs.reference.tonemap import apply_tone_curve
 from drgs.render import render_bands
-from drgs.scene.asset import save_asset
+from drgs.scene.asset import Asset, load_asset, save_asset
+from drgs.scene.certainty import Certainty
 from drgs_server.live.messages import CameraMessage, Channel, Settings
 from drgs_server.render.drgs_renderer import DrgsRenderer
 from drgs_server.render.interface import LINEAR_CHANNELS, AbstractPose, LinearPixels
@@ -41,11 +45,33 @@ def test_a_still_may_be_larger_than_what_is_streamed_up_to_a_limit(service: Serv
     assert "4096x2160" in is_problem(service.client.get(f"{url}&width=4096&height=4096"), 422)
 
 
+def with_certainty(asset: Asset) -> Asset:
+    known = (torch.full((len(asset.mesh.vertices),), value, dtype=torch.float16) for value in (1.0, 0.5, 0.75, 0.25))
+    return replace(asset, certainty=Certainty(*known))
+
+
+def test_certainty_comes_over_rest_and_an_asset_without_it_says_so(tmp_path: Path) -> None:
+    write_ball(tmp_path / "ball.ply")
+    service = Service(tmp_path, DrgsRenderer("cpu"))  # type: ignore[arg-type]
+    with service.client:
+        older, asset_id = service.add_mesh(tmp_path / "ball.ply"), service.add_mesh(tmp_path / "ball.ply")
+        folder = service.context.directory.asset(asset_id)
+        save_asset(with_certainty(load_asset(folder)), folder)
+        sessions = [service.client.post("/api/sessions", json={"asset": name}).json()["id"] for name in (older, asset_id)]
+        answers = [service.client.get(f"/api/sessions/{name}/frame.exr?width=24&height=16&spp=4&channel=certainty") for name in sessions]
+    assert "does not say what is certain" in is_problem(answers[0], 422)
+    shown = decode_exr(answers[1].content)
+    inside = shown["A"] == 1
+    assert inside.any()
+    for name, value in (("R", 1.0), ("G", 0.5), ("B", 0.25)):
+        np.testing.assert_allclose(shown[name][inside], value, atol=1e-3)
+
+
 @pytest.fixture(scope="module")
 def pose(tmp_path_factory: pytest.TempPathFactory) -> AbstractPose:
     folder = tmp_path_factory.mktemp("ball")
     write_ball(folder / "ball.ply")
-    save_asset(import_mesh(folder / "ball.ply"), folder / "asset")
+    save_asset(with_certainty(import_mesh(folder / "ball.ply")), folder / "asset")
     return DrgsRenderer("cpu").load(folder / "asset", folder).pose([], None)
 
 
@@ -90,7 +116,7 @@ def test_a_channel_holds_the_values_themselves(pose: AbstractPose) -> None:
     assert np.isinf(depth[0, 0, 0]) and 0.5 < depth[16, 24, 0] < 4
 
 
-@pytest.mark.parametrize("channel", ["final", "depth", "normal", "variance", "visibility", "indirect", "surfels"])
+@pytest.mark.parametrize("channel", ["final", "depth", "normal", "variance", "visibility", "indirect", "surfels", "certainty"])
 def test_a_picture_rendered_once_in_bands_has_the_pixels_of_one_that_is_refined(
     pose: AbstractPose, monkeypatch: pytest.MonkeyPatch, channel: Channel
 ) -> None:

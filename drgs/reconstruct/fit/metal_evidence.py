@@ -20,21 +20,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.maths.color import linear_from_srgb
 from drgs.maths.constants import F0
-from drgs.reconstruct.fit.mesh_light import radiance_along
+from drgs.reconstruct.fit.seen_vertices import mirrored_radiance, seen_vertices
 from drgs.reconstruct.fit.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
-from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 
 FEWEST_VIEWS = 4
-FACING = 0.25
-"""Least cosine between normal and view."""
-SOLID = 0.995
-SATURATED = 254 / 255
 DARK = 0.05
 """Radiance below which errors count as absolute rather than relative."""
 NOISE = 0.02
@@ -64,16 +58,15 @@ def metal_evidence(
     sums = torch.zeros(7, count, 3, device=device)  # w, E y0, E^2 (of no metal); A y, A^2, y^2 (of metal); y0^2
     views = torch.zeros(count, device=device)
     for target in targets:
-        seen, photo, wo = _seen_vertices(tracer, target)
+        here = seen_vertices(tracer, target)
+        seen, photo = here.index, here.photo
         if len(seen) == 0:
             continue
         normal, roughness = mesh.normals[seen], mesh.roughness[seen]
-        mirrored = 2 * (normal * wo).sum(-1, keepdim=True) * normal - wo
-        origin = mesh.vertices[seen] + 4 * tracer.lift * normal
-        transmittance, met = radiance_along(tracer, origin, mirrored, open_share, tables)
+        transmittance, met = mirrored_radiance(tracer, here, open_share, tables)
 
         white = torch.ones(len(seen), 3, device=device)
-        shaded = partial(shade_split_sum, residual=0 * white, roughness=roughness, normal=normal, wo=wo, tables=tables)
+        shaded = partial(shade_split_sum, residual=0 * white, roughness=roughness, normal=normal, wo=here.wo, tables=tables)
         lit = partial(shaded, transmittance=transmittance, hit_radiance=met, open_share=open_share[seen])
         b = lit(diffuse_albedo=0 * white, f0=0 * white)
         a, e = lit(diffuse_albedo=0 * white, f0=white) - b, lit(diffuse_albedo=white, f0=0 * white) - b
@@ -98,29 +91,6 @@ def metal_evidence(
     strength = torch.where(views >= FEWEST_VIEWS, trust * better.abs().clamp(max=STRONGEST), torch.zeros_like(better))
     kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER)
     return torch.tanh(kind / DECISIVE)
-
-
-def _seen_vertices(tracer: AbstractTracer, target: ViewTarget) -> tuple[Tensor, Tensor, Tensor]:
-    """Vertices that this view shows (n,), the radiance that it has there (n, 3), and unit directions to it (n, 3)."""
-    mesh, camera = tracer.mesh, target.camera
-    towards = camera.center_world - mesh.vertices
-    wo = torch.nn.functional.normalize(towards, dim=-1)
-    at = mesh.vertices @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
-    homogeneous = at @ camera.intrinsics.T
-    place = homogeneous[:, :2] / homogeneous[:, 2:]
-    size = torch.tensor([camera.width, camera.height], device=place.device)
-    seen = ((mesh.normals * wo).sum(-1) > FACING) & (at[:, 2] > 1e-6) & (place > 1).all(1) & (place < size - 1).all(1)
-    index = seen.nonzero().squeeze(1)
-    column, row = place[index].long().unbind(1)
-    colour = target.saturation[row, column]
-    index_ok = (target.mask[row, column] > SOLID) & (colour.amax(-1) < SATURATED)
-    index, place = index[index_ok], place[index][index_ok]
-    origin = mesh.vertices[index] + 4 * tracer.lift * mesh.normals[index]
-    open_ = ~trace_rays(origin, wo[index], tracer).hit
-    index, place = index[open_], place[open_]
-    grid = (2 * place / size - 1)[None, None]
-    sampled = torch.nn.functional.grid_sample(target.saturation.permute(2, 0, 1)[None], grid, mode="bilinear", align_corners=False)
-    return index, linear_from_srgb(sampled[0, :, 0].T), wo[index]
 
 
 def _averaged(error: Tensor, views: Tensor, edges: MeshEdges) -> Tensor:

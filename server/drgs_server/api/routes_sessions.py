@@ -197,7 +197,10 @@ async def _make_picture(
         if query.captured:
             light = [edit for edit in session.log.applied if isinstance(edit, EnvironmentEdit)]
             pose = await asyncio.wrap_future(work(lambda: loaded.pose(light, posed.pose)))
-        still = await asyncio.wrap_future(work(lambda: pose.still(camera, settings, query.width, query.height, suffix == "exr")))
+        try:
+            still = await asyncio.wrap_future(work(lambda: pose.still(camera, settings, query.width, query.height, suffix == "exr")))
+        except ValueError as error:
+            raise ProblemError(422, str(error)) from error
         # One call a slice: viewers get their turns in between, and who leaves stops the next one.
         while await asyncio.wrap_future(work(still.work)):
             pass

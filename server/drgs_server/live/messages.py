@@ -32,10 +32,14 @@ MAX_STILL_SAMPLES = MAX_PICTURE_SAMPLES
 MAX_SPP_TARGET = 65535
 """The header holds 16 bits."""
 
-Channel = Literal["final", "albedo", "roughness", "metallic", "normal", "depth", "visibility", "indirect", "variance", "surfels"]
+Channel = Literal[
+    "final", "albedo", "roughness", "metallic", "normal", "depth", "visibility", "indirect", "variance", "surfels", "certainty"
+]
 """visibility: open share of the cosine-weighted sky. indirect: light that met another surface. variance: standard error of the pixels'
-luminance, in colours from LEAST_SHOWN_ERROR to 1 (white). surfels: the Gaussians themselves."""
+luminance, in colours from LEAST_SHOWN_ERROR to 1 (white). surfels: the Gaussians themselves.
+certainty: how far the photographs decide what a place is, red for its shape, green for its albedo, blue for roughness and metallic."""
 LEAST_SHOWN_ERROR = 1e-3
+NO_CERTAINTY = "this asset does not say what is certain: it was imported, or built by an older version or with materials on surfels"
 Phase = Literal["loading", "moving", "still", "converged", "paused"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Row = tuple[Finite, Finite, Finite, Finite]

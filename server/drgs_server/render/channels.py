@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 HEAT_SRGB = ((11, 16, 38), (43, 76, 155), (47, 160, 143), (229, 195, 74), (255, 247, 214))
 """From the least shown error to 1, evenly in its logarithm; brighter is more. As --heat in web/src/ui/style.css."""
-_MAPS = {"normal": "normal_world"}
-"""Names that the G-buffer has for channels, where they differ."""
+_MAPS = {"normal": "normal_world", "certainty": "albedo"}
+"""Names that the G-buffer has for channels, where they differ. What certainty is shown of wears it as its albedo."""
 
 
 def channel_pixels(frame: "Frame", settings: Settings) -> Pixels:
@@ -93,6 +93,8 @@ def _color(frame: "Frame", settings: Settings) -> "Tensor":
     maps, channel = frame.gbuffer, settings.channel
     if channel == "albedo":
         return srgb_from_linear(maps.albedo.clamp(0, 1))
+    if channel == "certainty":
+        return maps.albedo
     if channel == "normal":
         return maps.normal_world * 0.5 + 0.5
     if channel in ("roughness", "metallic"):

@@ -17,7 +17,7 @@ import numpy as np
 
 from drgs.maths.color_numpy import linear_from_srgb
 from drgs.scene.edits import Edit
-from drgs_server.live.messages import CameraMessage, Settings
+from drgs_server.live.messages import NO_CERTAINTY, CameraMessage, Settings
 from drgs_server.render.channels import channel_pixels, linear_channel
 from drgs_server.render.environment_memory import EnvironmentMemory
 from drgs_server.render.interface import (
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from drgs.render.intersect.tracer import AbstractTracer
     from drgs.render.progressive.frame_state import FrameState
+    from drgs.render.records import GBuffer
     from drgs.scene.asset import Asset
     from drgs.scene.environment import Environment
     from drgs.scene.posed_scene import PosedScene
@@ -167,9 +168,8 @@ class Pose(AbstractPose):
             maps = settings.model_copy(update={"channel": "depth"})
             return SurfelPicture(self.scene, _camera(camera, width, height), known, lambda: self.begin(camera, maps, width, height, known))
         before = None if known is None else known.state
-        state = start_frame(
-            self._scene_of(settings), _camera(camera, width, height), _render_settings(settings), self.tracer, previous=before
-        )
+        scene, tracer = self._shown(settings)
+        state = start_frame(scene, _camera(camera, width, height), _render_settings(settings), tracer, previous=before)
         return Picture(self, state, settings, known if state.computed_parts == () else None)
 
     def still(self, camera: CameraMessage, settings: Settings, width: int, height: int, linear: bool) -> AbstractStill:
@@ -178,13 +178,26 @@ class Pose(AbstractPose):
         seen = _camera(camera, width, height)
         if settings.channel == "surfels":
             return SurfelStill(self.scene, seen)
+        if settings.channel == "certainty" and self.certainty is None:
+            raise ValueError(NO_CERTAINTY)
+        scene, tracer = self._shown(settings)
         rendered = replace(_render_settings(settings), samples_per_pixel=_samples_wanted(settings, self.scene.primary))
-        bands = render_bands(self._scene_of(settings), seen, rendered, self.tracer, SLICE_SECONDS)
+        bands = render_bands(scene, seen, rendered, tracer, SLICE_SECONDS)
         return Still(bands, height, width, settings, linear)
 
-    def _scene_of(self, settings: Settings) -> "PosedScene":
+    def _shown(self, settings: Settings) -> tuple["PosedScene", "AbstractTracer"]:
         """What a picture of this channel is made of."""
-        return self._under_white_sky if settings.channel == "visibility" else self.scene
+        if settings.channel == "certainty" and self.certainty is not None:
+            return self.certainty
+        return (self._under_white_sky if settings.channel == "visibility" else self.scene), self.tracer
+
+    @cached_property
+    def certainty(self) -> "tuple[PosedScene, AbstractTracer] | None":
+        """The scene that wears it as its albedo; None where the asset holds none."""
+        from drgs.render.visible.paint_certainty import paint_certainty
+
+        scene = paint_certainty(self.scene, self.asset.certainty, self.asset.binding)
+        return None if scene is None else (scene, self.tracer.with_materials(scene.mesh))
 
 
 class Picture(AbstractPicture):
@@ -201,7 +214,8 @@ class Picture(AbstractPicture):
         self._settings = settings
         self._passes_at_once: int = 1 if continued is None else continued._passes_at_once
         self._samples_a_pass = _samples_a_pass(state)
-        self.notes = tuple(f"{skip.what} left out: {skip.why}" for skip in state.plan.skips)
+        self._nothing_known = settings.channel == "certainty" and pose.certainty is None
+        self.notes = (NO_CERTAINTY,) if self._nothing_known else tuple(f"{skip.what} left out: {skip.why}" for skip in state.plan.skips)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
@@ -227,15 +241,15 @@ class Picture(AbstractPicture):
     def resolve(self) -> Pixels:
         from drgs.render.film.resolve_frame import resolve_frame
 
+        if self._nothing_known:
+            return np.zeros((self.height, self.width, 4), np.uint8)
         return channel_pixels(resolve_frame(self.state), self._settings)
 
     def linear(self) -> LinearPixels:
         return linear_channel(self.state, self._settings.channel).cpu().numpy()
 
     def pick(self, x: float, y: float) -> Picked | None:
-        from drgs.render.film.resolve_frame import resolve_frame
-
-        maps = resolve_frame(self.state).gbuffer
+        maps = self._maps()
         column, row = min(int(x * self.width), self.width - 1), min(int(y * self.height), self.height - 1)
         if float(maps.coverage[row, column]) < 0.5:
             return None
@@ -249,6 +263,17 @@ class Picture(AbstractPicture):
             region=self.pose.region_of(vertex),
             rest=tuple(self.pose.asset.mesh.vertices[vertex].tolist()),
         )
+
+    def _maps(self) -> "GBuffer":
+        """What the camera sees, in its own colours."""
+        from drgs.render.film.resolve_frame import resolve_frame
+        from drgs.render.progressive.refine import refine_frame
+        from drgs.render.progressive.start_frame import start_frame
+
+        state, pose, inputs = self.state, self.pose, self.state.inputs
+        if inputs.scene.mesh is not pose.scene.mesh:
+            state = refine_frame(start_frame(pose.scene, inputs.camera, inputs.settings, pose.tracer, previous=state), 1)
+        return resolve_frame(state).gbuffer
 
     def explain(self) -> Explanation:
         from drgs.render.film.resolve_frame import resolve_frame

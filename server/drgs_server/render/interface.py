@@ -19,7 +19,7 @@ Pixels: TypeAlias = np.ndarray
 """(height, width, 4) uint8, sRGB, straight alpha."""
 LinearPixels: TypeAlias = np.ndarray
 """(height, width, 4) float32: linear values and coverage."""
-LINEAR_CHANNELS = ("final", "albedo", "roughness", "metallic", "normal", "depth")
+LINEAR_CHANNELS = ("final", "albedo", "roughness", "metallic", "normal", "depth", "certainty")
 """Of which there are values to work with, not only a picture to look at."""
 
 
@@ -116,6 +116,9 @@ class AbstractPose(ABC):
 
         Args:
             linear: the values behind it (AbstractPicture.linear), not the picture.
+
+        Raises:
+            ValueError: a sentence, when the asset does not hold what the channel shows.
         """
 
 

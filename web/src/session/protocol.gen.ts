@@ -8,6 +8,7 @@ export const MAX_PIXELS = 4194304;
 export const MAX_STILL_PIXELS = 8847360;
 export const MAX_STILL_SAMPLES = 1073741824;
 export const LEAST_SHOWN_ERROR = 0.001;
+export const NO_CERTAINTY = "this asset does not say what is certain: it was imported, or built by an older version or with materials on surfels";
 export const FRAME_KIND_PICTURE = 1;
 export const CODEC_JPEG = 0;
 export const CODEC_PNG = 1;
@@ -636,7 +637,7 @@ export interface Settings {
   spp_target?: number;
   /** Indirect bounces; 0 is direct light with shadows only. */
   bounces?: number;
-  channel?: "final" | "albedo" | "roughness" | "metallic" | "normal" | "depth" | "visibility" | "indirect" | "variance" | "surfels";
+  channel?: "final" | "albedo" | "roughness" | "metallic" | "normal" | "depth" | "visibility" | "indirect" | "variance" | "surfels" | "certainty";
   /** Filter what is left of the noise; the filter follows the measured variance, so it fades as samples add up. */
   denoise?: boolean;
 }

@@ -1,4 +1,4 @@
-/** What the picture can show, in the order of the number keys, and how to read it. The server paints them (server/drgs_server/render/channels.py). */
+/** What the picture can show, in the order of their keys, and how to read it. The server paints them (server/drgs_server/render/channels.py). */
 
 import { LEAST_SHOWN_ERROR, type Settings } from '../session/protocol.gen';
 
@@ -36,6 +36,12 @@ export const CHANNELS: ChannelEntry[] = [
     scale: { kind: 'heat', marks: [String(LEAST_SHOWN_ERROR), '0.03', '1'] },
   },
   { value: 'surfels', text: 'Surfels', title: 'The 2D Gaussians that the object is made of', legend: 'A disc each, of one standard deviation and in a colour of its own; darker where it is seen from the side.' },
+  {
+    value: 'certainty',
+    text: 'Certainty',
+    title: 'What the photographs decide, and what is a guess',
+    legend: 'Red is shape, green albedo, blue the less certain of roughness and metallic: white is known from the photographs, black is a guess. Of the object as captured: edits do not change it.',
+  },
 ];
 
 export const entryOf = (channel: Channel) => CHANNELS.find(({ value }) => value === channel) ?? CHANNELS[0]!;

@@ -12,7 +12,7 @@ interface Shortcut {
 
 export type ActionName =
   | 'frame' | 'home' | 'undo' | 'redo' | 'help' | 'escape' | 'local' | 'theme' | 'library' | 'inspector'
-  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'channel7' | 'channel8' | 'channel9' | 'channel10'
+  | 'channel1' | 'channel2' | 'channel3' | 'channel4' | 'channel5' | 'channel6' | 'channel7' | 'channel8' | 'channel9' | 'channel10' | 'channel11'
   | 'wireframe' | 'still' | 'remove' | 'turn' | 'before' | 'fly' | 'all' | 'copy' | 'paste' | 'show'
   | 'photographs' | 'previousView' | 'nextView' | 'split';
 
@@ -49,6 +49,7 @@ export const shortcuts: Shortcut[] = [
   { group: 'View', chords: ['8'], text: 'Indirect light', action: 'channel8' },
   { group: 'View', chords: ['9'], text: 'Noise (variance)', action: 'channel9' },
   { group: 'View', chords: ['0'], text: 'Surfels', action: 'channel10' },
+  { group: 'View', chords: ['u'], text: 'Certainty', action: 'channel11' },
   { group: 'View', chords: ['e'], text: 'Edges of the mesh', action: 'wireframe' },
   { group: 'View', chords: ['c'], text: 'Compare with a photograph, or leave it', action: 'photographs' },
   { group: 'View', chords: ['arrowleft'], text: 'Comparing: the photograph before', action: 'previousView' },

@@ -4,6 +4,7 @@ import { STILL_BOUNCES } from '../../session/constants.gen';
 import { isAnalytic } from '../../edit/shape/deform_maps';
 import { edits } from '../../session/edit_log';
 import { assets } from '../../session/library';
+import { NO_CERTAINTY } from '../../session/protocol.gen';
 import { changeSettings, session, settings, status } from '../../session/session';
 import { CHANNELS, entryOf } from '../../stage/channels';
 import { flying, localPicture, resolution, wireframe } from '../../stage/switches';
@@ -11,11 +12,14 @@ import { CompareSection } from '../Compare';
 import { Choice, Section, Switch } from '../fields';
 import { titleFor, type ActionName } from '../shortcuts';
 
+const sentenceOf = (note: string) => `${note.charAt(0).toUpperCase()}${note.slice(1)}.`;
+
 function Legend() {
   const { channel } = settings.value;
   const { legend, scale } = entryOf(channel);
   const meshOnly = assets.value?.find(({ id }) => id === session.value?.asset)?.surfel_count === 0;
   if (channel === 'surfels' && meshOnly) return <p class="hint">This asset was made from a mesh: it has no surfels to show.</p>;
+  if (channel === 'certainty' && status.value?.notes.includes(NO_CERTAINTY)) return <p class="hint">{sentenceOf(NO_CERTAINTY)}</p>;
   if (!legend) return null;
   return (
     <div class="legend">
@@ -42,7 +46,7 @@ export function ViewPanel() {
       <Section title="Channel">
         <Choice
           bare
-          columns={5}
+          columns={4}
           label="Show"
           value={channel}
           options={CHANNELS.map(({ value, text, title }, i) => ({ value, text, title: titleFor(`channel${i + 1}` as ActionName, title) }))}
