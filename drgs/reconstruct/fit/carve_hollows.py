@@ -33,6 +33,8 @@ TRIMMED = 2 / 3
 """Share of the views whose difference counts."""
 THROUGH = 0.7
 """Share of the object's thickness that may be carved at once: more could tear a hole."""
+LEFT = 0.03
+"""Of the radius: what must be left of the thickness. Where plain paint does not say how deep it is, carvings would go on to the other side."""
 NEARBY = 0.02
 """Of the radius: how far beyond three depths from the vertex a ray may enter."""
 
@@ -114,7 +116,8 @@ def carved_depths(
     alike[matt[wishes]] = torch.stack([torch.ones_like(least), at * settings.step * radius], -1)[wishes]
     share, common = _averaged(around, alike, settings.cost_rings)[matt].unbind(-1)
     wishes &= share > settings.agreeing
-    common = torch.minimum(common / share.clamp(min=1e-9), THROUGH * _thickness(tracer, matt, inward[matt]))
+    thickness = _thickness(tracer, matt, inward[matt])
+    common = torch.minimum(common / share.clamp(min=1e-9), torch.minimum(THROUGH * thickness, (thickness - LEFT * radius).clamp(min=0)))
     weight, wish = torch.full_like(mesh.roughness, settings.hold), torch.zeros_like(mesh.roughness)
     weight[matt[cost[0] > settings.disagreeing]] = settings.hold_unsure  # also where too few views see them, for then it is endless
     weight[matt[wishes]], wish[matt[wishes]] = 1.0, common[wishes]

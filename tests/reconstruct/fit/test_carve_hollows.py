@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from drgs.reconstruct.fit import carve_hollows
 from drgs.reconstruct.fit.carve_hollows import CarveSettings, carved_depths
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -59,3 +60,21 @@ def test_where_the_surface_is_right_nothing_moves(targets: list[ViewTarget]):
     sphere = dataclasses.replace(placed_sphere(subdivisions=4), roughness=torch.full((2562,), 0.6))
     _, depth = carved(sphere, -1.0, targets)
     assert float(depth.mean()) < 0.003 * SPHERE_RADIUS
+
+
+def test_what_wants_to_go_through_leaves_a_wall(targets: list[ViewTarget], monkeypatch: pytest.MonkeyPatch):
+    """Whatever the photographs say, here: the deeper the better."""
+
+    def deeper_is_better(tracer, targets, vertices, inward, depth, radius):
+        return torch.full((len(vertices),), max(0.0, 0.3 - depth)), torch.full((len(vertices),), 12.0)
+
+    monkeypatch.setattr(carve_hollows, "_differences", deeper_is_better)
+    ball, _ = bumped()
+    flat = ball.vertices.clone()
+    flat[:, 2] = CENTER[2] + 0.03 * (flat[:, 2] - CENTER[2])
+    plate = dataclasses.replace(ball, vertices=flat, normals=vertex_normals(flat, ball.faces))
+    _, depth = carved(plate, -1.0, targets)
+    middle = (flat[:, :2] - CENTER[:2]).norm(dim=1) < 0.5 * SPHERE_RADIUS
+    thickness = 2 * (flat[:, 2] - CENTER[2]).abs()[middle]
+    assert float(depth[middle].max()) > 0.015 * SPHERE_RADIUS
+    assert float((thickness - depth[middle]).min()) > 0.025 * SPHERE_RADIUS
