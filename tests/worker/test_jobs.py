@@ -9,6 +9,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy.orm import Session
@@ -292,6 +293,19 @@ def test_a_job_on_its_way_to_the_queue_is_read_as_queued(bench: Bench, monkeypat
         bench.queue.submit(row)
     assert seen == ["queued"]
     assert bench.state("on-its-way") == "unknown"
+
+
+@pytest.mark.slow
+def test_a_job_cancelled_on_its_way_to_the_queue_is_cancelled(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    enqueue = bench.queue._client.enqueue
+
+    def cancel_first(*arguments: Any) -> Any:
+        bench.queue.cancel("cancelled-early")
+        return enqueue(*arguments)
+
+    monkeypatch.setattr(bench.queue._client, "enqueue", cancel_first)
+    bench.queue.submit(JobRow(id="cancelled-early", kind="build", name="tiny", dataset="nowhere", preset="draft", seed=0, created_at=now()))
+    assert bench.state("cancelled-early") == "cancelled"
 
 
 @pytest.mark.slow

@@ -80,6 +80,10 @@ class JobQueue:
             with Session(self._engine, expire_on_commit=False) as session, session.begin():
                 session.add(row)
             self._enqueue(row)
+            with Session(self._engine) as session:
+                stored = session.get(JobRow, job_id)
+            if stored is not None and stored.cancel_requested:  # before the queue knew what to cancel
+                self._client.cancel_workflow(job_id)
         finally:
             self._on_their_way.discard(job_id)
 
