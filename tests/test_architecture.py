@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE_SECONDS
+
 ROOT = Path(__file__).parent.parent
 LAYERS = (
     "drgs.maths", "drgs.exchange", "drgs.scene", "drgs.deform", "drgs.render", "drgs.reconstruct", "drgs.convert", "drgs.evaluate",
@@ -177,14 +179,14 @@ def test_server_and_worker_import_no_torch_at_module_level():
 @pytest.mark.parametrize("module", ["drgs_server.app", "drgs_worker.run"])
 def test_importing_a_service_does_not_bring_torch_along(module: str):
     program = f"import sys, {module}; sys.exit(sorted({{'torch', 'warp'}} & set(sys.modules)) or None)"
-    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert result.returncode == 0, result.stderr
 
 
 def test_importing_the_client_brings_only_what_a_client_needs():
     heavy = {"alembic", "av", "dbos", "fastapi", "numpy", "obstore", "sqlalchemy", "starlette", "torch", "uvicorn", "warp"}
     program = f"import sys; from drgs import Client; sys.exit(sorted({heavy} & set(sys.modules)) or None)"
-    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert result.returncode == 0, result.stderr
 
 
@@ -251,7 +253,7 @@ def test_no_path_of_one_machine_is_in_the_tree():
 @pytest.mark.slow
 def test_public_names_exist_and_are_imported_late():
     program = "import sys, drgs; bad = {'torch', 'numpy'} & set(sys.modules); [getattr(drgs, n) for n in drgs.__all__]; sys.exit(sorted(bad) or None)"
-    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert result.returncode == 0, result.stderr
 
 

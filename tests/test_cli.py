@@ -10,12 +10,15 @@ from typer.testing import CliRunner
 
 from drgs import __version__
 from drgs.cli import app
+from tests.patience import PATIENCE_SECONDS
 
 COMMANDS = ("build", "render", "import", "export", "simulate", "eval", "doctor", "serve", "worker", "bench")
 
 
 def drgs(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "drgs.cli", *map(str, arguments)], capture_output=True, text=True, timeout=120)
+    return subprocess.run(
+        [sys.executable, "-m", "drgs.cli", *map(str, arguments)], capture_output=True, text=True, timeout=PATIENCE_SECONDS
+    )
 
 
 def drgs_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -46,7 +49,7 @@ def test_help_imports_nothing_heavy():
     program = (
         "import sys; from drgs.cli import app; sys.exit(sorted({'torch', 'warp', 'numpy', 'rich', 'fastapi'} & set(sys.modules)) or None)"
     )
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert result.returncode == 0, f"imported {result.stderr}"
 
 
@@ -158,7 +161,7 @@ def test_a_file_that_cannot_be_written_whole_is_one_sentence_and_leaves_nothing(
         [sys.executable, "-m", "drgs.cli", "export", str(ball), str(tmp_path / name)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_SECONDS,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)),
     )
     assert_one_sentence(result)
@@ -205,6 +208,6 @@ def test_simulate_says_that_it_is_not_there_yet(tmp_path: Path):
 def test_ctrl_c_ends_with_130_and_a_sentence():
     program = "import drgs.cli as c, drgs.scene.edits as e\ndef stop(path): raise KeyboardInterrupt\ne.load_edits = stop\nc.main()"
     arguments = ["render", "asset", "out", "--cameras", "c.json", "--edits", "e.json"]
-    result = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert result.returncode == 130
     assert result.stderr == "drgs: stopped by Ctrl-C\n"

@@ -11,6 +11,7 @@ import pytest
 
 from drgs import installation
 from drgs.installation import install_command, missing_package, unsupported_system
+from tests.patience import PATIENCE_SECONDS
 
 ROOT = Path(__file__).parent.parent
 SERVICE_PACKAGES = (
@@ -23,7 +24,9 @@ SERVICE_PACKAGES = (
 def run_without(packages: tuple[str, ...], program: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run Python as if these packages were not installed."""
     hide = f"import sys; sys.modules.update(dict.fromkeys({packages!r}))\n"
-    return subprocess.run([sys.executable, "-c", hide + program, *map(str, arguments)], capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, "-c", hide + program, *map(str, arguments)], capture_output=True, text=True, timeout=PATIENCE_SECONDS
+    )
 
 
 def test_from_a_checkout_the_command_installs_the_checkout_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

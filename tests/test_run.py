@@ -12,13 +12,14 @@ import pytest
 import yaml
 
 from drgs import __version__
+from tests.patience import PATIENCE_SECONDS
 
 ROOT = Path(__file__).parent.parent
 posix = pytest.mark.skipif(shutil.which("sh") is None, reason="a POSIX shell is needed")
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(ROOT / "run"), *arguments], capture_output=True, text=True, timeout=60)
+    return subprocess.run([str(ROOT / "run"), *arguments], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
 
 
 @posix
@@ -63,7 +64,7 @@ def test_a_fault_of_lint_or_of_a_test_is_shown_and_fails_the_run(tmp_path: Path,
     installed = subprocess.run(["cksum"], input=(ROOT / "run").read_bytes(), capture_output=True, check=True).stdout
     (tmp_path / ".venv" / ".installed-dev").write_bytes(installed)
     environment = os.environ | {"FAILING": failing}
-    result = subprocess.run([str(tmp_path / "run"), "test"], env=environment, capture_output=True, text=True, timeout=60)
+    result = subprocess.run([str(tmp_path / "run"), "test"], env=environment, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     called = (tmp_path / "calls").read_text()
     assert "-m ruff check" in called and "--numprocesses" in called
     assert (result.returncode == 0) == (failing == "nothing"), result.stderr

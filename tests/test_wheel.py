@@ -23,9 +23,9 @@ from pathlib import Path
 import pytest
 
 from drgs import __version__
+from tests.patience import PATIENCE_SECONDS
 
 ROOT = Path(__file__).parent.parent
-PATIENCE_SECONDS = 60.0
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(sys.platform == "win32", reason="the service runs on Linux and macOS"),
@@ -54,7 +54,9 @@ class Installed:
 
     def run(self, *command: str) -> subprocess.CompletedProcess[str]:
         program = str(self.bin / command[0])
-        return subprocess.run([program, *command[1:]], cwd=self.folder, env=self.environment(), capture_output=True, text=True, timeout=120)
+        return subprocess.run(
+            [program, *command[1:]], cwd=self.folder, env=self.environment(), capture_output=True, text=True, timeout=PATIENCE_SECONDS
+        )
 
 
 @pytest.fixture(scope="module")

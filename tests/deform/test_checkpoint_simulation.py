@@ -13,6 +13,7 @@ from drgs.convert.import_mesh import import_mesh
 from drgs.deform.simulate import simulate
 from drgs.deform.simulation_scene import parse_simulation_scene
 from drgs.scene.asset import Asset, load_asset, save_asset
+from tests.patience import PATIENCE_SECONDS
 
 SCENE = parse_simulation_scene({"particles": 300, "duration": 0.4, "fps": 20, "spin": [0, 3.0, 0], "matter": {"preset": "jelly"}})
 FRAMES = 9
@@ -60,7 +61,7 @@ def frames_reported(asset: Asset, out: Path, checkpoint: Path) -> list[int]:
 def test_kill_9_costs_one_frame_and_no_bit(folder: Path, asset: Asset, tmp_path: Path) -> None:
     checkpoint = tmp_path / "frames"
     arguments = [str(folder / "asset"), str(tmp_path / "clip"), str(checkpoint), SCENE.model_dump_json(), "4"]
-    died = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], timeout=120)
+    died = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], timeout=PATIENCE_SECONDS)
     assert died.returncode == -signal.SIGKILL and not (tmp_path / "clip").exists()
     assert frames_reported(asset, tmp_path / "clip", checkpoint) == [4, 5, 6, 7, 8, 9]
     assert contents(tmp_path / "clip") == contents(folder / "undisturbed")

@@ -10,11 +10,12 @@ import pytest
 from conftest import Service
 from painter import Painter
 from test_rest import is_problem
-from test_stream import PATIENCE_SECONDS, material, talk
+from test_stream import material, talk
 
 from drgs_server.api.problems import ProblemError
 from drgs_server.live.admission import Admission, Caller, Kind
 from drgs_server.settings import Limits
+from tests.patience import PATIENCE_SECONDS
 
 MIB = 1 << 20
 

@@ -14,8 +14,8 @@ import uvicorn
 from conftest import Service
 
 from drgs_server.run import uvicorn_config
+from tests.patience import PATIENCE_SECONDS
 
-PATIENCE_SECONDS = 20.0
 SHORT = {"head_seconds": 0.3, "body_seconds": 0.4, "send_seconds": 0.3, "stranger_connections": 6, "connections": 4, "head_bytes": 8192}
 
 

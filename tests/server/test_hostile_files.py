@@ -20,6 +20,7 @@ import OpenEXR
 import pytest
 
 from drgs_worker.jobs import file_tool
+from tests.patience import PATIENCE_SECONDS
 
 MOST_BYTES = 1 << 30
 """Resident memory that refusing one file may add."""
@@ -209,5 +210,5 @@ def test_the_memory_of_an_environment_is_estimated_by_what_its_header_claims(tmp
 
 def test_the_tool_cannot_take_more_memory_than_its_limit() -> None:
     code = "import resource\nfrom drgs_worker.jobs import file_tool\nfile_tool.make_asset = lambda *_: bytearray(1 << 36)\nimport sys\nsys.exit(file_tool.main(['asset', 'a', 'b']))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert done.returncode == 2 and "more memory than the 16 GiB" in done.stderr

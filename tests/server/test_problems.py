@@ -13,6 +13,7 @@ from conftest import Service
 
 from drgs_server.render.interface import AbstractPose
 from drgs_server.run import uvicorn_config
+from tests.patience import PATIENCE_SECONDS
 
 MOST = 700
 """Characters of a sentence."""
@@ -31,7 +32,7 @@ def served(service: Service) -> Iterator[int]:
         yield listener.getsockname()[1]
     finally:
         server.should_exit = True
-        thread.join(10)
+        thread.join(PATIENCE_SECONDS)
 
 
 def test_the_connection_outlives_an_error_of_the_server(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,7 +43,7 @@ def test_the_connection_outlives_an_error_of_the_server(tmp_path, monkeypatch: p
 
     monkeypatch.setattr(service.context.environments, "all", fail)
     with served(service) as port:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_SECONDS)
         connection.connect()
         first = connection.sock
         for path, status in (("/api/environments", 500), ("/healthz", 200), ("/api/environments", 500), ("/api/assets", 200)):

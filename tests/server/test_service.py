@@ -18,9 +18,9 @@ from drgs_server.client import Client, ServerError
 from drgs_server.run import serve
 from drgs_worker.jobs.builders import BUILDER_VARIABLE
 from examples import turntable, variants_sheet
+from tests.patience import PATIENCE_SECONDS
 
 REPOSITORY = Path(__file__).parents[2]
-PATIENCE_SECONDS = 60.0
 PROGRAM = "import sys; from pathlib import Path; from drgs_server.run import serve; sys.exit(serve(Path(sys.argv[1]), port=0, ready=lambda a: print(a, flush=True)))"
 
 

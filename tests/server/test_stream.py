@@ -26,9 +26,9 @@ from drgs_server.live.messages import CLOSE_TRY_AGAIN
 from drgs_server.render import thread
 from drgs_server.render.thread import MODESTY, give_way
 from drgs_worker.store.database import AssetRow, now
+from tests.patience import PATIENCE_SECONDS
 
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
-PATIENCE_SECONDS = 60.0
 
 
 def camera(number: int = 0, x: float = 0.0, width: int = 64, height: int = 48) -> dict:

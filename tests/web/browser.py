@@ -16,9 +16,9 @@ from queue import Empty, Queue
 
 import trimesh
 
+from tests.patience import PATIENCE_SECONDS
+
 ROOT = Path(__file__).resolve().parents[2]
-START_SECONDS = 60
-STOP_SECONDS = 40
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox",
     "--use-gl=angle",
@@ -51,7 +51,7 @@ class RunningServer:
         threading.Thread(target=lambda: [lines.put(line) for line in output], daemon=True).start()
         self.process = process
         said = ""
-        deadline = time.monotonic() + START_SECONDS
+        deadline = time.monotonic() + PATIENCE_SECONDS
         while time.monotonic() < deadline and process.poll() is None:
             try:
                 said += lines.get(timeout=0.2)
@@ -61,13 +61,13 @@ class RunningServer:
                 self.port, self.token = int(address[1]), address[2]
                 return
         self.stop()
-        raise RuntimeError(f"drgs serve did not say its address within {START_SECONDS} s; it said: {said or 'nothing'}")
+        raise RuntimeError(f"drgs serve did not say its address within {PATIENCE_SECONDS:g} s; it said: {said or 'nothing'}")
 
     def stop(self) -> None:
         if self.process and self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:
-                self.process.wait(STOP_SECONDS)
+                self.process.wait(PATIENCE_SECONDS)
             except subprocess.TimeoutExpired:
                 self.process.kill()
 
@@ -79,7 +79,7 @@ class RunningServer:
         """GET with the token, as a script would; POST where there is a body."""
         headers = {"Authorization": f"Bearer {self.token}", "Content-Type": "application/json"}
         request = urllib.request.Request(self.address + path, None if body is None else json.dumps(body).encode(), headers)
-        with urllib.request.urlopen(request, timeout=20) as answer:
+        with urllib.request.urlopen(request, timeout=PATIENCE_SECONDS) as answer:
             return json.load(answer)
 
 

@@ -17,10 +17,9 @@ from PIL import Image
 from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, expect, sync_playwright
 
 from drgs_server.client import Client
+from tests.patience import PATIENCE_SECONDS
 from tests.web.browser import CHROMIUM_ARGUMENTS, ROOT, RunningServer, chromium_path, write_ball
 
-PATIENCE_SECONDS = 120
-"""How long a test waits for what must come. No test is faster for less of it; on a busy machine drawing and loading take their time."""
 expect.set_options(timeout=1000 * PATIENCE_SECONDS)
 
 

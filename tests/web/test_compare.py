@@ -23,6 +23,7 @@ from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.asset import Asset, save_asset
 from drgs.scene.camera import Camera, camera_from_opengl
+from tests.patience import PATIENCE_SECONDS
 from tests.web.browser import RunningServer
 from tests.web.conftest import Viewer, frame_alone, shown_page, wait_until
 
@@ -68,7 +69,7 @@ def captured(
         f"{server.address}/api/assets",
         files={"file": ("captured.zip", path.read_bytes())},
         headers={"Authorization": f"Bearer {server.token}"},
-        timeout=60,
+        timeout=PATIENCE_SECONDS,
     )
     assert answer.status_code == 201, answer.text
     with shown_page(server, browser, answer.json()["id"]) as viewer:

@@ -24,6 +24,7 @@ from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.scene.asset import Asset, save_asset
 from tests.convert.test_export_asset import ball_asset
+from tests.patience import PATIENCE_SECONDS
 from tests.web.browser import ROOT
 
 WARNING, INFORMATION = 1, 2
@@ -46,7 +47,7 @@ def run_node() -> Callable[..., str]:
     def run(script: str, *arguments: object) -> str:
         # One thread: with compilers beside it, Node now and then waits for itself for ever when it ends (nodejs/node issue 54918).
         command = [node, "--single-threaded", ROOT / "web" / script, *map(str, arguments)]
-        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=180).stdout
+        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=PATIENCE_SECONDS).stdout
 
     return run
 

@@ -20,15 +20,15 @@ from PIL import Image
 from playwright.sync_api import Browser, Download, Locator, expect
 from scipy import ndimage
 
-from tests.web.browser import ROOT, STOP_SECONDS, RunningServer
+from tests.patience import PATIENCE_SECONDS
+from tests.web.browser import ROOT, RunningServer
 from tests.web.conftest import Viewer, patient_page, wait_until
 
 CAPTURE = ROOT / "examples" / "sample_capture"
 VIEW_STEP, SIDE = 2, 96
 """Every second view, at this many pixels a side: with half as many, the object's outline is lost."""
-BUILD_SECONDS = 400
+BUILD_SECONDS = 900
 """Some twenty on two idle cores; others may use them, too."""
-DRAW_SECONDS = 120
 SAMPLES = 64
 NOISE = 3.0
 """Mean over the object of the difference between two pictures of the same thing, sRGB 0..255, stays below this."""
@@ -73,7 +73,7 @@ def worker(server: RunningServer) -> Iterator[None]:
     yield
     running.terminate()
     try:
-        running.wait(STOP_SECONDS)
+        running.wait(PATIENCE_SECONDS)
     except subprocess.TimeoutExpired:
         running.kill()
 
@@ -103,7 +103,7 @@ def refined_picture(viewer: Viewer) -> np.ndarray:
         viewer.settle()
         return int(viewer.stage()["samples"]) >= SAMPLES
 
-    wait_until(is_refined, lambda: f"all samples; the page says {viewer.stage()}", DRAW_SECONDS)
+    wait_until(is_refined, lambda: f"all samples; the page says {viewer.stage()}", PATIENCE_SECONDS)
     data = viewer.page.evaluate(READ_CANVAS)
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGBA"), float)
 
@@ -115,7 +115,7 @@ def wait_for_picture(viewer: Viewer, holds: Callable[[np.ndarray], bool], what: 
         now = refined_picture(viewer)
         return [now] if holds(now) else []
 
-    return wait_until(picture, what, DRAW_SECONDS)[0]
+    return wait_until(picture, what, PATIENCE_SECONDS)[0]
 
 
 def silhouette(picture: np.ndarray) -> np.ndarray:
@@ -307,6 +307,6 @@ def stored_mesh(viewer: Viewer) -> trimesh.Trimesh:
 
 
 def downloaded(viewer: Viewer, what: Locator) -> Download:
-    with viewer.page.expect_download(timeout=DRAW_SECONDS * 1000) as download:
+    with viewer.page.expect_download(timeout=PATIENCE_SECONDS * 1000) as download:
         what.click()
     return download.value

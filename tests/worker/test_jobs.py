@@ -18,9 +18,9 @@ from drgs_worker.jobs.builders import BUILDER_VARIABLE
 from drgs_worker.jobs.queue import JobNotInState, JobQueue
 from drgs_worker.store.data_directory import DataDirectory, open_data_directory
 from drgs_worker.store.database import JobRow, now, open_database
+from tests.patience import PATIENCE_SECONDS
 
 REPOSITORY = Path(__file__).parents[2]
-PATIENCE_SECONDS = 60.0
 
 
 class Bench:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from drgs_worker.store.data_directory import open_data_directory
 from drgs_worker.store.scratch import STALE_SECONDS, claim_scratch
+from tests.patience import PATIENCE_SECONDS
 
 PROGRAM = """
 import os, sys
@@ -25,7 +26,7 @@ def test_what_a_killed_process_left_is_swept_and_what_a_living_one_has_is_kept(t
     directory = open_data_directory(tmp_path)
     living = claim_scratch(directory)
     (living.folder / "draft").write_bytes(b"half")
-    assert subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], timeout=60).returncode == -9
+    assert subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], timeout=PATIENCE_SECONDS).returncode == -9
     assert len(list(directory.scratch.rglob(".version-x"))) == 1
     another = claim_scratch(directory)
     assert list(directory.scratch.rglob(".version-x")) == [] and list(another.folder.iterdir()) == []
