@@ -26,7 +26,6 @@ from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss
 from drgs.reconstruct.fit.fit_surface import SOLID, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.losses import display_image
 from drgs.reconstruct.fit.mesh_light import at_corners, corner_weights, radiance_along
-from drgs.reconstruct.fit.metal_evidence import metal_evidence
 from drgs.reconstruct.fit.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.split_sum import filter_environment
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
@@ -130,11 +129,7 @@ class _Steps:
         total, rounds = self.settings.iterations, self.settings.rounds
         if done < total and done * rounds // total > (done - 1) * rounds // total:
             self.surface.move(self.settings.moves)
-            parameters = self.state.parameters
-            with torch.no_grad():
-                tables = filter_environment(environment_table(parameters))
-                evidence = metal_evidence(self.surface.tracer, self.targets, parameters["open_share"], tables, self.surface.edges)
-                parameters["metal"].copy_(evidence)
+            self.surface.look_for_metal(self.targets)
 
     def step(self, iteration: int) -> StepLoss:
         parameters, settings = self.state.parameters, self.settings

@@ -24,7 +24,6 @@ from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.losses import display_image, rough_light, white_light
 from drgs.reconstruct.fit.mesh_light import at_corners, corner_weights, mirrored_light
-from drgs.reconstruct.fit.metal_evidence import metal_evidence
 from drgs.reconstruct.fit.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer
@@ -68,11 +67,13 @@ class SurfaceSettings:
     """0: the mesh stays as it was extracted."""
     steps_a_round: int = 100
     rates: SurfaceRates = field(default_factory=SurfaceRates)
+    normals_end: float = 0.002
+    """What the normals' rate has fallen to after all passes: they have far to go at first, and then each step is one photograph's noise."""
     fall_from: float = 0.5
     """Share of the steps after which rates fall, by a cosine to a twentieth; 1: they do not."""
     moves: MoveSettings = field(default_factory=MoveSettings)
     weight_bend: float = 0.05
-    weight_bend_end: float = 0.005
+    weight_bend_end: float = 0.0015
     """Of the mean difference of normals along edges, at the start and at the end."""
     weight_smooth: float = 1.0
     weight_smooth_end: float = 0.02
@@ -145,15 +146,11 @@ class _Steps:
         if done % self.settings.steps_a_round == 0:
             self.move_surface()
 
-    @torch.no_grad()
     def move_surface(self) -> None:
         """Where normals and outlines say, and what is metal there."""
         self.surface.move(self.settings.moves)
-        parameters = self.state.parameters
         if self.state.iteration > self.settings.metal_from * self.settings.iterations:
-            tables = filter_environment(environment_table(parameters))
-            evidence = metal_evidence(self.surface.tracer, self.targets, parameters["open_share"], tables, self.surface.edges)
-            parameters["metal"].copy_(evidence)
+            self.surface.look_for_metal(self.targets)
 
     def step(self, iteration: int) -> StepLoss:
         if iteration == 0:

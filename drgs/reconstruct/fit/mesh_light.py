@@ -13,16 +13,20 @@ from torch import Tensor
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.frames import tangents_from_normal
 from drgs.reconstruct.fit.split_sum import shade_split_sum
+from drgs.render.integrate.environment_table import build_environment_table
+from drgs.render.integrate.sample_rays import sample_rays
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
+from drgs.render.records import SampleCounts, ShadingPoints
 from drgs.scene.environment import Environment, environment_radiance
 from drgs.scene.mesh import TriangleMesh
 
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 SHARE_LIFT = 4.0
 """Of the tracer's lift: rays from vertices must clear all faces around them."""
 BRIGHTEST_SHARE = 3.0
 """More than this times the open sky's irradiance is noise."""
+SHARED_AT_ONCE = 8192
+"""Vertices whose rays are traced together."""
 CLEAR_OF_FACE = 1e-3
 """Least cosine of a mirrored ray to its face; rays below it count as free."""
 
@@ -97,22 +101,31 @@ def mirrored_light(
 def irradiance_share(
     tracer: AbstractTracer, environment: Environment, tables: Tensor, open_share: Tensor, rays: int, generator: torch.Generator
 ) -> Tensor:
-    """(vertex, 3) share of an open sky's irradiance that arrives, by `rays` stratified cosine-distributed rays a vertex.
+    """(vertex, 3) share of an open sky's irradiance that arrives, by `rays` directions a vertex.
+
+    Half of them by the cosine, half by the sky's light, so that no vertex misses a lamp or counts one twice (Veach 1995); a ratio of two
+    sums over the same directions, so that where nothing is met, or everything, it is exact.
 
     Args:
         open_share: (vertex, 3) as known so far: light that was reflected once more with each call.
     """
-    mesh = tracer.mesh
-    t_u, t_v = tangents_from_normal(mesh.normals)
-    origins = mesh.vertices + SHARE_LIFT * tracer.lift * mesh.normals
-    arriving, of_sky = torch.zeros_like(origins), torch.zeros_like(origins)
-    for ray in range(rays):
-        sine2 = (ray + 0.5) / rays
-        azimuth = ray * GOLDEN_ANGLE + 2 * math.pi * torch.rand(len(origins), generator=generator).to(origins.device)
-        around = t_u * azimuth.cos()[:, None] + t_v * azimuth.sin()[:, None]
-        directions = math.sqrt(sine2) * around + math.sqrt(1 - sine2) * mesh.normals
-        sky = environment_radiance(environment, directions)
-        transmittance, met = radiance_along(tracer, origins, directions, open_share, tables)
-        of_sky += sky
-        arriving += sky * transmittance[:, None] + met
-    return (arriving / of_sky.clamp(min=1e-6)).clamp(0, BRIGHTEST_SHARE)
+    mesh, table = tracer.mesh, build_environment_table(environment)
+    by_light = rays // 2
+    counts = SampleCounts(rays - by_light, 0, by_light)
+    seed = int(torch.randint(1 << 31, (1,), generator=generator))
+    shares = []
+    for first in range(0, len(mesh.vertices), SHARED_AT_ONCE):
+        some = slice(first, first + SHARED_AT_ONCE)
+        normal, count = mesh.normals[some], len(mesh.normals[some])
+        one = torch.ones(count, device=normal.device)
+        index = torch.arange(first, first + count, dtype=torch.int32, device=normal.device)
+        points = ShadingPoints(mesh.vertices[some], normal, normal, torch.ones_like(normal), one, 0 * one, index)
+        sampled = sample_rays(points, table, counts, seed, SHARE_LIFT * tracer.lift)
+        direction = sampled.direction_world.reshape(-1, 3)
+        origins = sampled.origin_world[:, None].expand_as(sampled.direction_world).reshape(-1, 3)
+        share = (sampled.weight * (sampled.direction_world * normal[:, None]).sum(-1)).clamp(min=0)[..., None]
+        transmittance, met = radiance_along(tracer, origins, direction, open_share, tables)
+        sky = environment_radiance(environment, direction).view(count, rays, 3) * share
+        arriving = sky * transmittance.view(count, rays, 1) + met.view(count, rays, 3) * share
+        shares.append(arriving.sum(1) / sky.sum(1).clamp(min=1e-6))
+    return torch.cat(shares).clamp(0, BRIGHTEST_SHARE)

@@ -1,7 +1,7 @@
 """The surface follows the normals that shading found and the masks' outlines, and the light on it is traced anew.
 
 In: the state of a fit on the mesh (fit_surface, fit_mesh_materials), its faces, views with masks. Out, in the same state: moved vertices, normals
-nearer to theirs, the share of an open sky's irradiance that arrives at each; a tracer of the moved mesh.
+nearer to theirs, the share of an open sky's irradiance that arrives at each, and on demand what is metal; a tracer of the moved mesh.
 """
 
 from dataclasses import dataclass, field
@@ -12,7 +12,9 @@ from torch import Tensor
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.mesh_light import irradiance_share
+from drgs.reconstruct.fit.metal_evidence import metal_evidence
 from drgs.reconstruct.fit.split_sum import filter_environment
+from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outlines, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -68,6 +70,13 @@ class MovingSurface:
         radiance = environment_table(parameters)
         tables, share = filter_environment(radiance), parameters["open_share"]
         share.copy_(irradiance_share(self.tracer, Environment(radiance), tables, share, settings.share_rays, self._state.generator))
+
+    @torch.no_grad()
+    def look_for_metal(self, targets: list[ViewTarget]) -> None:
+        """What the photographs say now of which places are metal."""
+        parameters = self._state.parameters
+        tables = filter_environment(environment_table(parameters))
+        parameters["metal"].copy_(metal_evidence(self.tracer, targets, parameters["open_share"], tables, self.edges))
 
 
 def mesh_from_surface_fit(state: FitState, faces: Tensor) -> TriangleMesh:

@@ -62,15 +62,16 @@ class SurfaceFit:
 
 
 def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
-    """Of pass `index`: weights go on where the pass before ended, and rates fall in the last one alone."""
+    """Of pass `index`: weights and the normals' rate go on where the pass before ended; the other rates fall in the last one alone."""
     given, last = settings.surface, index == settings.passes - 1
 
-    def between(start: float, end: float, place: int) -> float:
+    def between(start: float, end: float, place: float) -> float:
         share = place / settings.passes
         return start ** (1 - share) * end**share
 
     return replace(
         given,
+        rates=replace(given.rates, normals=between(given.rates.normals, given.normals_end, index + 0.5)),
         weight_bend=between(given.weight_bend, given.weight_bend_end, index),
         weight_bend_end=between(given.weight_bend, given.weight_bend_end, index + 1),
         weight_smooth=between(given.weight_smooth, given.weight_smooth_end, index),

@@ -18,13 +18,16 @@ from tests.reconstruct.tiny_capture import SPHERE_RADIUS
 SHRUNK = 0.93
 
 
-def test_weights_go_on_where_the_pass_before_ended_and_rates_fall_in_the_last():
+def test_weights_go_on_where_the_pass_before_ended_and_rates_fall():
     settings = PassSettings(passes=4)
     each = [settings_of_pass(settings, index) for index in range(4)]
     for before, after in pairwise(each):
         assert before.weight_smooth_end == pytest.approx(after.weight_smooth)
         assert before.weight_bend_end == pytest.approx(after.weight_bend)
     assert (each[0].weight_smooth, each[-1].weight_smooth_end) == pytest.approx((1.0, 0.02))
+    falling = [one.rates.normals for one in each]
+    assert falling == sorted(falling, reverse=True) and falling[0] ** 8 == pytest.approx(0.02**7 * 0.002)
+    assert falling[-1] ** 8 == pytest.approx(0.02 * 0.002**7)
     assert [one.fall_from for one in each] == [1.0, 1.0, 1.0, settings.surface.fall_from]
     assert len({one.seed for one in each}) == 4
 
