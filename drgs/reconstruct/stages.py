@@ -189,7 +189,7 @@ def surface_stage(
 
 def mesh_materials_stage(place: Workplace, views: Views, surface: SurfaceFit, radius: float, settings: MeshMaterialSettings) -> SurfaceFit:
     """fit_mesh_materials on the surface as it was fitted."""
-    state = start_mesh_materials(surface.state, surface.faces, settings, radius)
+    state = start_mesh_materials(surface.state, settings, radius)
     fit = SurfaceFit(state, surface.faces, surface.index)
     _checkpointed_fit(
         place,

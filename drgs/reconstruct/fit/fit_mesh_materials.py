@@ -38,7 +38,6 @@ from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Rays, SampleCounts, ShadingPoints
 from drgs.scene.camera import world_from_pixel
 from drgs.scene.environment import Environment
-from drgs.scene.mesh import vertex_normals
 from drgs.scene.views import Views
 
 
@@ -49,12 +48,12 @@ class MeshMaterialSettings:
     iterations: int = 300
     rounds: int = 2
     """After each the surface follows its normals, and what is metal is looked at again; but not after the last one."""
-    moves: MoveSettings = field(default_factory=MoveSettings)
+    moves: MoveSettings = field(default_factory=lambda: MoveSettings(to_surface=0.1))
     points_a_step: int = 2048
     samples: SampleCounts = field(default_factory=lambda: SampleCounts(32, 16, 16))
     """Rays a point in each of two sets: cosine, GGX, environment (the paper: 256, 128, 128 in one)."""
-    rates: SurfaceRates = field(default_factory=lambda: SurfaceRates(normals=0.002))
-    weight_bend: float = 0.005
+    rates: SurfaceRates = field(default_factory=lambda: SurfaceRates(normals=0.0007))
+    weight_bend: float = 0.0015
     weight_smooth: float = 0.05
     weight_metal: float = 0.3
     weight_white_light: float = 0.02
@@ -62,10 +61,9 @@ class MeshMaterialSettings:
     seed: int = 0
 
 
-def start_mesh_materials(surface: FitState, faces: Tensor, settings: MeshMaterialSettings, radius: float) -> FitState:
-    """The surface as it was fitted, with its own normals, which are smoother than the fitted ones, and this stage's rates."""
-    own = {"normals": vertex_normals(surface.parameters["vertices"].detach(), faces)}
-    values = leaves(surface.parameters | own, frozen=("vertices", "open_share", "metal"))
+def start_mesh_materials(surface: FitState, settings: MeshMaterialSettings, radius: float) -> FitState:
+    """The surface as it was fitted, with this stage's rates."""
+    values = leaves(surface.parameters, frozen=("vertices", "open_share", "metal"))
     return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 1))
 
 

@@ -66,7 +66,7 @@ def short(iterations: int, **changes) -> MeshMaterialSettings:
 def started(settings: MeshMaterialSettings) -> FitState:
     surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
     surface = start_surface(surfels, placed_sphere(), grey_light(), SurfaceSettings(), SPHERE_RADIUS)
-    return start_mesh_materials(surface, placed_sphere().faces, settings, SPHERE_RADIUS)
+    return start_mesh_materials(surface, settings, SPHERE_RADIUS)
 
 
 def fitted(
