@@ -26,7 +26,7 @@ from drgs.reconstruct.fit.losses import display_image, rough_light, white_light
 from drgs.reconstruct.fit.mesh_light import at_corners, corner_weights, mirrored_light
 from drgs.reconstruct.fit.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.split_sum import filter_environment, shade_split_sum
-from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer
+from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
@@ -128,7 +128,8 @@ def fit_surface(
     def rates(iteration: int) -> dict[str, float]:
         late = max(0.0, (iteration / settings.iterations - settings.fall_from) / max(1 - settings.fall_from, 1e-9))
         share = 0.525 + 0.475 * math.cos(math.pi * late)
-        return {group["name"]: group["full_rate"] * share for group in state.optimizer.param_groups}
+        # Of these settings, not of those that the optimizer was made with: each pass has its own.
+        return {group["name"]: rate_of_group(group["name"], settings.rates) * share for group in state.optimizer.param_groups}
 
     fit = FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, after_step=steps.end_round)
     return run_fit(fit, report, should_stop)

@@ -88,10 +88,14 @@ def make_optimizer(parameters: dict[str, Tensor], rates: object, radius: float) 
     """
     groups = []
     for name, value in parameters.items():
-        light = name.startswith("environment") or name == "background"
-        rate = getattr(rates, "environment" if light else name) * (radius if name == "centers" else 1.0) if value.requires_grad else 0.0
+        rate = rate_of_group(name, rates) * (radius if name == "centers" else 1.0) if value.requires_grad else 0.0
         groups.append({"params": [value], "lr": rate, "name": name, "full_rate": rate})
     return torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+
+
+def rate_of_group(name: str, rates: object) -> float:
+    """Of the record with a rate a name; tables of light share `environment`."""
+    return getattr(rates, "environment" if name.startswith("environment") or name == "background" else name)
 
 
 def parameters_from_gaussians(gaussians: Gaussians) -> dict[str, Tensor]:
