@@ -8,6 +8,7 @@ import resource
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -23,6 +24,8 @@ from benchmarks.trials.site import Answer, Site, Trial
 DISK_BYTES = 96 << 20
 LEFT_BYTES = 128 << 10
 """On the full disk: answers and locks find a place, files do not."""
+SWEPT_SECONDS = 5.0
+"""What was sent is removed behind its last byte, which the caller may have seen before."""
 
 Send = Callable[[Site, str], Answer]
 
@@ -119,8 +122,12 @@ def _refused(send: Send, done: int, site: Site) -> str | None:
         again = send(own, session)
         if again.status != done:
             return f"with room again it is answered {again.status}: {again.sentence[:200]}"
-        drafts = [path.name for path in (own.data / "scratch").glob("*/*")]
-        return f"{len(drafts)} drafts are left, such as {drafts[0]}" if drafts else None
+        end = time.monotonic() + SWEPT_SECONDS
+        while drafts := [path.name for path in (own.data / "scratch").glob("*/*")]:
+            if time.monotonic() > end:
+                return f"{len(drafts)} drafts are left, such as {drafts[0]}"
+            time.sleep(0.05)
+        return None
 
 
 def _edits(site: Site) -> str | None:

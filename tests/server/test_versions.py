@@ -1,5 +1,6 @@
 """Saving a session as a new version of its asset, and what a full disk leaves behind."""
 
+import asyncio
 import json
 import resource
 from pathlib import Path
@@ -9,6 +10,7 @@ from conftest import Service
 from test_rest import is_problem, left_on_disk, zipped
 
 from drgs.scene.asset import load_asset
+from drgs_server.api import routes_assets
 
 TETRAHEDRON = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
@@ -39,6 +41,38 @@ def test_an_export_of_a_session_holds_its_edits_and_keeps_no_version(service: Se
     assert refused.status_code == 422 and "Gaussians" in refused.json()["detail"]
     assert service.client.get("/api/assets").json()["total"] == 1
     assert list(service.context.directory.uploads.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("asked", "status"), [(None, 200), ("bytes=0-1", 206), ("bytes=0-1,3-3", 206), ("bytes=90-", 416), ("bytes=junk", 400)]
+)
+def test_an_export_leaves_no_draft_whatever_range_is_asked_for(
+    service: Service, monkeypatch: pytest.MonkeyPatch, asked: str | None, status: int
+) -> None:
+    async def tool(_: object, __: object, ___: object, kind: str, source: str, out: str, *rest: str) -> None:
+        Path(out).write_bytes(b"glTF")
+
+    monkeypatch.setattr(routes_assets, "_run_tool", tool)
+    headers = {} if asked is None else {"Range": asked}
+    assert service.client.get(f"/api/assets/{service.add_asset()}/export?format=glb", headers=headers).status_code == status
+    assert list(service.context.scratch.folder.glob(".export-*")) == []
+
+
+def test_an_export_leaves_no_draft_where_sending_fails(tmp_path: Path) -> None:
+    folder = tmp_path / ".export-1"
+    folder.mkdir()
+    (folder / "asset.glb").write_bytes(b"glTF")
+
+    async def receive() -> dict:
+        return {"type": "http.disconnect"}
+
+    async def send(_: object) -> None:
+        raise ConnectionResetError("the other end is gone")
+
+    scope = {"type": "http", "method": "GET", "headers": [], "asgi": {"spec_version": "2.4"}}
+    with pytest.raises(ConnectionResetError):
+        asyncio.run(routes_assets.DraftResponse(folder / "asset.glb")(scope, receive, send))
+    assert not folder.exists()
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

@@ -13,8 +13,8 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, Response
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
-from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
+from starlette.types import Receive, Scope, Send
 
 from drgs.exchange.export_formats import FILE_KINDS, DownloadFormat
 from drgs.scene.edits import Edit, plain_edit
@@ -196,6 +196,17 @@ async def export_asset(asset_id: str, format: DownloadFormat, context: Context, 
     return await while_connected(call, write_export(context, asset_id, format, (), caller_of(call)))
 
 
+class DraftResponse(FileResponse):
+    """A file whose folder is removed however sending ends. A background task is not run where the range that was asked for is refused, or where
+    sending fails."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            shutil.rmtree(Path(self.path).parent, ignore_errors=True)
+
+
 async def write_export(
     context: ServerContext, asset_id: str, format: DownloadFormat, edits: Sequence[Edit], caller: Caller
 ) -> FileResponse:
@@ -219,12 +230,7 @@ async def write_export(
         shutil.rmtree(folder, ignore_errors=True)
         raise
     title = "".join(c if c.isalnum() or c in "-_ " else "-" for c in row.name).strip() or "asset"
-    return FileResponse(
-        out,
-        media_type="application/octet-stream",
-        filename=title + FILE_KINDS[format].suffix,
-        background=BackgroundTask(shutil.rmtree, folder, ignore_errors=True),
-    )
+    return DraftResponse(out, media_type="application/octet-stream", filename=title + FILE_KINDS[format].suffix)
 
 
 @router.delete("/assets/{asset_id}", status_code=204)
