@@ -40,7 +40,7 @@ REJECTED: dict[str, dict] = {
     "a splice beyond the end": {"type": "splice", "id": 7, "revision": 0, "start": 5, "remove": 5, "edits": []},
     "a light that is none": {"type": "edit", "id": 7, "edit": {"op": "environment", "file": "none.exr"}},
     "a clip that is none": {"type": "edit", "id": 7, "edit": {"op": "pose", "clip": "clips/" + "0" * 32, "time": 0}},
-    "a region that is none": {"type": "edit", "id": 7, "edit": {"op": "material", "select": {"region": 99}, "set": {"roughness": 1}}},
+    "a region that is none": {"type": "edit", "id": 7, "edit": {"op": "material", "select": {"region": 999_999}, "set": {"roughness": 1}}},
 }
 STALLED_CHANGES, STALLED_EDITS = 200, 1000
 STALLED_BYTES = 150 << 20

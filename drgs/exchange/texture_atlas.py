@@ -17,7 +17,8 @@ TEXELS_PER_FACE = 40
 """What a face gets on average; values are linear within a face, so more would add nothing."""
 GUTTER = 4
 """Texels between charts, so that filtering and the first mip levels do not mix them."""
-_CHUNK = 1 << 22
+_CHUNK = 1 << 19
+"""Texels painted at once: some 200 bytes each."""
 _EDGE = 1e-3
 """Slack of a face's border, in texels and weights: float32 coordinates must not lose a corner that lies on a texel's centre."""
 

@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
@@ -76,3 +78,13 @@ def test_faces_without_area_fall_back_to_cells_instead_of_being_lost():
     atlas = unwrap(vertices, faces)
     assert np.array_equal(atlas.vertex_of[atlas.faces], faces)
     assert np.isfinite(paint(atlas, vertices)).all()
+
+
+def test_painting_takes_memory_in_proportion_to_the_picture():
+    mesh = trimesh.creation.icosphere(6)  # 81 920 faces, in cells
+    atlas = unwrap(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    tracemalloc.start()
+    picture = paint(atlas, np.asarray(mesh.vertices, np.float32))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * picture.nbytes  # 208 MiB of 68; all faces at once took 903

@@ -62,7 +62,7 @@ class Limits(BaseModel):
     """In memory; the least recently used one that nobody looks at goes first."""
     loaded_bytes: Positive = 4 << 30
     """Of asset folders whose contents are in memory, which is about what they need there, and of the environments there."""
-    heavy_bytes: Positive = 3 << 29
+    heavy_bytes: Positive = 1 << 30
     """Of memory, by estimate, that finished pictures and the processes that read and write files may take at once; others wait."""
     pictures_at_once: Positive = 2
     """Over REST. One thread renders them all; the second is prepared and encoded meanwhile."""
