@@ -2,7 +2,8 @@
 
 In: cameras and coverage. Out: a closed surface and the sphere that bounds it. Knows nothing of colours or Gaussians.
 The field at a point is the (k+1)-th smallest coverage over the views that see the point, so up to k wrong masks are outvoted;
-k is a few percent of the views. The surface is the field's level set, found coarse to fine.
+k is a few percent of the views. What hardly any view sees is not the object: where it fills their pictures, they would say that it reaches up to
+them. The surface is the field's level set, found coarse to fine.
 Source: Laurentini 1994, "The visual hull concept"; marching cubes by scikit-image.
 """
 
@@ -13,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Int32, Shaped, UInt8
 from numpy import ndarray
 from scipy import ndimage
 from skimage.measure import marching_cubes
@@ -23,6 +24,8 @@ from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 from drgs.warp_torch import launch, warp_array, warp_device
 
+FEWEST_SEEN = 3
+"""Views that must see a place of the object."""
 MOST_OUTVOTED = 3
 """The kernel keeps the MOST_OUTVOTED + 1 smallest values in one wp.vec4."""
 
@@ -37,6 +40,8 @@ class VisualHullSettings:
     """Share of the views whose masks may be wrong."""
     mask_side: int = 512
     """Larger masks are averaged down to at most this [pixels]: finer ones outdo the grid."""
+    seen_share: float = 0.5
+    """Of the views that see the best seen place of the object, how many must see all others."""
     level: float = 0.4
     """Coverage that counts as object; below one half so that details as wide as a cell survive."""
     smallest_part: float = 0.002
@@ -64,8 +69,10 @@ def outvote(
     fewest_seen: int,
     # outputs
     field: wp.array[float],
+    seen_by: wp.array[wp.int32],
 ):
-    """One thread a point: the (outvoted+1)-th smallest coverage, looked up bilinearly, over the views that see the point."""
+    """One thread a point: the (outvoted+1)-th smallest coverage, looked up bilinearly, over the views that see the point; and how many those
+    are, where it is not 0."""
     i = first + wp.tid()
     point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
     width = masks.shape[2]
@@ -96,6 +103,7 @@ def outvote(
                 if smallest[outvoted] <= 0.0:
                     break
     field[i] = wp.where(seen >= fewest_seen or smallest[outvoted] <= 0.0, smallest[outvoted], 0.0)
+    seen_by[i] = seen
 
 
 def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings()) -> VisualHull | None:
@@ -109,7 +117,7 @@ def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings(
         lower, upper = box
         cell = float((upper - lower).max()) / settings.coarse_cells
         shape = _grid_shape(lower, upper, cell)
-        occupied = (carver.upper_field(_grid_points(lower, cell, shape), cell) > settings.level).reshape(shape)
+        occupied = carver.occupied(_grid_points(lower, cell, shape), cell, settings).reshape(shape)
         if not occupied.any():
             return None
         sides = [occupied[0], occupied[-1], occupied[:, 0], occupied[:, -1], occupied[:, :, 0], occupied[:, :, -1]]
@@ -200,19 +208,28 @@ class _Carver:
             [(c.intrinsics.double() @ c.camera_from_world.double()[:3]).float().cpu() for c in self.cameras]
         )
         self.outvoted = min(MOST_OUTVOTED, math.ceil(settings.wrong_mask_share * count)) if count >= 12 else 0
-        self.fewest_seen = max(3, count // 4)
+        self.fewest_seen = FEWEST_SEEN
+
+    def occupied(self, points: Float[Tensor, "point 3"], cell: float, settings: VisualHullSettings) -> Bool[Tensor, "point"]:
+        """(point,) where the object may be in a cell around each point (point, 3). From now on, what fewer views see than settings say is empty."""
+        self.fewest_seen = FEWEST_SEEN
+        field, seen = self._outvote(points, self._widened(points, cell, ndimage.maximum_filter))
+        occupied = field > settings.level
+        if bool(occupied.any()):
+            self.fewest_seen = max(FEWEST_SEEN, math.ceil(settings.seen_share * int(seen[occupied].max())))
+        return occupied & (seen >= self.fewest_seen)
 
     def upper_field(self, points: Float[Tensor, "point 3"], cell: float) -> Float[Tensor, "point"]:
         """At least the field (n,) anywhere in a cell around each point (n, 3)."""
-        return self._outvote(points, self._widened(points, cell, ndimage.maximum_filter))
+        return self._outvote(points, self._widened(points, cell, ndimage.maximum_filter))[0]
 
     def lower_field(self, points: Float[Tensor, "point 3"], cell: float) -> Float[Tensor, "point"]:
         """At most the field (n,) anywhere in a cell around each point (n, 3)."""
-        return self._outvote(points, self._widened(points, cell, ndimage.minimum_filter))
+        return self._outvote(points, self._widened(points, cell, ndimage.minimum_filter))[0]
 
     def field(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
         """The field (n,) at `points` (n, 3)."""
-        return self._outvote(points, self.masks)
+        return self._outvote(points, self.masks)[0]
 
     def _widened(
         self, points: Float[Tensor, "point 3"], cell: float, widen: Callable[[ndarray, int], ndarray]
@@ -227,9 +244,11 @@ class _Carver:
             widened[index] = widen(self.masks[index], 2 * min(reach, min(self.masks.shape[1:]) // 2) + 1)
         return widened
 
-    def _outvote(self, points: Float[Tensor, "point 3"], masks: UInt8[ndarray, "view height width"]) -> Float[Tensor, "point"]:
+    def _outvote(
+        self, points: Float[Tensor, "point 3"], masks: UInt8[ndarray, "view height width"]
+    ) -> tuple[Float[Tensor, "point"], Int32[Tensor, "point"]]:
         points = points.float().contiguous()
-        field = torch.zeros(len(points))
+        field, seen = torch.zeros(len(points)), torch.zeros(len(points), dtype=torch.int32)
         launch(
             outvote,
             len(points),
@@ -240,10 +259,10 @@ class _Carver:
                 self.outvoted,
                 self.fewest_seen,
             ],
-            outputs=[warp_array(field)],
+            outputs=[warp_array(field), warp_array(seen)],
             device=warp_device(points),
         )
-        return field
+        return field, seen
 
 
 def _grid_shape(lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], cell: float) -> tuple[int, int, int]:

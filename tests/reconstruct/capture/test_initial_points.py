@@ -10,6 +10,7 @@ import torch
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings, axes_meeting_point, visual_hull
+from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 from tests.reconstruct import tiny_capture as tiny
 
@@ -96,6 +97,30 @@ def test_one_wrong_mask_is_outvoted(fill: int, sphere: Views) -> None:
     radii = _radii(initial_points(replace(sphere, coverage=coverage), COUNT, seed=0).points_world)
     assert radii.min() > 0.96
     assert np.median(radii) < 1.06
+
+
+def test_what_few_close_views_alone_see_is_not_the_object(sphere: Views) -> None:
+    def zoomed(camera: Camera, factor: float) -> Camera:
+        center = torch.tensor(tiny.SPHERE_CENTER).float() @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+        focal = factor * 0.5 * camera.width * float(center[2]) / tiny.SPHERE_RADIUS
+        at = focal * center[:2] / center[2]
+        middle = torch.tensor([camera.width / 2, camera.height / 2]) - at
+        return replace(camera, intrinsics=torch.tensor([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]))
+
+    def disc(share: float) -> torch.Tensor:
+        y, x = torch.meshgrid(*((torch.arange(size) + 0.5) / size - 0.5 for size in sphere.coverage.shape[1:]), indexing="ij")
+        return ((x**2 + y**2).sqrt() < 0.5 * share).to(torch.uint8) * 255
+
+    # The sphere just fits into each picture, but eight neighbours stand so near that it fills theirs.
+    around = [zoomed(camera, 0.9) for camera in sphere.cameras]
+    near = [zoomed(sphere.cameras[0], 4.0 + 0.01 * k) for k in range(8)]
+    coverage = torch.stack([disc(0.9)] * len(around) + [disc(4.0)] * len(near))
+    views = replace(
+        sphere, cameras=(*around, *near), coverage=coverage, images_srgb=sphere.images_srgb[:1].expand(len(coverage), -1, -1, -1)
+    )
+    hull = visual_hull(views)
+    assert hull is not None
+    assert _radii(torch.from_numpy(hull.vertices_world)).max() < 1.3
 
 
 def test_two_separate_parts_both_get_points(sphere: Views) -> None:
