@@ -104,7 +104,7 @@ def irradiance_share(
     """(vertex, 3) share of an open sky's irradiance that arrives, by `rays` directions a vertex.
 
     Half of them by the cosine, half by the sky's light, so that no vertex misses a lamp or counts one twice (Veach 1995); a ratio of two
-    sums over the same directions, so that where nothing is met, or everything, it is exact.
+    sums over the same directions, so that the sky's part is exact where nothing is met, or everything.
 
     Args:
         open_share: (vertex, 3) as known so far: light that was reflected once more with each call.
@@ -123,9 +123,10 @@ def irradiance_share(
         sampled = sample_rays(points, table, counts, seed, SHARE_LIFT * tracer.lift)
         direction = sampled.direction_world.reshape(-1, 3)
         origins = sampled.origin_world[:, None].expand_as(sampled.direction_world).reshape(-1, 3)
-        share = (sampled.weight * (sampled.direction_world * normal[:, None]).sum(-1)).clamp(min=0)[..., None]
+        cosine = (sampled.direction_world * normal[:, None]).sum(-1)
+        weight = (sampled.weight * cosine).clamp(min=0)[..., None]
         transmittance, met = radiance_along(tracer, origins, direction, open_share, tables)
-        sky = environment_radiance(environment, direction).view(count, rays, 3) * share
-        arriving = sky * transmittance.view(count, rays, 1) + met.view(count, rays, 3) * share
+        sky = environment_radiance(environment, direction).view(count, rays, 3) * weight
+        arriving = sky * transmittance.view(count, rays, 1) + met.view(count, rays, 3) * weight
         shares.append(arriving.sum(1) / sky.sum(1).clamp(min=1e-6))
     return torch.cat(shares).clamp(0, BRIGHTEST_SHARE)
