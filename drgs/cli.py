@@ -22,6 +22,7 @@ from typer.core import TyperGroup
 from drgs.exchange.export_formats import EXPORT_FORMATS, FILE_KINDS, ExportFormat, export_format_of
 from drgs.installation import missing_package, unsupported_system
 from drgs.maths.constants import STILL_BOUNCES
+from drgs.openmp import spin_briefly
 from drgs.scene.tone_curve import ToneCurve
 
 if TYPE_CHECKING:
@@ -415,6 +416,8 @@ def main() -> None:
     """Entry point of the `drgs` command."""
     if (sentence := unsupported_system()) and any(find_spec(name) is None for name in ("torch", "warp", "embreex")):
         sys.exit(f"drgs cannot run here: {sentence}")
+    if sys.argv[1:2] != ["serve"]:  # whose processes choose for themselves
+        spin_briefly()
     app()
 
 

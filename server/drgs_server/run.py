@@ -18,6 +18,7 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
+from drgs.openmp import sleep_at_once
 from drgs_server.api.connections import guarded_connections
 from drgs_server.api.rate_limit import KeepPeer
 from drgs_server.app import create_app
@@ -64,8 +65,7 @@ def serve(
     settings = settings.model_copy(update={"data": settings.data.expanduser().resolve()})
     host, port = settings.host, settings.port
     set_up_logging(settings.log_format)
-    # torch's idle threads would otherwise spin, and server and worker share the cores; read when torch is first imported.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    sleep_at_once()
     # Python's lock is passed on sooner than after its usual 5 ms: an answer needs it several times while the render thread wants it, too.
     sys.setswitchinterval(SWITCH_SECONDS)
     _raise_file_limit(settings.limits)

@@ -17,6 +17,7 @@ from sqlalchemy import Engine
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
+from drgs.openmp import spin_briefly
 from drgs_worker.jobs.builders import find_builder
 from drgs_worker.jobs.queue import (
     APPLICATION_NAME,
@@ -53,7 +54,7 @@ def run_worker(data: Path | None = None, device: str | None = None, parent_pid: 
     set_up_logging(settings.log_format)
     directory = open_data_directory(settings.data, settings.database_url, settings.queue_url, settings.artifact_url)
     worker_id, slot_lock = _claim_slot(directory)
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would otherwise spin beside the server's
+    spin_briefly()
     os.nice(10)  # the viewer comes first where both run on one machine
     engine = open_database(directory)
     migrate_queue(directory)

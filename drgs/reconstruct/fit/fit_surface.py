@@ -84,6 +84,8 @@ class SurfaceSettings:
     """Share of the rounds after which evidence is looked at: normals must be right before mirrors can be."""
     weight_white_light: float = 0.02
     weight_rough_light: float = 0.002
+    pixels_a_step: int = 65_536
+    """Of one photograph; of larger ones as many are drawn anew in each step."""
     seed: int = 0
 
     @property
@@ -182,6 +184,9 @@ class _Steps:
         with torch.no_grad():
             origin, directions = pixel_rays_world(target.camera)
             solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
+            if len(solid) > self.settings.pixels_a_step:
+                drawn = torch.randperm(len(solid), generator=self.state.generator)[: self.settings.pixels_a_step]
+                solid = solid[drawn.sort().values.to(solid.device)]
             direction = directions.reshape(-1, 3)[solid]
             hits = trace_rays(origin.expand_as(direction), direction, self.surface.tracer)
             hit = hits.hit.nonzero().squeeze(1)
