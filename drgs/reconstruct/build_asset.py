@@ -18,6 +18,7 @@ from drgs.exchange.photographs import encode_photographs
 from drgs.reconstruct.capture.find_masks import with_drawn_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.fit.albedo_detail import DetailSettings, albedo_detail, divisions
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_gaussians import FitSettings, gaussians_from_state
@@ -32,8 +33,10 @@ from drgs.reconstruct.fit.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
+from drgs.reconstruct.geometry.divide_faces import divided_binding, divided_faces
 from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, FULL_MESH, MeshSettings, mesh_report
 from drgs.reconstruct.geometry.face_surfels import radiating_surfels, surfels_on_faces_of
+from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.progress import STAGE_SHARES, Progress
@@ -59,6 +62,7 @@ from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import mesh_extent
 from drgs.render.records import SampleCounts
 from drgs.scene.asset import Asset, save_asset
+from drgs.scene.binding import Binding
 from drgs.scene.certainty import Certainty
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
@@ -94,10 +98,12 @@ class Preset:
     mesh: MeshSettings
     surface: PassSettings = field(default_factory=PassSettings)
     materials: MeshMaterialSettings = field(default_factory=MeshMaterialSettings)
+    detail: DetailSettings = field(default_factory=DetailSettings)
     mesh_surfels: MeshFitSettings = field(default_factory=MeshFitSettings)
     """For binding mesh: its fine-tuning."""
     materials_on: Literal["mesh", "surfels"] = "mesh"
-    """surfels: the mesh stays as it was extracted, and materials are fitted on surfels, as in the paper; then `surface` and `materials` are idle."""
+    """surfels: the mesh stays as it was extracted, and materials are fitted on surfels, as in the paper; then `surface`, `materials` and
+    `detail` are idle."""
     surfel_materials: MaterialSettings = field(default_factory=MaterialSettings)
     """Of materials_on surfels. Bound to the mesh, that one has as many faces at most as surfels are allowed (fit.densify.budget)."""
 
@@ -111,6 +117,7 @@ PRESETS = {
         replace(FAST_MESH, resolution=160, face_limit=30_000),
         PassSettings(3, SurfaceSettings(rounds=1, steps_a_round=50), replace(PASS_MESH, resolution=120, face_limit=30_000), carvings=1),
         MeshMaterialSettings(iterations=80, points_a_step=1024),
+        DetailSettings(most_faces=0),
         MeshFitSettings(iterations=150),
         surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
     ),
@@ -121,16 +128,18 @@ PRESETS = {
         FAST_MESH,
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carvings=2),
         MeshMaterialSettings(iterations=180),
+        DetailSettings(),
         MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
     ),
     "full": Preset(
         25_000,
         1024,
-        FitSettings(iterations=1400, half_size_share=0.25, densify=DensifySettings(budget=40_000)),
+        FitSettings(iterations=1400, half_size_share=0.25, most_pixels=320_000, densify=DensifySettings(budget=40_000)),
         FULL_MESH,
         PassSettings(24, mesh=replace(PASS_MESH, resolution=224, face_limit=80_000), carvings=10),
         MeshMaterialSettings(iterations=1200, rounds=3),
+        DetailSettings(most_faces=400_000),
         MeshFitSettings(iterations=500),
         surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
     ),
@@ -274,11 +283,11 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
 
     with timed("pack"):
         place.reporter.report("pack", 0.0, "writing the asset")
-        mesh, environment = decoupled.mesh, Environment(environment_table(decoupled.state.parameters).detach())
+        fitted, environment = decoupled.mesh, Environment(environment_table(decoupled.state.parameters).detach())
         # Faces moved once more with the materials; surfels stay where they are on them.
-        surfels, binding = surfels_on_faces_of(mesh) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=mesh))
+        surfels, binding = surfels_on_faces_of(fitted) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=fitted))
+        mesh, binding, certainty = _detailed(views, decoupled, binding, built.preset.detail)
         surfels = radiating_surfels(surfels, binding, mesh, environment)
-        certainty = _certainty(views, decoupled)
         asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh", certainty=certainty)
     return asset, surface_preview(decoupled, views.cameras)
 
@@ -319,11 +328,23 @@ def _horizons(mesh: TriangleMesh) -> UInt8[Tensor, "face 8"]:
 
 
 @torch.no_grad()
-def _certainty(views: Views, fit: SurfaceFit) -> Certainty:
+def _detailed(views: Views, fit: SurfaceFit, binding: Binding, settings: DetailSettings) -> tuple[TriangleMesh, Binding, Certainty]:
+    """The fitted mesh with faces as small as the photographs' pixels and the albedo that they show; where surfels are on it; how certain it is."""
     mesh, parameters = fit.mesh, fit.state.parameters
-    tables = filter_environment(environment_table(parameters))
+    tables, share = filter_environment(environment_table(parameters)), parameters["open_share"]
     targets = view_targets(views, 1.0, mesh.vertices.device)
-    return vertex_certainty(build_tracer(mesh), targets, parameters["open_share"], tables, parameters["metal"])
+    certainty = vertex_certainty(build_tracer(mesh), targets, share, tables, parameters["metal"])
+    times = divisions(mesh, views.cameras, settings)
+    for _ in range(times):
+        divided = divided_faces(mesh.faces, len(mesh.vertices))
+        binding = divided_binding(binding, len(mesh.faces))
+        fields = {name: divided.carried(value) for name, value in vars(mesh).items() if name != "faces"}
+        mesh = TriangleMesh(**fields | {"faces": divided.faces, "normals": torch.nn.functional.normalize(fields["normals"], dim=-1)})
+        share = divided.carried(share)
+        certainty = Certainty(**{name: divided.carried(value.float()).half() for name, value in vars(certainty).items()})
+    edges, rings = mesh_edges(mesh.faces), settings.rings * 4**times
+    albedo = albedo_detail(build_tracer(mesh), targets, share, tables, edges, rings)
+    return replace(mesh, albedo=albedo), binding, certainty
 
 
 def _check(settings: BuildSettings) -> None:

@@ -12,14 +12,14 @@ space carving's (Kutulakos and Seitz 2000, docs/sources.md: kutulakos2000), with
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.sparse import csr_matrix, diags, identity
+from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
+from drgs.reconstruct.geometry.average_around import averaging_matrix
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -90,7 +90,7 @@ def carved_depths(
         evidence: of metal_evidence. radius: of the object's bounding sphere [world units].
     """
     mesh = tracer.mesh
-    around = _averaging(edges, len(mesh.vertices))
+    around = averaging_matrix(edges, len(mesh.vertices))
     outward = _averaged(around, vertex_normals(mesh.vertices, mesh.faces), settings.direction_rings)
     inward = -torch.nn.functional.normalize(outward, dim=-1)
     matt = (mesh.metallic < settings.most_metallic) & (mesh.roughness > settings.smoothest) & (evidence < settings.most_evidence)
@@ -178,14 +178,6 @@ def _thickness(tracer: AbstractTracer, vertices: Tensor, inward: Tensor) -> Tens
     """(n,) how far it is from the vertices (n,) to the other side of the object [world units]."""
     hits = trace_rays(tracer.mesh.vertices[vertices] + 8 * tracer.lift * inward, inward, tracer)
     return torch.where(hits.hit, hits.distance, torch.zeros_like(hits.distance))
-
-
-def _averaging(edges: MeshEdges, count: int) -> csr_matrix:
-    """Matrix that takes the mean over each vertex and its neighbours."""
-    start, end = edges.vertices.cpu().numpy().T
-    ones = np.ones(2 * len(start))
-    adjacency = csr_matrix((ones, (np.concatenate([start, end]), np.concatenate([end, start]))), shape=(count, count)) + identity(count)
-    return diags(1 / np.asarray(adjacency.sum(1)).ravel()) @ adjacency
 
 
 def _averaged(around: csr_matrix, values: Tensor, rings: int) -> Tensor:

@@ -42,6 +42,7 @@ from drgs.reconstruct.fit.surfel_parameters import (
 )
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.render.visible.rasterize.near_plane import near_plane
+from drgs.scene.camera import Camera
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.views import Views
 
@@ -53,6 +54,8 @@ class FitSettings:
     iterations: int = 2000
     half_size_share: float = 0.4
     """Share of the iterations at half the image size, where a step costs a quarter."""
+    most_pixels: int = 160_000
+    """Larger photographs are reduced to this many: the surface's fit sees what is finer."""
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifySettings = field(default_factory=DensifySettings)
     sh_degree: int = 3
@@ -150,7 +153,7 @@ class _Steps:
 
     def _drawn_target(self, iteration: int) -> ViewTarget:
         half_size = iteration < int(self.settings.half_size_share * self.settings.iterations)
-        factor = 0.5 if half_size else 1.0
+        factor = (0.5 if half_size else 1.0) * size_factor(self.views.cameras[0], self.settings.most_pixels)
         if factor != self.target_factor:
             self.targets = view_targets(self.views, factor, self.state.parameters["centers"].device)
             self.target_factor = factor
@@ -160,6 +163,11 @@ class _Steps:
         if progress < self.settings.sh_start:
             return 0
         return min(self.settings.sh_degree, int((progress - self.settings.sh_start) * 10) + 1)
+
+
+def size_factor(camera: Camera, most_pixels: int) -> float:
+    """By which a photograph is reduced; 1 where it is small enough."""
+    return min(1.0, math.sqrt(most_pixels / (camera.width * camera.height)))
 
 
 def normal_share(progress: float) -> float:

@@ -12,7 +12,7 @@ from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.environment_pyramid import environment_table
-from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
+from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, size_factor, start_fit
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.render_stage_one import render_stage_one
 from drgs.reconstruct.fit.split_sum import filter_environment
@@ -148,3 +148,16 @@ def test_the_gradient_reaches_every_group(points: InitialPoints, views: Views):
     for name, value in state.parameters.items():
         assert value.grad is not None and bool(torch.isfinite(value.grad).all()), name
         assert float(value.grad.abs().max()) > 0, name
+
+
+def test_large_photographs_are_reduced_to_so_many_pixels(views: Views, points: InitialPoints) -> None:
+    camera = views.cameras[0]
+    assert size_factor(camera, camera.width * camera.height) == 1.0
+    pixels = camera.width * camera.height // 4
+    assert size_factor(camera, pixels) == 0.5
+    halved = dataclasses.replace(SHORT, half_size_share=1.0, iterations=4)
+    reduced = dataclasses.replace(SHORT, half_size_share=0.0, most_pixels=pixels, iterations=4)
+    states = [start_fit(points, settings, CPU) for settings in (halved, reduced)]
+    for state, settings in zip(states, (halved, reduced), strict=True):
+        run(views, state, points, settings)
+    assert_same_parameters(*states)

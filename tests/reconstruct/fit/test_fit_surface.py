@@ -76,6 +76,16 @@ def test_a_fit_resumed_inside_a_round_or_between_two_ends_with_the_same_numbers(
         assert torch.equal(resumed.parameters[name], value), name
 
 
+def test_of_large_photographs_some_pixels_are_looked_at(views: Views):
+    few = short(rounds=1, pixels_a_step=200)
+    (some, reports), (same, _), (all_, _) = fitted(views, few), fitted(views, few), fitted(views, short(rounds=1))
+    assert torch.equal(some.parameters["normals"], same.parameters["normals"])
+    assert not torch.equal(some.parameters["normals"], all_.parameters["normals"])
+    changed = (some.parameters["albedo_logits"] != started(few).parameters["albedo_logits"]).any(1)
+    assert float(changed.float().mean()) > 0.05
+    assert reports[-1].psnr > 5
+
+
 def test_no_rounds_leave_the_mesh_as_it_was(views: Views):
     settings = short(rounds=0)
     state, reports = fitted(views, settings)

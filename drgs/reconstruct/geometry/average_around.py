@@ -1,0 +1,14 @@
+"""Means over neighbourhoods of a mesh, as a sparse matrix."""
+
+import numpy as np
+from scipy.sparse import csr_matrix, diags, identity
+
+from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+
+
+def averaging_matrix(edges: MeshEdges, count: int) -> csr_matrix:
+    """(count, count) matrix that takes the mean over each vertex and its neighbours."""
+    start, end = edges.vertices.cpu().numpy().T
+    ones = np.ones(2 * len(start))
+    adjacency = csr_matrix((ones, (np.concatenate([start, end]), np.concatenate([end, start]))), shape=(count, count)) + identity(count)
+    return diags(1 / np.asarray(adjacency.sum(1)).ravel()) @ adjacency

@@ -1,0 +1,52 @@
+"""Each face of a mesh becomes four, by the middles of its edges: the same surface, with room for finer values at its vertices."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from drgs.scene.binding import Binding
+
+
+@dataclass(frozen=True, eq=False)
+class DividedFaces:
+    """The new faces, and what the new vertices lie between. Old vertices keep their numbers and come first."""
+
+    faces: Int[Tensor, "face 3"]
+    """Of old face f of F: f, F + f and 2 F + f at its corners, 3 F + f in its middle."""
+    between: Int[Tensor, "new 2"]
+    """Old vertices at the ends of the edge whose middle a new vertex is."""
+
+    def carried(self, values: Tensor) -> Tensor:
+        """(vertex, ...) of what the old vertices carried."""
+        start, end = self.between.unbind(1)
+        return torch.cat([values, 0.5 * (values[start] + values[end])])
+
+
+def divided_faces(faces: Int[Tensor, "face 3"], vertices: int) -> DividedFaces:
+    """Of a mesh with so many vertices; edges that faces share get one new vertex."""
+    corners = faces.long()
+    ends = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(1).values
+    between, number = torch.unique(ends, dim=0, return_inverse=True)
+    first, second, third = (vertices + number).view(3, -1)
+    a, b, c = corners.unbind(1)
+    parts = [(a, first, third), (b, second, first), (c, third, second), (first, second, third)]
+    return DividedFaces(torch.cat([torch.stack(part, 1) for part in parts]).to(faces), between)
+
+
+def divided_binding(binding: Binding, faces: int) -> Binding:
+    """The same places on the divided faces of a mesh that had so many."""
+    a, b, c = binding.barycentric.unbind(1)
+    children = torch.stack(
+        [
+            torch.stack([2 * a - 1, 2 * b, 2 * c], 1),
+            torch.stack([2 * b - 1, 2 * c, 2 * a], 1),
+            torch.stack([2 * c - 1, 2 * a, 2 * b], 1),
+            torch.stack([1 - 2 * c, 1 - 2 * a, 1 - 2 * b], 1),
+        ]
+    )
+    most, corner = binding.barycentric.max(1)
+    child = torch.where(most > 0.5, corner, torch.full_like(corner, 3))
+    inside = children[child, torch.arange(len(child), device=child.device)]
+    return replace(binding, face=(child * faces + binding.face.long()).to(binding.face), barycentric=inside)
