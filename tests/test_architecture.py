@@ -21,7 +21,7 @@ LAYERS = (
     "drgs_worker.store", "drgs_worker.jobs", "drgs_worker", "drgs_server",
 )  # fmt: skip
 """Each may import those before it."""
-TOP_FILES = {"drgs/__init__.py", "drgs/cli.py", "drgs/cli_progress.py", "drgs/installation.py", "drgs/warp_torch.py"}
+TOP_FILES = {"drgs/__init__.py", "drgs/cli.py", "drgs/cli_progress.py", "drgs/installation.py", "drgs/openmp.py", "drgs/warp_torch.py"}
 """Files of drgs that belong to no layer."""
 
 
