@@ -15,6 +15,7 @@ from PIL import Image
 from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photograph
 from drgs.reconstruct import report_progress
 from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, kept_photographs
+from drgs.reconstruct.fit.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.fit_gaussians import FitSettings
 from drgs.reconstruct.fit.fit_materials import MaterialSettings
@@ -42,9 +43,10 @@ TINY = Preset(
     fit=FitSettings(iterations=20, densify=DensifySettings(every=5, budget=700)),
     mesh=MeshSettings(resolution=48, face_limit=2000),
     surface=PassSettings(
-        2, SurfaceSettings(rounds=1, steps_a_round=3, moves=MoveSettings(share_rays=4)), replace(PASS_MESH, resolution=32, face_limit=2000)
+        2, SurfaceSettings(rounds=1, steps_a_round=3, moves=MoveSettings(share_rays=4)), replace(PASS_MESH, resolution=32, face_limit=500)
     ),
     materials=MeshMaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
+    detail=DetailSettings(most_faces=2000),
     mesh_surfels=MeshFitSettings(iterations=6),
     surfel_materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
 )

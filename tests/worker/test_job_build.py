@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from drgs.reconstruct.build_asset import PRESETS, Preset
+from drgs.reconstruct.fit.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.fit_gaussians import FitSettings
 from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings
@@ -33,9 +34,10 @@ TINY = Preset(
     fit=FitSettings(iterations=12, densify=DensifySettings(every=5, budget=700)),
     mesh=MeshSettings(resolution=48, face_limit=2000),
     surface=PassSettings(
-        2, SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)), replace(PASS_MESH, resolution=32, face_limit=2000)
+        2, SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)), replace(PASS_MESH, resolution=32, face_limit=500)
     ),
     materials=MeshMaterialSettings(iterations=4, points_a_step=64, samples=SampleCounts(4, 2, 2)),
+    detail=DetailSettings(most_faces=2000),
     mesh_surfels=MeshFitSettings(iterations=3),
 )
 MORE = replace(TINY, materials=MeshMaterialSettings(iterations=8, points_a_step=64, samples=SampleCounts(4, 2, 2)))
