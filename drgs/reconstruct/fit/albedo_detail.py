@@ -20,7 +20,7 @@ from torch import Tensor
 
 from drgs.maths.brdf import f0_from_base
 from drgs.reconstruct.fit.metal_evidence import DARK
-from drgs.reconstruct.fit.seen_vertices import mirrored_radiance, seen_vertices
+from drgs.reconstruct.fit.seen_vertices import SeenVertices, mirrored_radiance, seen_vertices
 from drgs.reconstruct.fit.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.average_around import averaging_matrix
@@ -76,21 +76,10 @@ def albedo_detail(
         seen = seen_vertices(tracer, target)
         if len(seen.index) == 0:
             continue
-        index, normal = seen.index, mesh.normals[seen.index]
-        transmittance, met = mirrored_radiance(tracer, seen, open_share, tables)
-
-        def shown(albedo: Tensor) -> Tensor:
-            metallic = mesh.metallic[index]  # noqa: B023  # called before the next view
-            return shade_split_sum(
-                albedo * (1 - metallic)[:, None], torch.zeros_like(albedo), f0_from_base(albedo, metallic), mesh.roughness[index],  # noqa: B023
-                normal, seen.wo, tables, transmittance, met, open_share[index],  # noqa: B023
-            )  # fmt: skip
-
-        black = shown(torch.zeros_like(seen.photo))
-        slope = shown(torch.ones_like(seen.photo)) - black
-        trust = ((normal * seen.wo).sum(-1, keepdim=True) / (seen.photo + DARK)) ** 2
-        explained.index_add_(0, index, trust * slope * (seen.photo - black))
-        weight.index_add_(0, index, trust * slope * slope)
+        black, slope = _linear_in_albedo(tracer, seen, open_share, tables)
+        trust = ((mesh.normals[seen.index] * seen.wo).sum(-1, keepdim=True) / (seen.photo + DARK)) ** 2
+        explained.index_add_(0, seen.index, trust * slope * (seen.photo - black))
+        weight.index_add_(0, seen.index, trust * slope * slope)
     known = weight > 0
     if not bool(known.any()):
         return mesh.albedo
@@ -101,3 +90,18 @@ def albedo_detail(
     for _ in range(rings):
         slow = around @ slow
     return (mesh.albedo * torch.from_numpy(ratio / slow).to(mesh.albedo)).clamp(LEAST, MOST)
+
+
+def _linear_in_albedo(tracer: AbstractTracer, seen: SeenVertices, open_share: Tensor, tables: Tensor) -> tuple[Tensor, Tensor]:
+    """(seen, 3) radiance towards the camera of vertices without albedo, and (seen, 3) what a unit of albedo adds."""
+    mesh, index = tracer.mesh, seen.index
+    metallic, transmittance_and_met = mesh.metallic[index], mirrored_radiance(tracer, seen, open_share, tables)
+
+    def shown(albedo: Tensor) -> Tensor:
+        return shade_split_sum(
+            albedo * (1 - metallic)[:, None], torch.zeros_like(albedo), f0_from_base(albedo, metallic), mesh.roughness[index],
+            mesh.normals[index], seen.wo, tables, *transmittance_and_met, open_share[index],
+        )  # fmt: skip
+
+    black = shown(torch.zeros_like(seen.photo))
+    return black, shown(torch.ones_like(seen.photo)) - black
