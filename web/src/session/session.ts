@@ -150,6 +150,9 @@ export function sendCamera(camera: Parameters<Stream['sendCamera']>[0]): number 
   return stream ? stream.sendCamera(camera) : null;
 }
 
+/** While true, no traced pictures are wanted. */
+export const holdFrames = (hold: boolean) => stream?.holdFrames(hold);
+
 /** What lies under a point of the picture, given as shares of its width and height; null while no asset is open. */
 export function pick(x: number, y: number): Promise<PickedMessage> | null {
   return stream ? stream.pick(x, y) : null;

@@ -48,6 +48,9 @@ export class Stream {
   private settingsSent = false;
   private picks = new Map<number, (picked: PickedMessage) => void>();
   private newestFrame = 0;
+  private holding = false;
+  /** The newest frame that the server was not told of, while holding. */
+  private unacknowledged = 0;
   /** Begins the keys of this page's changes. */
   private readonly page = crypto.getRandomValues(new Uint32Array(2)).join('-');
 
@@ -188,7 +191,7 @@ export class Stream {
       case 'hello':
         this.ready = true;
         this.retryMs = RECONNECT_FIRST_MS;
-        this.newestFrame = 0;
+        this.newestFrame = this.unacknowledged = 0;
         this.events.hello(message);
         this.events.connection('open');
         this.settingsSent = false;
@@ -230,7 +233,21 @@ export class Stream {
       this.newestFrame = header.frameId;
       this.events.frame(header, picture, header.flags >> CAMERA_NUMBER_SHIFT);
     } else picture?.close();
-    this.send({ type: 'ack', frame_id: header.frameId });
+    this.unacknowledged = Math.max(this.unacknowledged, header.frameId);
+    this.acknowledge();
+  }
+
+  private acknowledge(): void {
+    if (this.holding || !this.unacknowledged) return;
+    this.send({ type: 'ack', frame_id: this.unacknowledged });
+    this.unacknowledged = 0;
+  }
+
+  /** While true, nobody sees the server's pictures: it is left to rest once those in flight have come, since none of them is acknowledged. */
+  holdFrames(hold: boolean): void {
+    if (hold === this.holding) return;
+    this.holding = hold;
+    this.acknowledge();
   }
 
   /** Answer the largest change that waits as the server would, if it could. */

@@ -13,7 +13,7 @@ import { tool } from '../edit/material/selection';
 import { shapeTool } from '../edit/shape/shape_tools';
 import { edits } from '../session/edit_log';
 import { MAX_PIXELS, MAX_SIDE, type FrameHeader, type ServerHello } from '../session/protocol.gen';
-import { listen, openedAsset, sendCamera, session, settings } from '../session/session';
+import { holdFrames, listen, openedAsset, sendCamera, session, settings } from '../session/session';
 import { aimNow, aimOf, viewNow, viewOf, wantedAim, type View } from '../session/view';
 import { FlyControls } from './camera/fly_controls';
 import { frameBox } from './camera/framing';
@@ -30,6 +30,8 @@ CameraControls.install({ THREE: { MOUSE, Vector2, Vector3, Vector4, Quaternion, 
 
 /** The camera counts as moving for this long after its last move. */
 const MOVING_MS = 120;
+/** Without a move for this long, traced pictures are wanted again: shorter than `MOVING_MS`, so that the first one is there as the camera counts as still. */
+const HELD_MS = 60;
 const PIXEL_BUDGET = { low: 200_000, medium: 500_000, full: MAX_PIXELS };
 /** Of a picture that is worth tracing [pixels]. */
 const LEAST_SIDE = 16;
@@ -267,6 +269,8 @@ export class Viewport {
     }
     this.sendView();
     const moving = now - this.movedAt < MOVING_MS;
+    // A picture that is old when it comes shows nowhere while the local one stands in: the server's cores are the browser's, or another user's.
+    holdFrames(this.local.standsIn && now - this.movedAt < HELD_MS);
     this.local.draw(now, { resting: now - this.movedAt > MOVING_MS, covered: this.fresh });
     this.drawGizmo();
     this.stage.dataset.moving = String(moving);

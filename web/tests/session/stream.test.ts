@@ -151,6 +151,29 @@ it('decodes frames, says which camera they show, and acknowledges every one', as
   expect(socket.take()).toEqual([1, 2, 4, 3].map((frame_id) => ({ type: 'ack', frame_id })));
 });
 
+it('lets the server rest while nobody sees its pictures: they are acknowledged afterwards, all at once', async () => {
+  const { decode } = slowDecoder();
+  const [socket] = FakeSocket.all as [FakeSocket];
+  socket.greet();
+  socket.take();
+  stream.holdFrames(true);
+  for (const id of [1, 2]) {
+    socket.show(id, 0, id);
+    await decode(id);
+  }
+  expect(socket.take()).toEqual([]);
+  stream.holdFrames(false);
+  stream.holdFrames(false);
+  expect(socket.take()).toEqual([{ type: 'ack', frame_id: 2 }]);
+  stream.holdFrames(true);
+  socket.show(3, 0, 3);
+  await decode(3);
+  socket.greet(); // another connection counts anew
+  socket.take();
+  stream.holdFrames(false);
+  expect(socket.take()).toEqual([]);
+});
+
 it('answers a pick with what the server says of that very click', async () => {
   const [socket] = FakeSocket.all as [FakeSocket];
   socket.greet();
