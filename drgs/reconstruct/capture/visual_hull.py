@@ -35,7 +35,9 @@ class VisualHullSettings:
     coarse_cells: int = 64
     """Cells along the longest axis of the box in which the object is looked for."""
     fine_cells: int = 192
-    """Cells along the longest axis of the box that holds the object."""
+    """Cells along the longest axis of the box that holds the object; fewer where masks are small."""
+    cell_pixels: float = 0.5
+    """No cell is smaller than this share of a pixel of the masks: those say no more."""
     wrong_mask_share: float = 0.03
     """Share of the views whose masks may be wrong."""
     mask_side: int = 512
@@ -231,6 +233,12 @@ class _Carver:
         """The field (n,) at `points` (n, 3)."""
         return self._outvote(points, self.masks)[0]
 
+    def pixel_side(self, point: Float[ndarray, "3"]) -> float:
+        """Of the finest pixel of all views, at that place in the world [world units]."""
+        depths = self.pixel_from_world[:, 2].double().numpy() @ np.append(point, 1.0)
+        sides = [depth / float(camera.intrinsics[0, 0]) for depth, camera in zip(depths, self.cameras, strict=True) if depth > 0]
+        return min(sides, default=0.0)
+
     def _widened(
         self, points: Float[Tensor, "point 3"], cell: float, widen: Callable[[ndarray, int], ndarray]
     ) -> UInt8[ndarray, "view height width"]:
@@ -285,7 +293,7 @@ def _fine_surface(
     carver: _Carver, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], settings: VisualHullSettings
 ) -> VisualHull | None:
     """Level set on the fine grid. Cells that the coarse grid proves empty or full are not looked at again."""
-    cell = float((upper - lower).max()) / settings.fine_cells
+    cell = max(float((upper - lower).max()) / settings.fine_cells, settings.cell_pixels * carver.pixel_side((lower + upper) / 2))
     coarse_cell = 2 * cell
     coarse_shape = _grid_shape(lower, upper, coarse_cell)
     coarse_points = _grid_points(lower, coarse_cell, coarse_shape)
