@@ -15,9 +15,11 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from drgs.exchange.photographs import encode_photographs
+from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.find_masks import with_drawn_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.albedo_detail import DetailSettings, albedo_detail, divisions
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.environment_pyramid import environment_table
@@ -48,6 +50,7 @@ from drgs.reconstruct.stages import (
     capture_digest,
     fit_stage,
     forget_checkpoints,
+    hollows_stage,
     masks_stage,
     mesh_materials_stage,
     mesh_stage,
@@ -99,6 +102,7 @@ class Preset:
     surface: PassSettings = field(default_factory=PassSettings)
     materials: MeshMaterialSettings = field(default_factory=MeshMaterialSettings)
     detail: DetailSettings = field(default_factory=DetailSettings)
+    hollows: HollowSettings = field(default_factory=HollowSettings)
     mesh_surfels: MeshFitSettings = field(default_factory=MeshFitSettings)
     """For binding mesh: its fine-tuning."""
     materials_on: Literal["mesh", "surfels"] = "mesh"
@@ -118,6 +122,7 @@ PRESETS = {
         PassSettings(3, SurfaceSettings(rounds=1, steps_a_round=50), replace(PASS_MESH, resolution=120, face_limit=30_000), carvings=1),
         MeshMaterialSettings(iterations=80, points_a_step=1024),
         DetailSettings(most_faces=0),
+        HollowSettings(RadianceGridSettings(levels=())),
         MeshFitSettings(iterations=150),
         surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
     ),
@@ -129,6 +134,7 @@ PRESETS = {
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carvings=2),
         MeshMaterialSettings(iterations=180),
         DetailSettings(),
+        HollowSettings(),
         MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
     ),
@@ -140,6 +146,7 @@ PRESETS = {
         PassSettings(24, mesh=replace(PASS_MESH, resolution=224, face_limit=80_000), carvings=10),
         MeshMaterialSettings(iterations=1200, rounds=3),
         DetailSettings(most_faces=400_000),
+        HollowSettings(),
         MeshFitSettings(iterations=500),
         surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
     ),
@@ -204,6 +211,9 @@ def build_stages(
         if not views.has_masks:
             masked = masks_stage(place, views, points, fit_settings, device)
             points = points_of_found_masks(masked, points, preset.points, settings.seed)
+        else:
+            masked = views
+        points = hollows_stage(place, masked, points, preset.points, preset.hollows, settings.seed, device)
     yield "read", None
 
     with timed("fit"):

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 STAGE_SHARES = {
-    "particles": {"read": 0.02, "fit": 0.35, "mesh": 0.03, "surface": 0.33, "materials": 0.25, "pack": 0.02},
-    "mesh": {"read": 0.02, "fit": 0.31, "mesh": 0.03, "surface": 0.3, "bind": 0.1, "materials": 0.22, "pack": 0.02},
+    "particles": {"read": 0.1, "fit": 0.32, "mesh": 0.03, "surface": 0.3, "materials": 0.23, "pack": 0.02},
+    "mesh": {"read": 0.09, "fit": 0.28, "mesh": 0.03, "surface": 0.27, "bind": 0.1, "materials": 0.21, "pack": 0.02},
 }
 """The stages of a build with each binding, in their order, and their shares of its time, for the progress bar."""
 

@@ -14,8 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
 from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
+from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.environment_pyramid import environment_table
 from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
@@ -42,12 +44,14 @@ from drgs.scene.views import Views
 
 MASKS = "masks.safetensors"
 """Of a capture that has none of its own."""
+HOLLOWS = "hollows.safetensors"
+"""Points without the hull's hollows; those of the hull where it has none."""
 FIT, MESH, SURFACE, MATERIALS = "stage1.safetensors", "mesh.safetensors", "surface.safetensors", "stage2.safetensors"
 SURFELS_ON_MESH = "mesh_surfels.safetensors"
 """With binding mesh."""
 SURFEL_MATERIALS, MATERIALS_OF_BOUND = "stage2_surfels.safetensors", "stage2_mesh.safetensors"
 """Where materials are fitted on surfels (Preset.materials_on): of particles, and of surfels bound to faces."""
-CHECKPOINTS = (FIT, MESH, SURFACE, MATERIALS, SURFELS_ON_MESH, SURFEL_MATERIALS, MATERIALS_OF_BOUND)
+CHECKPOINTS = (HOLLOWS, FIT, MESH, SURFACE, MATERIALS, SURFELS_ON_MESH, SURFEL_MATERIALS, MATERIALS_OF_BOUND)
 PREVIEW_SIDE = 256
 """[pixels]"""
 
@@ -108,6 +112,29 @@ def points_of_found_masks(masked: Views, points: InitialPoints, count: int, seed
         return initial_points(masked, count, seed)
     except ValueError:  # a first guess may be wrong where the user's own masks may not: the fit then starts from random points
         return points
+
+
+def hollows_stage(
+    place: Workplace, views: Views, points: InitialPoints, count: int, settings: HollowSettings, seed: int, device: torch.device
+) -> InitialPoints:
+    """find_hollows: the points on the hull, moved to what the photographs show behind it. The bounds stay the hull's."""
+    if points.hull_vertices is None or points.hull_faces is None or points.normals_world is None or not settings.grid.levels:
+        return points
+    hull = VisualHull(points.hull_vertices.numpy(), points.hull_faces.numpy(), 2 * points.bounds_radius / settings.chosen.resolution)
+
+    def report(share: float) -> None:
+        place.reporter.report("read", share, "looking for hollows")
+
+    def made() -> dict[str, Tensor]:
+        surface = find_hollows(views, hull, settings, seed, device, report, place.should_stop)
+        if place.should_stop():
+            raise BuildStopped
+        found = points if surface is None else initial_points(views, count, seed, surface)
+        assert found.normals_world is not None  # those of a surface
+        return {"points": found.points_world, "normals": found.normals_world, "colors": found.colors_srgb}
+
+    kept = _kept_or_made(place, HOLLOWS, torch.device("cpu"), made)
+    return replace(points, points_world=kept["points"], normals_world=kept["normals"], colors_srgb=kept["colors"])
 
 
 def fit_stage(place: Workplace, views: Views, points: InitialPoints, settings: FitSettings, device: torch.device) -> FitState:

@@ -15,6 +15,8 @@ from PIL import Image
 from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photograph
 from drgs.reconstruct import report_progress
 from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, kept_photographs
+from drgs.reconstruct.capture.find_hollows import HollowSettings
+from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.fit_gaussians import FitSettings
@@ -47,6 +49,7 @@ TINY = Preset(
     ),
     materials=MeshMaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
     detail=DetailSettings(most_faces=2000),
+    hollows=HollowSettings(RadianceGridSettings(levels=((12, 4),), rays_a_step=64)),
     mesh_surfels=MeshFitSettings(iterations=6),
     surfel_materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
 )
@@ -247,17 +250,24 @@ def test_bound_to_the_mesh_a_build_goes_on_from_the_fit_of_particles_and_resumes
 def test_stopping_before_anything_is_fitted_can_be_resumed(capture: Path, tmp_path: Path):
     with pytest.raises(BuildStopped):
         build_asset(capture, tmp_path / "a", SETTINGS, should_stop=lambda: True)
+    with pytest.raises(BuildStopped):
+        build_asset(capture, tmp_path / "a", replace(SETTINGS, resume=True), should_stop=points_are_found(tmp_path / "a"))
     assert (tmp_path / "a.build" / "stage1.safetensors").is_file()
+
+
+def points_are_found(out: Path):
+    """should_stop that says yes as soon as the fit could begin."""
+    return (out.parent / f"{out.name}.build" / "hollows.safetensors").is_file
 
 
 @pytest.fixture(scope="module")
 def stopped(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """OUT of a build that stopped at once."""
+    """OUT of a build that stopped before its first step."""
     out = tmp_path_factory.mktemp("stopped") / "a"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "tiny", TINY)
         with pytest.raises(BuildStopped):
-            build_asset(capture, out, SETTINGS, should_stop=lambda: True)
+            build_asset(capture, out, SETTINGS, should_stop=points_are_found(out))
     return out
 
 

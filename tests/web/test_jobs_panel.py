@@ -35,13 +35,20 @@ class Jobs:
             route.fulfill(status=202, json=self.list[0] if self.list else RUNNING)
 
 
-@pytest.fixture
-def jobs(viewer: Viewer) -> Iterator[Jobs]:
+@pytest.fixture(scope="module")
+def answers(viewer: Viewer) -> Iterator[Jobs]:
+    """For as long as the page lives: it asks for what a test showed it after that test, too."""
     made = Jobs()
     viewer.page.route("**/api/jobs**", made.answer)
     viewer.page.route("**/api/jobs/**", made.answer)
     yield made
     viewer.page.unroute_all(behavior="wait")
+
+
+@pytest.fixture
+def jobs(answers: Jobs) -> Jobs:
+    answers.list, answers.asked = [], []
+    return answers
 
 
 def wait_for_a_request(page: Page, jobs: Jobs) -> None:

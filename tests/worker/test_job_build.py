@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from drgs.reconstruct.build_asset import PRESETS, Preset
+from drgs.reconstruct.capture.find_hollows import HollowSettings
+from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.fit_gaussians import FitSettings
@@ -38,6 +40,7 @@ TINY = Preset(
     ),
     materials=MeshMaterialSettings(iterations=4, points_a_step=64, samples=SampleCounts(4, 2, 2)),
     detail=DetailSettings(most_faces=2000),
+    hollows=HollowSettings(RadianceGridSettings(levels=((12, 4),), rays_a_step=64)),
     mesh_surfels=MeshFitSettings(iterations=3),
 )
 MORE = replace(TINY, materials=MeshMaterialSettings(iterations=8, points_a_step=64, samples=SampleCounts(4, 2, 2)))

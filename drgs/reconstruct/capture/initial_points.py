@@ -42,8 +42,11 @@ class InitialPoints:
     hull_faces: Int[Tensor, "face 3"] | None
 
 
-def initial_points(views: Views, count: int, seed: int) -> InitialPoints:
+def initial_points(views: Views, count: int, seed: int, surface: VisualHull | None = None) -> InitialPoints:
     """`count` points (fewer when the capture's own sparse points are all there is).
+
+    Args:
+        surface: a better one than the hull, on which points are to lie.
 
     Raises:
         ValueError: the masks have no common shape.
@@ -51,11 +54,12 @@ def initial_points(views: Views, count: int, seed: int) -> InitialPoints:
     random = np.random.default_rng(seed)
     hull = visual_hull(views) if views.has_masks else None
     sparse = _sparse_points_on_object(views)
+    surface = hull if surface is None else surface
     if sparse is not None and len(sparse[0]) >= FEWEST_SPARSE_POINTS:
-        return _from_sparse(views, sparse, hull, count, random)
-    if hull is not None:
-        points, normals = _sample_surface(hull, count, random)
-        colors = _median_colors(views, points, normals, hull)
+        return _from_sparse(views, sparse, hull, surface, count, random)
+    if hull is not None and surface is not None:
+        points, normals = _sample_surface(surface, count, random)
+        colors = _median_colors(views, points, normals, surface)
         center, radius = _bounding_sphere(hull.vertices_world)
         return _record(points, normals, colors, center, radius, "hull", hull)
     if views.has_masks:
@@ -90,22 +94,27 @@ def _record(
 
 
 def _from_sparse(
-    views: Views, sparse: tuple[ndarray, ndarray], hull: VisualHull | None, count: int, random: np.random.Generator
+    views: Views,
+    sparse: tuple[ndarray, ndarray],
+    hull: VisualHull | None,
+    surface: VisualHull | None,
+    count: int,
+    random: np.random.Generator,
 ) -> InitialPoints:
-    """The capture's points, filled up to `count` from the hull where there is one."""
+    """The capture's points, filled up to `count` from the surface where there is one."""
     points, colors = sparse
     if len(points) > count:
         kept = random.choice(len(points), count, replace=False)
         points, colors = points[kept], colors[kept]
-    if hull is None:
+    if hull is None or surface is None:
         # Without masks the points are of the whole room; the object is where all cameras look.
         return _record(points, None, colors, *_seen_by_all(views), "sparse", None)
     center, radius = _bounding_sphere(hull.vertices_world)
-    normals = _vertex_normals(hull)[cKDTree(hull.vertices_world).query(points)[1]]
+    normals = _vertex_normals(surface)[cKDTree(surface.vertices_world).query(points)[1]]
     if len(points) == count:
         return _record(points, normals, colors, center, radius, "sparse", hull)
-    more_points, more_normals = _sample_surface(hull, count - len(points), random)
-    more_colors = _median_colors(views, more_points, more_normals, hull)
+    more_points, more_normals = _sample_surface(surface, count - len(points), random)
+    more_colors = _median_colors(views, more_points, more_normals, surface)
     points, normals, colors = (np.concatenate(pair) for pair in ((points, more_points), (normals, more_normals), (colors, more_colors)))
     return _record(points, normals, colors, center, radius, "sparse+hull", hull)
 

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
-from drgs.reconstruct.geometry.average_around import averaging_matrix
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -91,7 +90,7 @@ def carved_depths(
     """
     mesh = tracer.mesh
     around = averaging_matrix(edges, len(mesh.vertices))
-    outward = _averaged(around, vertex_normals(mesh.vertices, mesh.faces), settings.direction_rings)
+    outward = averaged(around, vertex_normals(mesh.vertices, mesh.faces), settings.direction_rings)
     inward = -torch.nn.functional.normalize(outward, dim=-1)
     matt = (mesh.metallic < settings.most_metallic) & (mesh.roughness > settings.smoothest) & (evidence < settings.most_evidence)
     matt = matt.nonzero().squeeze(1)
@@ -99,11 +98,11 @@ def carved_depths(
         return inward, torch.zeros_like(mesh.roughness)
     costs = []
     for step in range(settings.steps + 1):
-        difference, views = _differences(tracer, targets, matt, inward[matt], step * settings.step * radius, radius)
+        difference, views = view_differences(tracer, targets, matt, inward[matt], step * settings.step * radius, radius)
         known = views >= settings.fewest_views
         sums = torch.zeros(len(mesh.vertices), 2, device=matt.device)
         sums[matt[known]] = torch.stack([difference * views, views], -1)[known]
-        total, weight = _averaged(around, sums, settings.cost_rings)[matt].unbind(-1)
+        total, weight = averaged(around, sums, settings.cost_rings)[matt].unbind(-1)
         costs.append(torch.where(weight > 1e-3 * settings.fewest_views, total / weight.clamp(min=1e-9), torch.full_like(total, torch.inf)))
     cost = torch.stack(costs)
     least = cost.min(0).values
@@ -114,7 +113,7 @@ def carved_depths(
     wishes &= at >= settings.shallowest
     alike = torch.zeros(len(mesh.vertices), 2, device=matt.device)
     alike[matt[wishes]] = torch.stack([torch.ones_like(least), at * settings.step * radius], -1)[wishes]
-    share, common = _averaged(around, alike, settings.cost_rings)[matt].unbind(-1)
+    share, common = averaged(around, alike, settings.cost_rings)[matt].unbind(-1)
     wishes &= share > settings.agreeing
     thickness = _thickness(tracer, matt, inward[matt])
     common = torch.minimum(common / share.clamp(min=1e-9), torch.minimum(THROUGH * thickness, (thickness - LEFT * radius).clamp(min=0)))
@@ -125,7 +124,7 @@ def carved_depths(
     return inward, depth
 
 
-def _differences(
+def view_differences(
     tracer: AbstractTracer, targets: list[ViewTarget], vertices: Tensor, inward: Tensor, depth: float, radius: float
 ) -> tuple[Tensor, Tensor]:
     """(n,) mean difference from the median colour among views that would see the places `depth` behind the vertices (n,), and how many those are.
@@ -178,11 +177,3 @@ def _thickness(tracer: AbstractTracer, vertices: Tensor, inward: Tensor) -> Tens
     """(n,) how far it is from the vertices (n,) to the other side of the object [world units]."""
     hits = trace_rays(tracer.mesh.vertices[vertices] + 8 * tracer.lift * inward, inward, tracer)
     return torch.where(hits.hit, hits.distance, torch.zeros_like(hits.distance))
-
-
-def _averaged(around: csr_matrix, values: Tensor, rings: int) -> Tensor:
-    """Values (vertex, k), averaged `rings` times."""
-    result = values.cpu().double().numpy()
-    for _ in range(rings):
-        result = around @ result
-    return torch.from_numpy(result).to(values)

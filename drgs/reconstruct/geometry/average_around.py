@@ -1,7 +1,9 @@
 """Means over neighbourhoods of a mesh, as a sparse matrix."""
 
 import numpy as np
+import torch
 from scipy.sparse import csr_matrix, diags, identity
+from torch import Tensor
 
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 
@@ -12,3 +14,11 @@ def averaging_matrix(edges: MeshEdges, count: int) -> csr_matrix:
     ones = np.ones(2 * len(start))
     adjacency = csr_matrix((ones, (np.concatenate([start, end]), np.concatenate([end, start]))), shape=(count, count)) + identity(count)
     return diags(1 / np.asarray(adjacency.sum(1)).ravel()) @ adjacency
+
+
+def averaged(around: csr_matrix, values: Tensor, rings: int) -> Tensor:
+    """Values (vertex, k), averaged `rings` times by an averaging_matrix."""
+    result = values.cpu().double().numpy()
+    for _ in range(rings):
+        result = around @ result
+    return torch.from_numpy(result).to(values)

@@ -68,7 +68,7 @@ def test_what_wants_to_go_through_leaves_a_wall(targets: list[ViewTarget], monke
     def deeper_is_better(tracer, targets, vertices, inward, depth, radius):
         return torch.full((len(vertices),), max(0.0, 0.3 - depth)), torch.full((len(vertices),), 12.0)
 
-    monkeypatch.setattr(carve_hollows, "_differences", deeper_is_better)
+    monkeypatch.setattr(carve_hollows, "view_differences", deeper_is_better)
     ball, _ = bumped()
     flat = ball.vertices.clone()
     flat[:, 2] = CENTER[2] + 0.03 * (flat[:, 2] - CENTER[2])

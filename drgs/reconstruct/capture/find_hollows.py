@@ -1,0 +1,251 @@
+"""What the hull fills, and the photographs show to be empty.
+
+Silhouettes do not show hollows: the hull of things on a plate is a hill. Everything after it moves surfaces by small steps and stays on that hill.
+So a coarse radiance field (radiance_grid) is fitted first; it finds the floor between the things, but mistakes mirrors and gloss, which it
+sees below their surfaces. Each ray therefore says whether what it sees behind the hull's surface deserves belief: the place looks alike from all
+sides, more so than the hull's surface before it, and the ray is stopped there rather than on its way. Rays vote for the place of the hull that they
+pass through; where enough do, depth is the field's, else the hull's, and all depths are fused to one surface.
+
+In: Views with masks, their hull. Out: a closed surface inside the hull, or None where the hull is believed everywhere.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import igl
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
+from drgs.reconstruct.capture.visual_hull import VisualHull
+from drgs.reconstruct.fit.carve_hollows import view_differences
+from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
+from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, clean_mesh, extract_mesh
+from drgs.reconstruct.geometry.mesh_edges import mesh_edges
+from drgs.render.intersect.trace_rays import build_tracer, trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.camera import pixel_rays_world
+from drgs.scene.mesh import TriangleMesh, vertex_normals
+from drgs.scene.views import Views
+
+SOLID = 0.99
+"""Least coverage of a pixel whose ray is fitted."""
+FEWEST_VIEWS = 3
+"""Of a place whose looks are compared."""
+HULL_FACES = 40_000
+FIELD_MESH = MeshSettings(resolution=112, smoothing_passes=10, keep_component_fraction=0.02)
+CHOSEN_MESH = MeshSettings(resolution=160, keep_component_fraction=0.02)
+
+
+@dataclass(frozen=True)
+class HollowSettings:
+    """What is looked at, and what is believed."""
+
+    grid: RadianceGridSettings = field(default_factory=RadianceGridSettings)
+    """Without levels nothing is looked for."""
+    pixels: int = 4500
+    """Of the object in the median photograph, after reduction: a ray each."""
+    fused: MeshSettings = FIELD_MESH
+    """Of the field's own surface."""
+    chosen: MeshSettings = CHOSEN_MESH
+    """Of the surface of chosen depths."""
+    least_depth: float = 0.03
+    """Of the radius, behind the hull: what lies nearer, later steps find."""
+    alike: float = 0.03
+    """Mean difference between views (display values) over brightness, at most."""
+    better: float = 0.8
+    """Of the hull's difference, at most."""
+    stopped: float = 0.7
+    """Spread of where the ray is stopped over the depth behind the hull, at most."""
+    votes: float = 0.3
+    """Share of the rays through a place of the hull that must believe: of teapot, bunny, mic and tankard 0.04 to 0.2 at most did anywhere, of still_life's
+    whole hull a quarter in the median."""
+    least_patch: float = 0.01
+    """Of the hull's vertices: what is smaller is chance."""
+    cost_rings: int = 4
+    vote_rings: int = 8
+    """Neighbourhoods over which differences and votes are averaged."""
+
+
+def find_hollows(
+    views: Views,
+    hull: VisualHull,
+    settings: HollowSettings,
+    seed: int,
+    device: torch.device,
+    report: Callable[[float], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> VisualHull | None:
+    """The hull without its hollows; None where there are none, or should_stop() said so."""
+    solid = float((views.coverage > 127).flatten(1).sum(1).float().median())
+    targets = view_targets(views, min(1.0, (settings.pixels / max(solid, 1.0)) ** 0.5), device)
+    low, high = (torch.from_numpy(np.asarray(x, np.float32)).to(device) for x in (hull.vertices_world.min(0), hull.vertices_world.max(0)))
+    radius, center = float((high - low).max()) / 2, (low + high) / 2
+    outer = _surface(*clean_mesh(*_tensors(hull, device), MeshSettings(face_limit=HULL_FACES), 1e-5 * radius))
+    grid = _fitted_grid(targets, outer, low, high, settings.grid, seed, report, should_stop)
+    if grid is None:
+        return None
+    seen = [_Seen.of(target, outer, grid, radius) for target in targets]
+    deep = [DepthMap(view.target.camera, view.deep, view.target.mask) for view in seen]
+    try:
+        inner = _surface(*extract_mesh(deep, center, 1.03 * radius, settings.fused))
+    except ValueError:  # fog everywhere: nothing that photographs agree about
+        return None
+    believed = _believed(seen, targets, outer, inner, radius, settings)
+    empty = _large_patches(believed > settings.votes, outer.mesh.faces, settings.least_patch)
+    if not bool(empty.any()):
+        return None
+    maps = [view.chosen(inner, empty) for view in seen]
+    vertices, faces = extract_mesh(maps, center, 1.03 * radius, settings.chosen)
+    cell = 2 * radius / settings.chosen.resolution
+    return VisualHull(vertices.cpu().numpy(), faces.cpu().numpy().astype(np.int64), cell)
+
+
+def _tensors(hull: VisualHull, device: torch.device) -> tuple[Tensor, Tensor]:
+    return torch.from_numpy(hull.vertices_world).to(device), torch.from_numpy(hull.faces.astype(np.int32)).to(device)
+
+
+def _surface(vertices: Tensor, faces: Tensor) -> AbstractTracer:
+    """What rays meet; its materials are never looked at."""
+    plain = torch.zeros(len(vertices), device=vertices.device)
+    vertices = vertices.float().contiguous()
+    return build_tracer(TriangleMesh(vertices, faces, vertex_normals(vertices, faces), plain[:, None].repeat(1, 3), plain, plain))
+
+
+def _fitted_grid(
+    targets: list[ViewTarget],
+    outer: AbstractTracer,
+    low: Tensor,
+    high: Tensor,
+    settings: RadianceGridSettings,
+    seed: int,
+    report: Callable[[float], None] | None,
+    should_stop: Callable[[], bool] | None,
+) -> RadianceGrid | None:
+    parts, colors = [], []
+    for target in targets:
+        solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
+        rays, met = _rays(target, outer, solid)
+        parts.append(rays[met])
+        colors.append(target.saturation.reshape(-1, 3)[solid[met]])
+    every = torch.cat(colors)
+    if len(every) == 0:
+        return None
+    rays = Rays(*(torch.cat([getattr(part, name) for part in parts]) for name in ("origin", "direction", "near", "far")))
+    vertices, faces = (x.cpu().numpy().astype(kind) for x, kind in ((outer.mesh.vertices, np.float64), (outer.mesh.faces, np.int64)))
+
+    def is_inside(places: Tensor) -> Bool[Tensor, "place"]:
+        winding = igl.fast_winding_number(vertices, faces, places.cpu().double().numpy())
+        return torch.from_numpy(winding > 0.5).to(places.device)
+
+    return fit_radiance_grid(rays, every, (low, high), is_inside, settings, seed, report, should_stop)
+
+
+def _rays(target: ViewTarget, outer: AbstractTracer, pixels: Int[Tensor, "ray"]) -> tuple[Rays, Int[Tensor, "met"]]:
+    """Through `pixels` (flat), and which of them meet the hull."""
+    origin, directions = pixel_rays_world(target.camera)
+    direction = torch.nn.functional.normalize(directions.reshape(-1, 3)[pixels], dim=-1).contiguous()
+    start = origin.expand_as(direction).contiguous()
+    first = trace_rays(start, direction, outer)
+    beyond = 2 * float((outer.mesh.vertices - origin).norm(dim=1).max())
+    last = trace_rays(start + beyond * direction, -direction, outer)
+    return Rays(start, direction, first.distance, beyond - last.distance), (first.hit & last.hit).nonzero().squeeze(1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What one photograph's rays see; depths along the viewing axis, per pixel, 0 for none."""
+
+    target: ViewTarget
+    pixels: Int[Tensor, "ray"]
+    """Of rays that meet the hull."""
+    rays: Rays
+    corners: Int[Tensor, "ray 3"]
+    """Of the hull's face that the ray enters by."""
+    axial: Float[Tensor, "ray"]
+    """Depth over distance."""
+    spread: Float[Tensor, "ray"]
+    """Of what stops the ray [world units]."""
+    deep: Float[Tensor, "height width"]
+    """Of the field."""
+
+    @classmethod
+    def of(cls, target: ViewTarget, outer: AbstractTracer, grid: RadianceGrid, radius: float) -> "_Seen":
+        pixels = (target.mask.flatten() > 0.5).nonzero().squeeze(1)
+        rays, met = _rays(target, outer, pixels)
+        rays, pixels = rays[met], pixels[met]
+        corners = outer.mesh.faces[trace_rays(rays.origin, rays.direction, outer).face.long()].long()
+        axial = rays.direction @ target.camera.camera_from_world[2, :3]
+        parts = [grid.depths(rays[part]) for part in torch.arange(len(pixels), device=pixels.device).split(4096)]
+        if not parts:
+            return cls(target, pixels, rays, corners, axial, axial, torch.zeros_like(target.mask))
+        median, spread = (torch.cat(part) for part in zip(*parts, strict=True))
+        depth = torch.where(torch.isfinite(median), median * axial, torch.zeros_like(median))
+        return cls(target, pixels, rays, corners, axial, spread, _placed(target, pixels, depth))
+
+    def behind(self, inner: AbstractTracer) -> tuple[Float[Tensor, "ray"], Int[Tensor, "ray"], Bool[Tensor, "ray"]]:
+        """Distance to the inner surface, the face there, and whether there is one."""
+        hits = trace_rays(self.rays.origin, self.rays.direction, inner)
+        return hits.distance, hits.face.long().clamp(min=0), hits.hit
+
+    def chosen(self, inner: AbstractTracer, empty: Bool[Tensor, "vertex"]) -> DepthMap:
+        """Depth of the inner surface where the hull is `empty` (hull's vertex), else of the hull."""
+        distance, _, hit = self.behind(inner)
+        passes = hit & (empty[self.corners].sum(1) >= 2)
+        depth = torch.where(passes, torch.maximum(distance, self.rays.near), self.rays.near) * self.axial
+        met = _placed(self.target, self.pixels, torch.ones_like(depth))
+        return DepthMap(self.target.camera, _placed(self.target, self.pixels, depth), met)
+
+
+def _placed(target: ViewTarget, pixels: Int[Tensor, "ray"], values: Float[Tensor, "ray"]) -> Float[Tensor, "height width"]:
+    flat = torch.zeros_like(target.mask).flatten()
+    flat[pixels] = values
+    return flat.reshape(target.mask.shape)
+
+
+def _believed(
+    seen: list[_Seen], targets: list[ViewTarget], outer: AbstractTracer, inner: AbstractTracer, radius: float, settings: HollowSettings
+) -> Float[Tensor, "vertex"]:
+    """Of the hull's vertices, the share of rays through them that believe what they see behind, averaged around."""
+    outside, behind = (_unlikeness(surface, targets, radius, settings.cost_rings) for surface in (outer, inner))
+    votes = torch.zeros(len(outer.mesh.vertices), 2, device=outside.device)
+    for view in seen:
+        distance, face, hit = view.behind(inner)
+        there, here = behind[inner.mesh.faces[face].long()].mean(1), outside[view.corners].mean(1)
+        brightness = view.target.saturation.reshape(-1, 3)[view.pixels].mean(1)
+        depth = distance - view.rays.near
+        believes = hit & (depth > settings.least_depth * radius) & (there < settings.alike * (brightness + 0.05))
+        believes &= (there < settings.better * here) & (view.spread < settings.stopped * depth)
+        counted = torch.stack([believes.float(), torch.ones_like(depth)], -1)
+        for corner in view.corners.unbind(1):
+            votes.index_add_(0, corner, counted)
+    around = averaging_matrix(mesh_edges(outer.mesh.faces), len(votes))
+    for_it, total = averaged(around, votes, settings.vote_rings).unbind(1)
+    return for_it / total.clamp(min=1e-6)
+
+
+def _large_patches(chosen: Bool[Tensor, "vertex"], faces: Int[Tensor, "face 3"], least: float) -> Bool[Tensor, "vertex"]:
+    """Of the chosen vertices, those that hang together with at least the share `least` of all."""
+    marks = chosen.cpu().numpy()
+    start, end = mesh_edges(faces).vertices.cpu().numpy().T
+    joined = marks[start] & marks[end]
+    graph = coo_matrix((np.ones(joined.sum()), (start[joined], end[joined])), shape=(len(marks),) * 2)
+    _, patch = connected_components(graph, directed=False)
+    large = np.bincount(patch) >= least * len(marks)
+    return torch.from_numpy(marks & large[patch]).to(chosen.device)
+
+
+def _unlikeness(surface: AbstractTracer, targets: list[ViewTarget], radius: float, rings: int) -> Float[Tensor, "vertex"]:
+    """Mean difference (display values) between the views that see a vertex, averaged around; inf where hardly any does."""
+    mesh = surface.mesh
+    every = torch.arange(len(mesh.vertices), device=mesh.vertices.device)
+    difference, views = view_differences(surface, targets, every, -mesh.normals, 0.0, radius)
+    known = torch.where(views >= FEWEST_VIEWS, views, torch.zeros_like(views))
+    sums = torch.stack([difference.nan_to_num(0.0) * known, known], -1)
+    total, weight = averaged(averaging_matrix(mesh_edges(mesh.faces), len(every)), sums, rings).unbind(1)
+    return torch.where(weight > 0.1 * FEWEST_VIEWS, total / weight.clamp(min=1e-6), torch.full_like(total, torch.inf))

@@ -1,0 +1,222 @@
+"""A coarse radiance field inside the hull: density and colour on a grid, fitted to the photographs by volume rendering, coarse to fine.
+
+It knows no surface, so nothing has to move for a hollow to empty: all of the hull begins as thin fog, and what photographs agree about becomes
+dense wherever it lies. Colours are spherical harmonics of degree 1 of the viewing direction. What mirrors is seen behind its surface, and
+plain gloss a little below it: whom to believe is find_hollows' matter.
+Sources: Sun et al. 2022 (grids of density and colour), Fridovich-Keil et al. 2022 (harmonics in place of a network), Barron et al. 2022
+(densities gathered along rays); docs/sources.md: sun2022, fridovich2022, barron2022.
+
+In: rays with colours, a box, what of it is inside. Out: RadianceGrid, which tells how far rays see.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+HARMONICS = 4
+"""Of degree 0 and 1: 1, x, y, z."""
+EVEN_SAMPLES = 160
+"""Along a ray whose depth is asked for."""
+
+
+@dataclass(frozen=True)
+class RadianceGridSettings:
+    """Size and rates. Figures are of still_life, teapot and bunny (docs/decisions/0003-fitting.md)."""
+
+    levels: tuple[tuple[int, int], ...] = ((32, 150), (64, 250))
+    """Nodes along the longest side, and steps."""
+    rays_a_step: int = 1024
+    density_rate: float = 0.3
+    color_rate: float = 0.15
+    decay: float = 0.1
+    """Rates fall to this share in the second half of a level: until then they are too large to settle."""
+    start_density: float = -4.0
+    """Before softplus, a node's side: thin fog."""
+    weight_opaque: float = 0.02
+    """Of the mean -log of opacity: what masks cover is not to be seen through."""
+    weight_even: float = 0.001
+    weight_gathered: float = 0.005
+    """Of the mean distance of a ray's density from its own mean, in sides of the box; from `gathered_from` on."""
+    gathered_from: float = 0.15
+    least_weight: float = 4e-3
+    """Places of less weight keep their share of the ray, but their colour is not looked up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Through pixels that masks fill; unit directions, distances in world units."""
+
+    origin: Float[Tensor, "ray 3"]
+    direction: Float[Tensor, "ray 3"]
+    near: Float[Tensor, "ray"]
+    """Where the hull is entered first, and left last."""
+    far: Float[Tensor, "ray"]
+
+    def __getitem__(self, index: Tensor) -> "Rays":
+        return Rays(self.origin[index], self.direction[index], self.near[index], self.far[index])
+
+
+@dataclass(frozen=True, eq=False)
+class RadianceGrid:
+    """Nodes at low + cell * (i, j, k)."""
+
+    low: Float[Tensor, "3"]
+    cell: float
+    """[world units]"""
+    density: Float[Tensor, "n n n"]
+    """Before softplus, a cell."""
+    inside: Float[Tensor, "n n n"]
+    """1 in the hull, 0 outside."""
+    colors: Float[Tensor, "row 12"]
+    """Before the sigmoid: of each channel HARMONICS coefficients; row 0 is of nodes far outside."""
+    row: Int[Tensor, "node"]
+    """Of `colors`."""
+
+    def samples(self, rays: Rays, offsets: Float[Tensor, "ray k"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Distances (ray, k) at shares `offsets` of the way, a cell longer at both ends, places there (ray, k, 3) and weights (ray, k)."""
+        near = rays.near - self.cell
+        length = rays.far + self.cell - near
+        distance = near[:, None] + length[:, None] * offsets
+        places = rays.origin[:, None] + distance[..., None] * rays.direction[:, None]
+        step = length[:, None] / (offsets.shape[1] * self.cell)
+        density = torch.nn.functional.softplus(self.looked_up(self.density, places))
+        opacity = (1 - torch.exp(-density * step)) * (self.looked_up(self.inside, places) > 0.5)
+        passed = torch.cumprod(torch.cat([torch.ones_like(near)[:, None], 1 - opacity + 1e-7], 1), 1)
+        return distance, places, opacity * passed[:, :-1]
+
+    def colors_at(self, places: Float[Tensor, "n 3"], direction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """SRGB seen in those directions; the derivative goes to the coefficients alone."""
+        harmonics = torch.cat([torch.ones_like(direction[:, :1]), direction], -1)
+        return torch.sigmoid((self.coefficients_at(places).reshape(-1, 3, HARMONICS) * harmonics[:, None]).sum(-1))
+
+    def coefficients_at(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 12"]:
+        """Trilinearly, as `colors` has them."""
+        count = len(self.density)
+        at = ((places - self.low) / self.cell).clamp(0, count - 1.001)
+        base = at.floor().long()
+        part = at - base
+        corner = torch.tensor([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], device=places.device)
+        node = base[:, None] + corner
+        rows = self.row[(node[..., 0] * count + node[..., 1]) * count + node[..., 2]]
+        weights = torch.where(corner.bool(), part[:, None], 1 - part[:, None]).prod(-1)
+        return torch.nn.functional.embedding_bag(rows, self.colors, mode="sum", per_sample_weights=weights)
+
+    @torch.no_grad()
+    def depths(self, rays: Rays) -> tuple[Float[Tensor, "ray"], Float[Tensor, "ray"]]:
+        """Distance at which half of the light is stopped, inf where it never is; and the mean distance of what stops it from its own mean."""
+        offsets = (torch.arange(EVEN_SAMPLES, device=self.low.device) + 0.5) / EVEN_SAMPLES
+        distance, _, weight = self.samples(rays, offsets.expand(len(rays.near), -1))
+        stopped = weight.cumsum(1) > 0.5
+        median = torch.where(stopped.any(1), distance.gather(1, stopped.to(torch.uint8).argmax(1, keepdim=True))[:, 0], torch.inf)
+        total = weight.sum(1, keepdim=True).clamp(min=0.01)
+        mean = (weight * distance).sum(1, keepdim=True) / total
+        return median, (weight * (distance - mean).abs()).sum(1) / total[:, 0]
+
+    def looked_up(self, field: Float[Tensor, "n n n"], places: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
+        """Trilinearly."""
+        at = 2 * (places - self.low) / (self.cell * (len(field) - 1)) - 1
+        flat = at.reshape(1, 1, 1, -1, 3).flip(-1)  # grid_sample names the last axis first
+        return torch.nn.functional.grid_sample(field[None, None], flat, align_corners=True).reshape(places.shape[:-1])
+
+
+def fit_radiance_grid(
+    rays: Rays,
+    colors: Float[Tensor, "ray 3"],
+    box: tuple[Float[Tensor, "3"], Float[Tensor, "3"]],
+    is_inside: Callable[[Float[Tensor, "place 3"]], Bool[Tensor, "place"]],
+    settings: RadianceGridSettings,
+    seed: int,
+    report: Callable[[float], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> RadianceGrid | None:
+    """Fit the grid; None when should_stop(), asked before each step, said so.
+
+    Args:
+        colors: SRGB of the rays' pixels. box: of the hull, low and high. is_inside: of the hull. report: is told the share that is done.
+    """
+    generator, grid, done = torch.Generator().manual_seed(seed), None, 0
+    total = sum(steps for _, steps in settings.levels)
+    for count, steps in settings.levels:
+        grid = _finer(grid, box, is_inside, count, settings)
+        optimizer = torch.optim.Adam(
+            [{"params": [grid.density], "lr": settings.density_rate}, {"params": [grid.colors], "lr": settings.color_rate}],
+            betas=(0.9, 0.99),
+            eps=1e-15,
+        )
+        rates = [group["lr"] for group in optimizer.param_groups]
+        for step in range(steps):
+            if should_stop is not None and should_stop():
+                return None
+            late = max(0.0, 2 * step / steps - 1)
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * settings.decay**late
+            drawn = torch.randint(len(colors), (settings.rays_a_step,), generator=generator).to(colors.device)
+            shake = torch.rand(settings.rays_a_step, 1, generator=generator).to(colors.device)
+            loss = _loss(grid, rays[drawn], colors[drawn], shake, settings, done > settings.gathered_from * total)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+            done += 1
+            if report is not None and done % 20 == 0:
+                report(done / total)
+    return None if grid is None else replace(grid, density=grid.density.detach(), colors=grid.colors.detach())
+
+
+def _finer(
+    coarse: RadianceGrid | None,
+    box: tuple[Float[Tensor, "3"], Float[Tensor, "3"]],
+    is_inside: Callable[[Float[Tensor, "place 3"]], Bool[Tensor, "place"]],
+    count: int,
+    settings: RadianceGridSettings,
+) -> RadianceGrid:
+    """A grid of `count` nodes a side, of what a coarser one holds; of fog where there is none."""
+    low, high = box
+    cell = float((high - low).max()) / (count - 5)  # two nodes to spare on each side
+    low = (low + high - cell * (count - 1)) / 2
+    node = torch.stack(torch.meshgrid(*(3 * [torch.arange(count, device=low.device)]), indexing="ij"), -1).reshape(-1, 3)
+    places = low + cell * node
+    inside = is_inside(places).to(low).reshape(count, count, count)
+    # Two nodes around what is inside may be asked for by interpolation.
+    active = torch.nn.functional.max_pool3d(inside[None, None], 5, 1, 2).flatten().nonzero().squeeze(1)
+    row = torch.zeros(count**3, dtype=torch.long, device=low.device)
+    row[active] = torch.arange(1, len(active) + 1, device=low.device)
+    colors = torch.zeros(len(active) + 1, 3 * HARMONICS, device=low.device)
+    density = torch.full_like(inside, settings.start_density)
+    if coarse is not None:
+        with torch.no_grad():
+            density = coarse.looked_up(coarse.density, places).reshape(inside.shape).contiguous()
+            colors[1:] = coarse.coefficients_at(places[active])
+    return RadianceGrid(low, cell, density.requires_grad_(), inside, colors.requires_grad_(), row)
+
+
+def _loss(
+    grid: RadianceGrid,
+    rays: Rays,
+    colors: Float[Tensor, "ray 3"],
+    shake: Float[Tensor, "ray 1"],
+    settings: RadianceGridSettings,
+    gather: bool,
+) -> Float[Tensor, ""]:
+    count = len(grid.density)
+    offsets = (torch.arange(count, device=shake.device) + shake) / count
+    _, places, weights = grid.samples(rays, offsets)
+    ray, sample = (weights.detach() > settings.least_weight).nonzero(as_tuple=True)
+    kept = weights[ray, sample]
+    shown = grid.colors_at(places[ray, sample].detach(), rays.direction[ray])
+    opacity = weights.sum(1)
+    empty = torch.zeros_like(opacity)
+    # What was not looked up has the photograph's colour, and no say.
+    rest = (opacity - empty.index_add(0, ray, kept)).detach()
+    image = torch.zeros_like(colors).index_add(0, ray, kept[:, None] * shown) + rest[:, None] * colors
+    steps = [grid.density.diff(dim=axis).square().mean() for axis in range(3)]
+    loss = (image - colors).square().mean() + settings.weight_even * torch.stack(steps).sum()
+    loss = loss - settings.weight_opaque * opacity.clamp(1e-4, 1).log().mean()
+    if not gather:
+        return loss
+    side = grid.cell * (count - 5)
+    at = (offsets * ((rays.far - rays.near + 2 * grid.cell) / side)[:, None]).detach()
+    middle = (weights * at).sum(1, keepdim=True) / opacity.detach()[:, None].clamp(min=0.01)
+    return loss + settings.weight_gathered * (weights * (at - middle).abs()).sum(1).mean()

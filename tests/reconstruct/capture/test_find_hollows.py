@@ -1,0 +1,154 @@
+"""A bowl: its hull is a drum, and only what is painted on its floor tells that it is hollow."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
+from drgs.reconstruct.capture.initial_points import initial_points
+from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
+from drgs.reconstruct.capture.visual_hull import visual_hull
+from drgs.render.intersect.trace_rays import build_tracer, trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.camera import Camera, pixel_rays_world
+from drgs.scene.mesh import TriangleMesh, vertex_normals
+from drgs.scene.views import Views
+from tests.reconstruct.tiny_capture import camera_positions, look_at
+
+SIDE = 72
+CPU = torch.device("cpu")
+SETTINGS = HollowSettings(RadianceGridSettings(levels=((24, 120), (40, 150)), rays_a_step=512))
+RIM, FLOOR = 0.35, -0.05
+"""Heights; the bowl's inner radius is 0.45."""
+
+
+def tracer_of(mesh: trimesh.Trimesh) -> AbstractTracer:
+    vertices, faces = torch.from_numpy(np.asarray(mesh.vertices, np.float32)), torch.from_numpy(np.asarray(mesh.faces, np.int32))
+    plain = torch.zeros(len(vertices))
+    return build_tracer(TriangleMesh(vertices, faces, vertex_normals(vertices, faces), plain[:, None].repeat(1, 3), plain, plain))
+
+
+def bowl() -> AbstractTracer:
+    wall = trimesh.creation.annulus(r_min=0.45, r_max=0.65, height=2 * RIM)
+    floor = trimesh.creation.cylinder(radius=0.5, height=RIM + FLOOR)
+    floor.apply_translation([0, 0, (FLOOR - RIM) / 2])
+    return tracer_of(trimesh.util.concatenate([wall, floor]))
+
+
+def paint(place: Tensor, normal: Tensor, direction: Tensor) -> Tensor:
+    """Alike from all sides."""
+    return 0.5 + 0.35 * torch.sin(9 * place + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def mirror(place: Tensor, normal: Tensor, direction: Tensor) -> Tensor:
+    """Of a room with stripes."""
+    reflected = direction - 2 * (direction * normal).sum(-1, keepdim=True) * normal
+    return 0.5 + 0.35 * torch.sin(7 * reflected + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def photographed(object_: AbstractTracer, shade: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Views:
+    cameras, images, masks = [], [], []
+    for position in camera_positions(48):
+        position = position * np.array([1, 1, 0.8])
+        pose = torch.from_numpy(look_at(position)).float()
+        intrinsics = torch.tensor([[100.0, 0, SIDE / 2], [0, 100.0, SIDE / 2], [0, 0, 1]])
+        camera = Camera(pose, intrinsics, SIDE, SIDE, str(len(cameras)))
+        origin, directions = pixel_rays_world(camera)
+        direction = torch.nn.functional.normalize(directions.reshape(-1, 3), dim=-1).contiguous()
+        hits = trace_rays(origin.expand_as(direction).contiguous(), direction, object_)
+        place = origin + hits.distance.nan_to_num(posinf=0.0)[:, None] * direction
+        color = shade(place, object_.face_normals[hits.face.long().clamp(min=0)], direction)
+        images.append((255 * color.clamp(0, 1)).to(torch.uint8).reshape(SIDE, SIDE, 3))
+        masks.append((255 * hits.hit).to(torch.uint8).reshape(SIDE, SIDE))
+        cameras.append(camera)
+    return Views(tuple(cameras), torch.stack(images), torch.stack(masks), None, None, True, "nerf-synthetic")
+
+
+def height_inside(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Of the surface, looked at from above within the bowl, in the median."""
+    angle, radius = np.meshgrid(np.linspace(0, 2 * np.pi, 24), np.linspace(0.02, 0.35, 8))
+    above = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full_like(radius, 2.0)], -1).reshape(-1, 3)
+    rays = torch.from_numpy(above.astype(np.float32))
+    down = torch.tensor([0.0, 0, -1]).expand_as(rays).contiguous()
+    hits = trace_rays(rays, down, tracer_of(trimesh.Trimesh(vertices, faces, process=False)))
+    return float((2 - hits.distance).median())
+
+
+@pytest.fixture(scope="module")
+def painted() -> Views:
+    return photographed(bowl(), paint)
+
+
+@pytest.mark.slow
+def test_a_painted_hollow_is_found_and_points_start_in_it(painted: Views) -> None:
+    hull = visual_hull(painted)
+    assert hull is not None
+    filled = height_inside(hull.vertices_world, hull.faces)
+    assert filled > RIM - 0.1
+    told: list[float] = []
+    found = find_hollows(painted, hull, SETTINGS, 0, CPU, told.append)
+    assert found is not None
+    assert told and told == sorted(told) and told[-1] <= 1
+    emptied = height_inside(found.vertices_world, found.faces)
+    assert abs(emptied - FLOOR) < 0.25 * (filled - FLOOR)
+    points = initial_points(painted, 2000, 0, found).points_world
+    within = (points[:, :2].norm(dim=1) < 0.35) & (points[:, 2] > FLOOR - 0.15)
+    assert float(points[within, 2].median()) < FLOOR + 0.15
+
+
+@pytest.mark.slow
+def test_a_mirror_keeps_its_hull() -> None:
+    ball = photographed(tracer_of(trimesh.creation.icosphere(4, radius=0.6)), mirror)
+    hull = visual_hull(ball)
+    assert hull is not None
+    assert find_hollows(ball, hull, SETTINGS, 0, CPU) is None
+
+
+def test_a_search_that_is_stopped_finds_nothing(painted: Views) -> None:
+    hull = visual_hull(painted)
+    assert hull is not None
+    assert find_hollows(painted, hull, SETTINGS, 0, CPU, should_stop=lambda: True) is None
+
+
+def constant_grid(density: float, inside: float = 1.0) -> RadianceGrid:
+    cells = 9
+    return RadianceGrid(
+        torch.full((3,), -1.0),
+        0.25,
+        torch.full((cells,) * 3, density),
+        torch.full((cells,) * 3, inside),
+        torch.zeros(2, 12),
+        torch.ones(cells**3, dtype=torch.long),
+    )
+
+
+def test_light_falls_off_by_beer_s_law_and_the_median_depth_follows() -> None:
+    density = 1.3
+    grid = constant_grid(float(torch.tensor(density).expm1().log()))  # softplus of it, a cell
+    rays = Rays(torch.tensor([[-0.5, 0.0, 0.0]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([0.25]), torch.tensor([0.75]))
+    offsets = (torch.arange(400) + 0.5)[None] / 400
+    distance, places, weights = grid.samples(rays, offsets)
+    length = 0.5 + 2 * 0.25  # a cell longer at both ends
+    assert float(weights.sum()) == pytest.approx(1 - np.exp(-density * length / 0.25), rel=1e-3)
+    assert torch.allclose(places[0, :, 0], distance[0] - 0.5)
+    median, spread = grid.depths(rays)
+    assert float(median) == pytest.approx(np.log(2) / density * 0.25, abs=length / 160)
+    assert 0 < float(spread) < length
+    assert torch.isinf(constant_grid(-20.0).depths(rays)[0]).all()
+    assert torch.isinf(constant_grid(5.0, inside=0.0).depths(rays)[0]).all()
+
+
+def test_what_is_told_is_deterministic(painted: Views) -> None:
+    settings = replace(SETTINGS.grid, levels=((12, 6), (16, 4)), rays_a_step=64)
+    generator = torch.Generator().manual_seed(3)
+    direction = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=-1)
+    rays = Rays(-2 * direction, direction, torch.full((200,), 1.4), torch.full((200,), 2.6))
+    box = torch.full((3,), -0.6), torch.full((3,), 0.6)
+    grids = [fit_radiance_grid(rays, 0.5 + 0.4 * direction, box, lambda p: p.norm(dim=1) < 0.6, settings, seed) for seed in (1, 1, 2)]
+    first, again, other = (grid.density for grid in grids if grid is not None)
+    assert torch.equal(first, again) and not torch.equal(first, other)
