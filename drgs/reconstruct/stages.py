@@ -120,16 +120,16 @@ def hollows_stage(
     """find_hollows: the points on the hull, moved to what the photographs show behind it. The bounds stay the hull's."""
     if points.hull_vertices is None or points.hull_faces is None or points.normals_world is None or not settings.grid.levels:
         return points
-    hull = VisualHull(points.hull_vertices.numpy(), points.hull_faces.numpy(), 2 * points.bounds_radius / settings.chosen.resolution)
+    hull = VisualHull(points.hull_vertices.numpy(), points.hull_faces.numpy(), 2 * points.bounds_radius / settings.chosen_mesh.resolution)
 
     def report(share: float) -> None:
         place.reporter.report("read", share, "looking for hollows")
 
     def made() -> dict[str, Tensor]:
         surface = find_hollows(views, hull, settings, seed, device, report, place.should_stop)
-        if place.should_stop():
+        if surface is None:
             raise BuildStopped
-        found = points if surface is None else initial_points(views, count, seed, surface)
+        found = points if surface is hull else initial_points(views, count, seed, surface)
         assert found.normals_world is not None  # those of a surface
         return {"points": found.points_world, "normals": found.normals_world, "colors": found.colors_srgb}
 

@@ -1,4 +1,4 @@
-"""A bowl: its hull is a drum, and only what is painted on its floor tells that it is hollow."""
+"""A bowl beside a ball: the bowl's hull is a drum, and only what is painted on its floor tells that it is hollow."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,6 +25,8 @@ CPU = torch.device("cpu")
 SETTINGS = HollowSettings(RadianceGridSettings(levels=((24, 120), (40, 150)), rays_a_step=512))
 RIM, FLOOR = 0.35, -0.05
 """Heights; the bowl's inner radius is 0.45."""
+BALL = (0.9, 0.0, 0.0)
+BALL_RADIUS = 0.15
 
 
 def tracer_of(mesh: trimesh.Trimesh) -> AbstractTracer:
@@ -33,11 +35,13 @@ def tracer_of(mesh: trimesh.Trimesh) -> AbstractTracer:
     return build_tracer(TriangleMesh(vertices, faces, vertex_normals(vertices, faces), plain[:, None].repeat(1, 3), plain, plain))
 
 
-def bowl() -> AbstractTracer:
+def bowl_and_ball() -> AbstractTracer:
     wall = trimesh.creation.annulus(r_min=0.45, r_max=0.65, height=2 * RIM)
     floor = trimesh.creation.cylinder(radius=0.5, height=RIM + FLOOR)
     floor.apply_translation([0, 0, (FLOOR - RIM) / 2])
-    return tracer_of(trimesh.util.concatenate([wall, floor]))
+    ball = trimesh.creation.icosphere(3, radius=BALL_RADIUS)
+    ball.apply_translation(BALL)
+    return tracer_of(trimesh.util.concatenate([wall, floor, ball]))
 
 
 def paint(place: Tensor, normal: Tensor, direction: Tensor) -> Tensor:
@@ -81,7 +85,7 @@ def height_inside(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def painted() -> Views:
-    return photographed(bowl(), paint)
+    return photographed(bowl_and_ball(), paint)
 
 
 @pytest.mark.slow
@@ -96,6 +100,9 @@ def test_a_painted_hollow_is_found_and_points_start_in_it(painted: Views) -> Non
     assert told and told == sorted(told) and told[-1] <= 1
     emptied = height_inside(found.vertices_world, found.faces)
     assert abs(emptied - FLOOR) < 0.25 * (filled - FLOOR)
+    # What hangs apart stays.
+    from_ball = np.linalg.norm(found.vertices_world - np.array(BALL), axis=1)
+    assert (np.abs(from_ball - BALL_RADIUS) < 0.04).sum() > 100
     points = initial_points(painted, 2000, 0, found).points_world
     within = (points[:, :2].norm(dim=1) < 0.35) & (points[:, 2] > FLOOR - 0.15)
     assert float(points[within, 2].median()) < FLOOR + 0.15
@@ -106,13 +113,19 @@ def test_a_mirror_keeps_its_hull() -> None:
     ball = photographed(tracer_of(trimesh.creation.icosphere(4, radius=0.6)), mirror)
     hull = visual_hull(ball)
     assert hull is not None
-    assert find_hollows(ball, hull, SETTINGS, 0, CPU) is None
+    assert find_hollows(ball, hull, SETTINGS, 0, CPU) is hull
 
 
 def test_a_search_that_is_stopped_finds_nothing(painted: Views) -> None:
     hull = visual_hull(painted)
     assert hull is not None
     assert find_hollows(painted, hull, SETTINGS, 0, CPU, should_stop=lambda: True) is None
+
+
+def test_photographs_in_which_nothing_is_solid_keep_the_hull(painted: Views) -> None:
+    hull = visual_hull(painted)
+    assert hull is not None
+    assert find_hollows(replace(painted, coverage=painted.coverage // 2), hull, SETTINGS, 0, CPU) is hull
 
 
 def constant_grid(density: float, inside: float = 1.0) -> RadianceGrid:
