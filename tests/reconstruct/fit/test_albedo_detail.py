@@ -43,6 +43,20 @@ def test_stripes_come_back_and_what_is_wrong_everywhere_stays(metallic: float) -
     assert abs(float(found[seen].mean() / blurred.albedo[seen].mean()) - 1) < 0.05
 
 
+def test_what_photographs_from_both_sides_contradict_is_not_painted() -> None:
+    """The surface lies 15 % of its radius too deep: each photograph shows other stripes there. Their plain mean keeps half of the contrast."""
+    mesh, blurred = striped(0.0)
+    tables = filter_environment(light())
+    deep = dataclasses.replace(blurred, vertices=0.85 * blurred.vertices)
+    shown, ones = pictures(mesh, tables), torch.ones_like(mesh.vertices)
+    right, wrong = (
+        albedo_detail(build_tracer(fitted), shown, ones, tables, mesh_edges(mesh.faces), RINGS) / fitted.albedo - 1
+        for fitted in (blurred, deep)
+    )
+    seen = mesh.vertices[:, 2].abs() < 0.5
+    assert float(wrong[seen].std()) < 0.15 * float(right[seen].std())
+
+
 def test_what_no_photograph_shows_keeps_its_albedo() -> None:
     mesh, blurred = striped(0.0)
     tables = filter_environment(light())
