@@ -1,14 +1,17 @@
 """The surfels that cameras see, and the mesh around them: grey, since bake_materials gives it its materials."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TypeVar
 
+import igl
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, clean_mesh, extract_mesh
+from drgs.reconstruct.geometry.extract_mesh.clean_mesh import component_labels, face_areas, used_only
 from drgs.render.visible.rasterize import RasterSettings, rasterize
 from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.binding import Binding
@@ -17,6 +20,13 @@ from drgs.scene.gaussians import Gaussians, surfel_tangents
 from drgs.scene.mesh import TriangleMesh, vertex_normals
 
 Surfels = TypeVar("Surfels", Gaussians, Binding)
+
+SMALLEST_PART = 0.02
+"""Of the largest part's area: below, a part of the mesh is taken for floating bits."""
+BEYOND_HULL = 0.02
+"""Of the bounds' radius: farther outside the hull nothing is the object."""
+PART_IN_HULL = 0.9
+"""Share of a part's vertices that the hull must hold."""
 
 
 def drop_unseen(gaussians: Gaussians, cameras: tuple[Camera, ...], radius: float, least_weight: float = 0.02) -> Gaussians:
@@ -46,12 +56,15 @@ def reduced_mesh(mesh: TriangleMesh, face_limit: int, radius: float) -> Triangle
     """The mesh with at most `face_limit` faces, grey again where its vertices are new."""
     if len(mesh.faces) <= face_limit:
         return mesh
-    settings = MeshSettings(smoothing_passes=0, face_limit=face_limit)
+    settings = MeshSettings(smoothing_passes=0, face_limit=face_limit, keep_component_fraction=0.0)
     return _grey_mesh(*clean_mesh(mesh.vertices, mesh.faces, settings, shortest_edge=1e-5 * radius))
 
 
 def mesh_from_gaussians(gaussians: Gaussians, cameras: tuple[Camera, ...], points: InitialPoints, settings: MeshSettings) -> TriangleMesh:
-    """Fuse the median depth of every training view (mean depth draws a second sheet between two surfaces)."""
+    """Fuse the median depth of every training view (mean depth draws a second sheet between two surfaces).
+
+    Things that stand apart are kept, where a hull says that they are the object; without one the largest alone is.
+    """
     tangents, opacities = surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)
     empty = torch.zeros(len(gaussians.centers), 1, device=gaussians.centers.device)
     raster = RasterSettings(near_plane(points.bounds_radius))
@@ -60,7 +73,34 @@ def mesh_from_gaussians(gaussians: Gaussians, cameras: tuple[Camera, ...], point
         drawn = rasterize(gaussians.centers, tangents, opacities, empty, camera.to(empty.device), raster)
         assert drawn.median_depth is not None  # asked for by RasterSettings.depth
         maps.append(DepthMap(camera.to(empty.device), drawn.median_depth, drawn.coverage))
-    return _grey_mesh(*extract_mesh(maps, points.bounds_center, points.bounds_radius, settings))
+    if points.hull_vertices is None or points.hull_faces is None:
+        return _grey_mesh(*extract_mesh(maps, points.bounds_center, points.bounds_radius, settings))
+    settings = replace(settings, keep_component_fraction=SMALLEST_PART)
+    vertices, faces = extract_mesh(maps, points.bounds_center, points.bounds_radius, settings)
+    return _grey_mesh(*parts_in_hull(vertices, faces, points.hull_vertices, points.hull_faces, BEYOND_HULL * points.bounds_radius))
+
+
+def parts_in_hull(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    hull_vertices: Float[Tensor, "corner 3"],
+    hull_faces: Int[Tensor, "triangle 3"],
+    reach: float,
+) -> tuple[Float[Tensor, "new_vertex 3"], Int[Tensor, "new_face 3"]]:
+    """The parts that lie in the hull or no farther than `reach` [world units] outside; the largest where none does."""
+    places, triangles = vertices.cpu().double().numpy(), faces.cpu().numpy().astype(np.int64)
+    label = component_labels(len(places), triangles)
+    if label.max() == 0:
+        return vertices, faces
+    outer, outer_faces = hull_vertices.cpu().double().numpy(), hull_faces.cpu().numpy().astype(np.int64)
+    held = igl.fast_winding_number(outer, outer_faces, places) > 0.5
+    held |= igl.point_mesh_squared_distance(places, outer, outer_faces)[0] < reach * reach
+    kept = np.bincount(label, held) >= PART_IN_HULL * np.bincount(label)
+    if not kept.any():
+        areas = np.bincount(label[triangles[:, 0]], face_areas(places, triangles))
+        kept = np.arange(len(areas)) == areas.argmax()
+    points, triangles = used_only(places, triangles[kept[label[triangles[:, 0]]]])
+    return torch.from_numpy(points).to(vertices), torch.from_numpy(triangles).to(faces)
 
 
 def _grey_mesh(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> TriangleMesh:
