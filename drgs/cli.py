@@ -128,6 +128,7 @@ def build(
     """Build an asset from posed photographs."""
     from drgs.cli_progress import StopOnInterrupt, build_progress
     from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
+    from drgs.reconstruct.outline_agreement import complaint
 
     settings = BuildSettings(preset=preset.value, binding=binding.value, device=device.value, seed=seed, resume=resume)
     with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
@@ -144,6 +145,9 @@ def build(
             f"Asset written to {out}: {len(asset.mesh.faces)} faces. To look at it: drgs serve, and drop the folder, zipped, on its page",
             file=sys.stderr,
         )
+    wrong = complaint(asset.provenance["outline_agreement"])
+    if wrong is not None:
+        print(f"drgs: {wrong}", file=sys.stderr)
 
 
 # Many arguments because each is an option of the command.

@@ -41,6 +41,7 @@ from drgs.reconstruct.geometry.face_surfels import radiating_surfels, surfels_on
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
+from drgs.reconstruct.outline_agreement import complaint, outline_agreement
 from drgs.reconstruct.progress import STAGE_SHARES, Progress
 from drgs.reconstruct.report_progress import BuildReporter
 from drgs.reconstruct.stages import (
@@ -231,10 +232,12 @@ def build_stages(
 
     built = _Built(place, views, points, preset, settings, fit, gaussians, mesh, timed)
     asset, thumbnail = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
+    agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
+    provenance |= {"outline_agreement": round(agreement, 4)}
     asset = replace(asset, provenance=provenance, cameras=views.cameras)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
-    reporter.report("pack", 1.0, "done")
+    reporter.report("pack", 1.0, "; ".join(filter(None, ("done", complaint(agreement)))))
     yield "pack", asset
 
 

@@ -21,7 +21,7 @@ from drgs.scene.mesh import TriangleMesh, vertex_normals
 
 Surfels = TypeVar("Surfels", Gaussians, Binding)
 
-SMALLEST_PART = 0.02
+SMALLEST_PART = 0.01
 """Of the largest part's area: below, a part of the mesh is taken for floating bits."""
 BEYOND_HULL = 0.02
 """Of the bounds' radius: farther outside the hull nothing is the object."""
