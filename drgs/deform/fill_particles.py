@@ -4,6 +4,7 @@ In: vertices and faces. Out: jittered lattice points where the generalised windi
 to the volume enclosed, and points of the surface as tracers. Knows nothing of materials. Source: docs/sources.md (jacobson2013).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -83,8 +84,16 @@ def measure_depth(
     depth[i] = distance
 
 
-def fill_particles(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], settings: FillSettings | None = None) -> Particles:
+def fill_particles(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    settings: FillSettings | None = None,
+    go_on: Callable[[], None] | None = None,
+) -> Particles:
     """Fill the mesh of vertices (vertex, 3) and faces (face, 3).
+
+    Args:
+        go_on: called between steps, of which each may take seconds; what it raises ends the work.
 
     Raises:
         ValueError: the mesh encloses nothing, or so little of its box that the lattice would not fit in memory.
@@ -111,8 +120,12 @@ def fill_particles(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face
         raise ValueError(
             f"cannot fill this mesh with {settings.particles} particles: it fills only {enclosed / float((high - low).prod()):.1e} of its box"
         )
+    if go_on is not None:
+        go_on()
     points = _lattice(low, high, spacing, settings.jitter, settings.seed, vertices.device)
     depth = depths(tree, points)
+    if go_on is not None:
+        go_on()
     inside = depth > settings.minimum_depth * spacing
     if not bool(inside.any()):
         inside = depth > 0

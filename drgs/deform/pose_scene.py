@@ -291,7 +291,7 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: EditFiles, go_on
         if edit.time == 0:
             return rest
         scene_key = ("simulation", scene.model_dump_json(), *map(files.stamp, file_names(edit)))
-        simulation = _remembered(asset, scene_key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True)))
+        simulation = _remembered(asset, scene_key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True), go_on))
         frame = simulation.at(edit.time, go_on)
     elif (rig := split_rig_clip(edit.clip)) is not None:
         rig_key = ("rig", files.stamp(rig[0]), edit.model_dump_json(exclude={"time"}))

@@ -84,11 +84,11 @@ class SimulationReport:
 class Simulation:
     """Frames of one asset in one scene, computed as far as somebody has asked, and kept. Final; safe to use from several threads."""
 
-    def __init__(self, asset: Asset, scene: SimulationScene, find: Files = refuse_files) -> None:
-        """Fill the mesh and bind vertices and surfels; nothing moves yet.
+    def __init__(self, asset: Asset, scene: SimulationScene, find: Files = refuse_files, go_on: Callable[[], None] | None = None) -> None:
+        """Fill the mesh and bind vertices and surfels; nothing moves yet. With many particles that takes seconds.
 
         Args:
-            find: the files that the scene names.
+            find: the files that the scene names. go_on: as of `frame`, between steps of this.
 
         Raises:
             ValueError: one sentence: the mesh encloses nothing, or the scene does not fit the object.
@@ -101,7 +101,7 @@ class Simulation:
         self._center = ((mesh.vertices.amin(0).double() + mesh.vertices.amax(0).double()) / 2).cpu()
         local = (mesh.vertices.double() - self._center.to(mesh.vertices.device)).float()
         fill = FillSettings(scene.particles, surface="particles" if scene.variant == "paper" else "tracers", seed=scene.seed)
-        filled = fill_particles(local, mesh.faces, fill)
+        filled = fill_particles(local, mesh.faces, fill, go_on)
         self.model = _make_model(asset, scene, filled, self._center, find)
         self._settings = MpmSettings(
             courant=scene.courant,
@@ -112,6 +112,8 @@ class Simulation:
         if asset.gaussians is not None:
             centers = (asset.gaussians.centers.double() - self._center.to(local.device)).float()
             points = torch.cat([local, centers])
+        if go_on is not None:
+            go_on()
         gmls = GmlsSettings(isolated=3 * self.model.grid.dx, variant="paper_centred" if scene.variant == "paper" else "taylor")
         self._weights: Weights = build_weights(self.model.rest, points, gmls, (local, mesh.faces))
         # Sand and fluids mix: what their particles have turned says nothing about the surface, which the moved mesh still tells.

@@ -131,6 +131,18 @@ def test_an_object_that_nothing_moves_keeps_its_tensors():
     assert report.substeps == 0 and all(frame.vertices is asset.mesh.vertices for frame in frames)
 
 
+def test_filling_an_object_asks_between_its_steps_whether_to_go_on():
+    asked = []
+    Simulation(ball_asset(), scene(), go_on=lambda: asked.append(1))
+    assert len(asked) == 3
+
+    def stop() -> None:
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        Simulation(ball_asset(), scene(), go_on=stop)
+
+
 @pytest.mark.slow
 def test_regions_hold_another_matter_and_acts_hold_parts_in_place():
     hold = {"shape": {"box": {"minimum": [1, -2, 5.2], "maximum": [3, 0, 6]}}, "effect": "sticky"}
