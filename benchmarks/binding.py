@@ -35,10 +35,10 @@ from drgs.reconstruct.build_asset import PRESETS, BuildSettings, build_asset, bu
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import load_cameras, load_views
 from drgs.reconstruct.checkpoints import read_tensors
-from drgs.reconstruct.fit.environment_pyramid import environment_table
-from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
-from drgs.reconstruct.fit.render_stage_one import render_stage_one
-from drgs.reconstruct.fit.split_sum import filter_environment
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
+from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.reconstruct.geometry.mesh_from_gaussians import reduced_mesh
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.stages import CHECKPOINTS, read_geometry

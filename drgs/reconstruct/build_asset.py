@@ -20,18 +20,18 @@ from drgs.reconstruct.capture.find_masks import with_drawn_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
-from drgs.reconstruct.fit.albedo_detail import DetailSettings, albedo_detail, divisions
 from drgs.reconstruct.fit.densify import DensifySettings
-from drgs.reconstruct.fit.environment_pyramid import environment_table
-from drgs.reconstruct.fit.fit_gaussians import FitSettings, gaussians_from_state
+from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings, albedo_detail, divisions
+from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.fit_loop import FitState
-from drgs.reconstruct.fit.fit_materials import MaterialSettings, gaussians_from_materials
-from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings
-from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings, gaussians_from_mesh_fit
-from drgs.reconstruct.fit.fit_surface import SurfaceSettings
-from drgs.reconstruct.fit.split_sum import filter_environment
-from drgs.reconstruct.fit.surface_passes import PASS_MESH, PassSettings, SurfaceFit
-from drgs.reconstruct.fit.vertex_certainty import vertex_certainty
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings, SurfaceFit
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, gaussians_from_state
+from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings, gaussians_from_materials
+from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, gaussians_from_mesh_fit
 from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians

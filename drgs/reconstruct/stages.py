@@ -19,18 +19,18 @@ from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
-from drgs.reconstruct.fit.environment_pyramid import environment_table
-from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
-from drgs.reconstruct.fit.fit_materials import MaterialSettings, fit_materials, start_materials
-from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings, fit_mesh_materials, start_mesh_materials
-from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings, MeshFitState, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
-from drgs.reconstruct.fit.fit_surface import start_surface
-from drgs.reconstruct.fit.mesh_light import corner_weights, hit_radiance
-from drgs.reconstruct.fit.render_stage_one import render_stage_one
-from drgs.reconstruct.fit.render_stage_two import render_stage_two
-from drgs.reconstruct.fit.split_sum import filter_environment
-from drgs.reconstruct.fit.surface_passes import PassSettings, SurfaceFit, fit_surface_in_passes
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.mesh_light import corner_weights, hit_radiance
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings, fit_mesh_materials, start_mesh_materials
+from drgs.reconstruct.fit.surface.fit_surface import start_surface
+from drgs.reconstruct.fit.surface.surface_passes import PassSettings, SurfaceFit, fit_surface_in_passes
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
+from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings, fit_materials, start_materials
+from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, MeshFitState, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
+from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
+from drgs.reconstruct.fit.surfels.render_stage_two import render_stage_two
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen, mesh_from_gaussians
 from drgs.reconstruct.report_progress import BuildReporter, encode_preview

@@ -1,4 +1,4 @@
-"""Slow torch twins of drgs/reconstruct/fit/split_sum.py, at the precision of their inputs; the specification of the filter, the kernel and the table."""
+"""Slow torch twins of drgs/reconstruct/fit/light/split_sum.py, at the precision of their inputs; the specification of the filter, the kernel and the table."""
 
 import math
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from drgs.maths.brdf import ggx_d, smith_v
-from drgs.reconstruct.fit.split_sum import IRRADIANCE_ROWS, LEVELS
+from drgs.reconstruct.fit.light.split_sum import IRRADIANCE_ROWS, LEVELS
 from drgs.scene.environment import Environment, direction_from_uv, environment_radiance
 
 
@@ -75,7 +75,7 @@ def shade_split_sum(
     tables: Tensor,
     factor_table: Tensor,
 ) -> Tensor:
-    """As drgs.reconstruct.fit.split_sum.shade_split_sum, with the table of F1 and F2, (2, roughness, n.v), as brdf_table returns it."""
+    """As drgs.reconstruct.fit.light.split_sum.shade_split_sum, with the table of F1 and F2, (2, roughness, n.v), as brdf_table returns it."""
     n_dot_v = (normal * wo).sum(-1)
     mirror = 2 * n_dot_v[:, None] * normal - wo
     tables_by_level, irradiance = split_tables(tables)

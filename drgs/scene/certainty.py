@@ -10,7 +10,7 @@ from torch import Tensor
 class Certainty:
     """Of the mesh as it was captured, one entry a vertex, 0..1: 0 is a guess (never seen, always dark), near 1 the photographs leave no choice.
 
-    0.5: they alone say as much as was known before them, a standard deviation of 0.1 (drgs.reconstruct.fit.vertex_certainty). Edits and
+    0.5: they alone say as much as was known before them, a standard deviation of 0.1 (drgs.reconstruct.fit.evidence.vertex_certainty). Edits and
     poses do not change it. float16.
     """
 

@@ -17,16 +17,16 @@ from drgs.reconstruct import report_progress
 from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, kept_photographs
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
-from drgs.reconstruct.fit.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.densify import DensifySettings
-from drgs.reconstruct.fit.fit_gaussians import FitSettings
-from drgs.reconstruct.fit.fit_materials import MaterialSettings
-from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings
-from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings
-from drgs.reconstruct.fit.fit_surface import SurfaceSettings
-from drgs.reconstruct.fit.moving_surface import MoveSettings
-from drgs.reconstruct.fit.surface_passes import PASS_MESH, PassSettings
+from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings
+from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings
+from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings
 from drgs.reconstruct.fit.surfel_parameters import parameters_from_gaussians
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
+from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings
+from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings
 from drgs.reconstruct.geometry.bind_gaussians import points_from_binding
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen

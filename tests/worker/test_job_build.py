@@ -10,14 +10,14 @@ import pytest
 from drgs.reconstruct.build_asset import PRESETS, Preset
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
-from drgs.reconstruct.fit.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.densify import DensifySettings
-from drgs.reconstruct.fit.fit_gaussians import FitSettings
-from drgs.reconstruct.fit.fit_mesh_materials import MeshMaterialSettings
-from drgs.reconstruct.fit.fit_mesh_surfels import MeshFitSettings
-from drgs.reconstruct.fit.fit_surface import SurfaceSettings
-from drgs.reconstruct.fit.moving_surface import MoveSettings
-from drgs.reconstruct.fit.surface_passes import PASS_MESH, PassSettings
+from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings
+from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings
+from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
+from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.progress import STAGE_SHARES, Progress
 from drgs.render.records import SampleCounts

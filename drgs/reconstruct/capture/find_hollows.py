@@ -22,7 +22,7 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
 from drgs.reconstruct.capture.visual_hull import VisualHull
-from drgs.reconstruct.fit.carve_hollows import view_differences
+from drgs.reconstruct.fit.evidence.carve_hollows import view_differences
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, clean_mesh, extract_mesh

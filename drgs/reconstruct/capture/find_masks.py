@@ -14,8 +14,8 @@ from dataclasses import replace
 import torch
 
 from drgs.reconstruct.capture.initial_points import InitialPoints
-from drgs.reconstruct.fit.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
 from drgs.reconstruct.fit.fit_loop import FitReport
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
 from drgs.render.visible.rasterize import RasterSettings, rasterize
 from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.camera import scaled_camera

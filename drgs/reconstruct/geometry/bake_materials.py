@@ -9,7 +9,7 @@ from torch import Tensor
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.frames import rotation_from_quat_wxyz, tangents_from_normal
 from drgs.maths.spherical_harmonics import evaluate_sh, sh_basis
-from drgs.reconstruct.fit.split_sum import filter_environment, shade_split_sum
+from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.geometry.bind_gaussians import nearest_surfels
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians

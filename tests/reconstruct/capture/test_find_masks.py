@@ -13,8 +13,8 @@ from drgs.reconstruct.capture.find_masks import find_masks, smaller_views
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.fit.densify import DensifySettings
-from drgs.reconstruct.fit.environment_pyramid import background_image
-from drgs.reconstruct.fit.fit_gaussians import FitSettings
+from drgs.reconstruct.fit.light.environment_pyramid import background_image
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
 from drgs.scene.camera import pixel_rays_world
 from drgs.scene.environment import uv_from_direction
 from drgs.scene.views import Views

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from drgs.reconstruct.capture.load_views import load_views
-from drgs.reconstruct.fit.environment_pyramid import ENVIRONMENT_PYRAMID
+from drgs.reconstruct.fit.light.environment_pyramid import ENVIRONMENT_PYRAMID
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic

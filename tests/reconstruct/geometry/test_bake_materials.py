@@ -8,7 +8,7 @@ import torch
 
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import radiance_from_sh
-from drgs.reconstruct.fit.split_sum import ENVIRONMENT_SIZE, brdf_table
+from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, brdf_table
 from drgs.reconstruct.geometry.bake_materials import (
     average_surfels,
     bake_materials,

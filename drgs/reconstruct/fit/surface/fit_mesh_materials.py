@@ -1,0 +1,191 @@
+"""Stage 2 on the mesh: albedo, roughness, metallic and the HDR light, by Monte Carlo integration of the full rendering equation on the mesh.
+
+Each step looks at some pixels of one photograph: rays find the mesh behind them, two independent sets of directions are sampled from cosine,
+GGX and environment distributions under the balance heuristic, visibility and the light of what is met are traced, and both estimates are
+compared with the photo:
+
+    L = L1(PBR, photo) + priors                                                                                               (Eq. 6)
+
+Value and derivative come from different sets, 1/2 [l'(A) dB + l'(B) dA]: with one set for both, the gradient of any loss that is not linear
+leans towards low variance, that is to rough and dim. Source: the paper's stage 2 with the parameters of Gu et al. 2025 where it is silent;
+independent halves after Nicolet et al. 2023 (docs/sources.md: gu2025irgs, nicolet2023). Exact densities and one definition of F0 throughout.
+
+In rounds: between two the surface follows the normals, which this estimate knows better than split sum does (moving_surface).
+
+In: the state of fit_surface. Out: the same, further.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.mesh_light import at_corners, corner_weights, radiance_along
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.losses import display_image
+from drgs.reconstruct.fit.surface.fit_surface import SOLID, SurfaceRates, prior_terms
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
+from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
+from drgs.render.integrate.environment_table import build_environment_table
+from drgs.render.integrate.integrate_samples import integrate_samples
+from drgs.render.integrate.sample_rays import sample_rays
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.render.records import Rays, SampleCounts, ShadingPoints
+from drgs.scene.camera import world_from_pixel
+from drgs.scene.environment import Environment
+from drgs.scene.views import Views
+
+
+@dataclass(frozen=True)
+class MeshMaterialSettings:
+    """Stage 2."""
+
+    iterations: int = 300
+    rounds: int = 2
+    """After each the surface follows its normals, and what is metal is looked at again; but not after the last one."""
+    moves: MoveSettings = field(default_factory=lambda: MoveSettings(to_surface=0.1))
+    points_a_step: int = 2048
+    samples: SampleCounts = field(default_factory=lambda: SampleCounts(32, 16, 16))
+    """Rays a point in each of two sets: cosine, GGX, environment (the paper: 256, 128, 128 in one)."""
+    rates: SurfaceRates = field(default_factory=lambda: SurfaceRates(normals=0.0007))
+    weight_bend: float = 0.0015
+    weight_smooth: float = 0.05
+    weight_metal: float = 0.3
+    weight_white_light: float = 0.02
+    weight_rough_light: float = 0.002
+    seed: int = 0
+
+
+def start_mesh_materials(surface: FitState, settings: MeshMaterialSettings, radius: float) -> FitState:
+    """The surface as it was fitted, with this stage's rates."""
+    values = leaves(surface.parameters, frozen=("vertices", "open_share", "metal"))
+    return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 1))
+
+
+def fit_mesh_materials(
+    views: Views,
+    faces: Tensor,
+    state: FitState,
+    settings: MeshMaterialSettings,
+    report: Callable[[FitReport], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> FitState:
+    """Run (or go on with) stage 2; see run_fit. Rates fall by a cosine: the estimate is noisy."""
+    steps = _Steps(views, faces, state, settings)
+
+    def rates(iteration: int) -> dict[str, float]:
+        return cosine_rates(state.optimizer, iteration, settings.iterations)
+
+    return run_fit(
+        FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, after_step=steps.end_round), report, should_stop
+    )
+
+
+def crossed_halves(first: Tensor, second: Tensor, photo: Tensor) -> Tensor:
+    """Scalar: the mean absolute error of the mean of two independent estimates; its gradient takes the sign from one and the derivative from
+    the other, in turn."""
+    crossed = 0.5 * (torch.sign(first.detach() - photo) * second + torch.sign(second.detach() - photo) * first)
+    value = (0.5 * (first + second).detach() - photo).abs().mean()
+    return value + (crossed - crossed.detach()).mean()
+
+
+@dataclass(frozen=True, eq=False)
+class IncidentLight:
+    """What rays from the surface meet: the mesh, shaded by split sum, and the sky."""
+
+    tracer: AbstractTracer
+    open_share: Tensor
+    """(vertex, 3) of irradiance_share."""
+    tables: Tensor
+    """Of filter_environment."""
+
+
+def traced_light(light: IncidentLight, points: ShadingPoints, face_normal: Tensor, rays: Rays) -> tuple[Tensor, Tensor]:
+    """(point, sample) transmittance and (point, sample, 3) hit radiance, without gradient; rays below the face count as blocked."""
+    usable = (rays.weight > 0) & ((rays.direction_world * face_normal[:, None]).sum(-1) > 0)
+    transmittance, met = torch.zeros_like(rays.weight), torch.zeros_like(rays.direction_world)
+    origins = (points.position_world + light.tracer.lift * face_normal)[:, None].expand_as(rays.direction_world)[usable]
+    transmittance[usable], met[usable] = radiance_along(light.tracer, origins, rays.direction_world[usable], light.open_share, light.tables)
+    return transmittance, met
+
+
+class _Steps:
+    """Final. Stage 2's part of the fit loop."""
+
+    def __init__(self, views: Views, faces: Tensor, state: FitState, settings: MeshMaterialSettings) -> None:
+        self.state, self.settings, self.faces = state, settings, faces
+        self.targets = view_targets(views, 1.0, faces.device)
+        self.solid = [(target.mask.flatten() > SOLID).nonzero().squeeze(1) for target in self.targets]
+        self.surface = MovingSurface(views, faces, state)
+
+    def end_round(self, done: int) -> None:
+        total, rounds = self.settings.iterations, self.settings.rounds
+        if done < total and done * rounds // total > (done - 1) * rounds // total:
+            self.surface.move(self.settings.moves)
+            self.surface.look_for_metal(self.targets)
+
+    def step(self, iteration: int) -> StepLoss:
+        parameters, settings = self.state.parameters, self.settings
+        view = drawn_view(iteration, len(self.targets), settings.seed)
+        target = self.targets[view]
+        environment = environment_table(parameters)
+        normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
+        materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
+        terms: dict[str, Tensor] = {}
+        squared_error = None
+        points, face_normal = self._points(target, self.solid[view], normals, materials)
+        if len(points.pixel):
+            photo = target.saturation.reshape(-1, 3)[points.pixel.long()]
+            first, second = (self._shown(points, face_normal, environment, photo, 2 * iteration + half) for half in (0, 1))
+            terms["traced"] = crossed_halves(first, second, photo)
+            mean = 0.5 * (first + second).detach()
+            squared_error = float((mean.clamp(0, 1) - photo).square().mean())
+        terms |= prior_terms(
+            self.surface.edges, environment, normals, materials, parameters["metal"], settings.weight_bend, settings.weight_smooth,
+            settings.weight_metal, settings.weight_white_light, settings.weight_rough_light,
+        )  # fmt: skip
+        return StepLoss(terms, target.camera, squared_error)
+
+    def _points(self, target: ViewTarget, solid: Tensor, normals: Tensor, materials: dict[str, Tensor]) -> tuple[ShadingPoints, Tensor]:
+        """Points behind some of the view's pixels, each at a place of its pixel drawn anew, and the normals of their faces."""
+        device, generator = self.faces.device, self.state.generator
+        with torch.no_grad():
+            chosen = solid[
+                torch.randint(max(1, len(solid)), (min(self.settings.points_a_step, len(solid)),), generator=generator).to(device)
+            ]
+            place = torch.rand(len(chosen), 2, generator=generator).to(device)
+            width = target.camera.width
+            at = torch.stack([chosen % width, chosen // width], -1) + place
+            direction = torch.cat([at, torch.ones_like(at[:, :1])], -1) @ world_from_pixel(target.camera).T
+            direction = torch.nn.functional.normalize(direction, dim=-1)
+            origin = target.camera.center_world
+            hits = trace_rays(origin.expand_as(direction), direction, self.surface.tracer)
+            hit = hits.hit.nonzero().squeeze(1)
+            face = hits.face[hit].long()
+            corners, weights = self.faces[face].long(), corner_weights(hits.barycentric[hit])
+        points = ShadingPoints(
+            position_world=at_corners(self.surface.tracer.mesh.vertices, corners, weights),
+            normal_world=torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1),
+            wo_world=-direction[hit],
+            albedo=at_corners(materials["albedo"], corners, weights),
+            roughness=at_corners(materials["roughness"], corners, weights),
+            metallic=at_corners(materials["metallic"], corners, weights),
+            pixel=chosen[hit].int(),
+        )
+        return points, self.surface.tracer.face_normals[face]
+
+    def _shown(self, points: ShadingPoints, face_normal: Tensor, environment: Tensor, photo: Tensor, draw: int) -> Tensor:
+        """(point, 3) colour in display space by one set of rays; gradients reach materials, normals and the light."""
+        with torch.no_grad():
+            table = build_environment_table(Environment(environment.detach()))
+            rays = sample_rays(points, table, self.settings.samples, self.settings.seed * 1_000_003 + draw)
+            tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
+            light = IncidentLight(tracer, self.state.parameters["open_share"], filter_environment(environment.detach()))
+            transmittance, met = traced_light(light, points, face_normal, rays)
+        radiance = integrate_samples(points, rays, transmittance, met, environment)
+        return display_image(radiance, torch.ones_like(points.roughness), photo)

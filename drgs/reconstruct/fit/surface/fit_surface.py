@@ -1,0 +1,240 @@
+"""The mesh becomes the surface that the photographs show: shading normals, materials and light by deferred shading, positions from them.
+
+In rounds. First the mesh moves (integrate_normals): its outlines onto the masks', its faces across the normals found so far. Then visibility and
+inter-reflection are traced anew, and for the rest of the round each step looks at one photograph: rays find the mesh behind its pixels,
+split sum with one mirrored ray shades them, and normals, albedo, roughness and metallic of the vertices and the environment follow the
+gradient. Normals are free while they are fitted, so that each vertex answers to its own pixels; the solve makes them a surface again.
+
+Why: surfels place a mesh by where they lie, which is where depth is worst known and outlines are blurred; shading knows normals well and masks
+know outlines to a tenth of a pixel (docs/decisions/0003-fitting.md). Sources: Nehab et al. 2005 (positions from normals), Godard et al.
+2015 (mirrors from few photographs), Karis 2013 (split sum); docs/sources.md: nehab2005, godard2015, karis2013.
+
+In: Views with masks, a mesh, surfels for the normals to start from, the light of stage 1. Out: FitState; `mesh_from_surface_fit` and its light.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from drgs.maths.brdf import f0_from_base
+from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.mesh_light import at_corners, corner_weights, mirrored_light
+from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
+from drgs.reconstruct.fit.losses import display_image, rough_light, white_light
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
+from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
+from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
+from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.scene.camera import pixel_rays_world
+from drgs.scene.gaussians import Gaussians
+from drgs.scene.mesh import TriangleMesh
+from drgs.scene.views import Views
+
+SOLID = 0.995
+"""Least coverage of a pixel that is compared: others mix in the background."""
+GRAZING = 0.05
+"""Least cosine between normal and view: below, interpolated normals say little."""
+
+
+@dataclass(frozen=True)
+class SurfaceRates:
+    """Adam's step per group."""
+
+    normals: float = 0.02
+    albedo_logits: float = 0.03
+    roughness_logits: float = 0.03
+    metallic_logits: float = 0.03
+    environment: float = 0.02
+    vertices: float = 0.0
+    """Moved by the solve alone."""
+    open_share: float = 0.0
+    """Traced, not fitted."""
+    metal: float = 0.0
+    """Decided, not fitted."""
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """The surface's fit."""
+
+    rounds: int = 6
+    """0: the mesh stays as it was extracted."""
+    steps_a_round: int = 100
+    rates: SurfaceRates = field(default_factory=SurfaceRates)
+    normals_end: float = 0.002
+    """What the normals' rate has fallen to after all passes: they have far to go at first, and then each step is one photograph's noise."""
+    fall_from: float = 0.5
+    """Share of the steps after which rates fall, by a cosine to a twentieth; 1: they do not."""
+    moves: MoveSettings = field(default_factory=MoveSettings)
+    weight_bend: float = 0.05
+    weight_bend_end: float = 0.0015
+    """Of the mean difference of normals along edges, at the start and at the end."""
+    weight_smooth: float = 1.0
+    weight_smooth_end: float = 0.02
+    """Of the mean difference of materials along edges, at the start and at the end: what shading explains is not to become paint first."""
+    weight_metal: float = 0.3
+    """Of the mean distance of metallic from what the evidence says, times its strength (metal_evidence)."""
+    metal_from: float = 0.2
+    """Share of the rounds after which evidence is looked at: normals must be right before mirrors can be."""
+    weight_white_light: float = 0.02
+    weight_rough_light: float = 0.002
+    pixels_a_step: int = 65_536
+    """Of one photograph; of larger ones as many are drawn anew in each step."""
+    seed: int = 0
+
+    @property
+    def iterations(self) -> int:
+        return self.rounds * self.steps_a_round
+
+
+def start_surface(
+    gaussians: Gaussians, mesh: TriangleMesh, stage_one: dict[str, Tensor], settings: SurfaceSettings, radius: float
+) -> FitState:
+    """Normals and materials of the surfels around each vertex, the light of stage 1."""
+    weights = vertex_weights(mesh.vertices, mesh.normals, gaussians)
+    normals = torch.nn.functional.normalize(average_surfels(outward_normals(gaussians, mesh), *weights), dim=-1)
+    parameters = {
+        "normals": normals,
+        "albedo_logits": logits_of_shares(average_surfels(gaussians.albedo, *weights)),
+        "roughness_logits": logits_of_shares(average_surfels(gaussians.roughness, *weights)),
+        "metallic_logits": logits_of_shares(average_surfels(gaussians.metallic, *weights)),
+        "vertices": mesh.vertices,
+        "open_share": torch.ones_like(mesh.vertices),
+        "metal": torch.zeros_like(mesh.roughness),
+    } | light_parameters(stage_one)
+    values = leaves(parameters, frozen=("vertices", "open_share", "metal"))
+    return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 2))
+
+
+def fit_surface(
+    views: Views,
+    mesh: TriangleMesh,
+    state: FitState,
+    settings: SurfaceSettings,
+    report: Callable[[FitReport], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> FitState:
+    """Run (or go on with) the surface's fit; see run_fit.
+
+    Args:
+        mesh: whose faces the state's vertices have.
+    """
+    steps = _Steps(views, mesh.faces, state, settings)
+
+    def rates(iteration: int) -> dict[str, float]:
+        late = max(0.0, (iteration / settings.iterations - settings.fall_from) / max(1 - settings.fall_from, 1e-9))
+        share = 0.525 + 0.475 * math.cos(math.pi * late)
+        # Of these settings, not of those that the optimizer was made with: each pass has its own.
+        return {group["name"]: rate_of_group(group["name"], settings.rates) * share for group in state.optimizer.param_groups}
+
+    fit = FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, after_step=steps.end_round)
+    return run_fit(fit, report, should_stop)
+
+
+class _Steps:
+    """Final. The surface's part of the fit loop."""
+
+    def __init__(self, views: Views, faces: Tensor, state: FitState, settings: SurfaceSettings) -> None:
+        self.state, self.settings, self.faces = state, settings, faces
+        self.targets = view_targets(views, 1.0, faces.device)
+        self.surface = MovingSurface(views, faces, state)
+
+    def end_round(self, done: int) -> None:
+        if done % self.settings.steps_a_round == 0:
+            self.move_surface()
+
+    def move_surface(self) -> None:
+        """Where normals and outlines say, and what is metal there."""
+        self.surface.move(self.settings.moves)
+        if self.state.iteration > self.settings.metal_from * self.settings.iterations:
+            self.surface.look_for_metal(self.targets)
+
+    def step(self, iteration: int) -> StepLoss:
+        if iteration == 0:
+            self.move_surface()
+        target = self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
+        parameters = self.state.parameters
+        environment = environment_table(parameters)
+        normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
+        materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
+        terms: dict[str, Tensor] = {}
+        pixels, shown = self._shown(target, environment, normals, materials)
+        squared_error = None
+        if len(pixels):
+            photo = target.saturation.reshape(-1, 3)[pixels]
+            terms["shaded"] = (shown - photo).abs().mean()
+            squared_error = float((shown.detach().clamp(0, 1) - photo).square().mean())
+        settings, progress = self.settings, iteration / self.settings.iterations
+        bend = settings.weight_bend ** (1 - progress) * settings.weight_bend_end**progress
+        smooth = settings.weight_smooth ** (1 - progress) * settings.weight_smooth_end**progress
+        terms |= prior_terms(
+            self.surface.edges, environment, normals, materials, parameters["metal"], bend, smooth, settings.weight_metal,
+            settings.weight_white_light, settings.weight_rough_light,
+        )  # fmt: skip
+        return StepLoss(terms, target.camera, squared_error)
+
+    def _shown(self, target: ViewTarget, environment: Tensor, normals: Tensor, materials: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Flat indices of the pixels that mask and mesh fill, and their shaded colours (pixel, 3) in display space."""
+        with torch.no_grad():
+            origin, directions = pixel_rays_world(target.camera)
+            solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
+            if len(solid) > self.settings.pixels_a_step:
+                drawn = torch.randperm(len(solid), generator=self.state.generator)[: self.settings.pixels_a_step]
+                solid = solid[drawn.sort().values.to(solid.device)]
+            direction = directions.reshape(-1, 3)[solid]
+            hits = trace_rays(origin.expand_as(direction), direction, self.surface.tracer)
+            hit = hits.hit.nonzero().squeeze(1)
+            pixels, wo, face = solid[hit], -direction[hit], hits.face[hit].long()
+            corners, weights = self.faces[face].long(), corner_weights(hits.barycentric[hit])
+            facing = (torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1) * wo).sum(-1) > GRAZING
+            pixels, wo, face, corners, weights = (x[facing] for x in (pixels, wo, face, corners, weights))
+        normal = torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1)
+        albedo, roughness, metallic = (at_corners(materials[name], corners, weights) for name in ("albedo", "roughness", "metallic"))
+        tables = filter_environment(environment)
+        share = self.state.parameters["open_share"]
+        with torch.no_grad():
+            tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
+            position = at_corners(tracer.mesh.vertices, corners, weights)
+            transmittance, met = mirrored_light(
+                tracer, position, tracer.face_normals[face], normal.detach(), roughness.detach(), wo, share, tables.detach(),
+                self.state.generator,
+            )  # fmt: skip
+        radiance = shade_split_sum(
+            albedo * (1 - metallic)[:, None], torch.zeros_like(albedo), f0_from_base(albedo, metallic), roughness, normal, wo, tables,
+            transmittance, met, at_corners(share, corners, weights),
+        )  # fmt: skip
+        photo = target.saturation.reshape(-1, 3)[pixels]
+        return pixels, display_image(radiance, torch.ones_like(roughness), photo)
+
+
+def prior_terms(
+    edges: MeshEdges,
+    environment: Tensor,
+    normals: Tensor,
+    materials: dict[str, Tensor],
+    evidence: Tensor,
+    bend: float,
+    smooth: float,
+    metal: float,
+    white: float,
+    rough: float,
+) -> dict[str, Tensor]:
+    """Weighted loss terms that look at no photograph: normals and materials along edges, metallic against the evidence, the light."""
+    start, end = (corner.contiguous() for corner in edges.vertices.unbind(1))
+    across = {
+        name: values.index_select(0, start) - values.index_select(0, end) for name, values in (materials | {"normals": normals}).items()
+    }
+    decided = (evidence > 0).to(evidence)
+    return {
+        "bend": bend * across["normals"].norm(dim=-1).mean(),
+        "smooth": smooth * torch.stack([across[name].abs().mean() for name in materials]).sum(),
+        "metal": metal * (evidence.abs() * (materials["metallic"] - decided).abs()).mean(),
+        "white_light": white * white_light(environment),
+        "rough_light": rough * rough_light(environment),
+    }

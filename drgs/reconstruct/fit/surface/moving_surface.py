@@ -1,0 +1,92 @@
+"""The surface follows the normals that shading found and the masks' outlines, and the light on it is traced anew.
+
+In: the state of a fit on the mesh (fit_surface, fit_mesh_materials), its faces, views with masks. Out, in the same state: moved vertices, normals
+nearer to theirs, the share of an open sky's irradiance that arrives at each, and on demand what is metal; a tracer of the moved mesh.
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
+from drgs.reconstruct.fit.fit_loop import FitState
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.mesh_light import irradiance_share
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, integrate_normals
+from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outlines, outline_residuals
+from drgs.reconstruct.geometry.mesh_edges import mesh_edges
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.environment import Environment
+from drgs.scene.mesh import TriangleMesh, vertex_normals
+from drgs.scene.views import Views
+
+
+@dataclass(frozen=True)
+class MoveSettings:
+    """How the surface follows."""
+
+    integration: IntegrationSettings = field(default_factory=IntegrationSettings)
+    solves: int = 2
+    """Of positions: outlines are found anew between."""
+    to_surface: float = 0.5
+    """Share by which normals return to the surface's own afterwards."""
+    share_rays: int = 48
+    """A vertex, for the irradiance that arrives there."""
+
+
+class MovingSurface:
+    """Final. The mesh of a fit, with the tracer of where it is now."""
+
+    def __init__(self, views: Views, faces: Tensor, state: FitState) -> None:
+        self._state, self.faces = state, faces
+        self._cameras = tuple(camera.to(faces.device) for camera in views.cameras)
+        self._outlines: list[MaskOutline | None] = mask_outlines(views) if views.has_masks else [None] * len(self._cameras)
+        self.edges = mesh_edges(faces)
+        self.tracer = self._tracer()
+
+    def _tracer(self) -> AbstractTracer:
+        tracer = build_tracer(mesh_from_surface_fit(self._state, self.faces))
+        _ = tracer.face_normals  # computed once, shared by the copies with other materials
+        return tracer
+
+    @torch.no_grad()
+    def move(self, settings: MoveSettings) -> None:
+        """Positions from normals and outlines, then light that the moved surface blocks and sends back."""
+        parameters = self._state.parameters
+        normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
+        for _ in range(settings.solves):
+            residuals = outline_residuals(self.edges, self.tracer, self._cameras, self._outlines)
+            moved = integrate_normals(parameters["vertices"], self.faces, normals, self.edges, residuals, settings.integration)
+            parameters["vertices"].copy_(moved)
+            self.tracer = self._tracer()
+        own = vertex_normals(parameters["vertices"], self.faces)
+        back = (1 - settings.to_surface) * normals + settings.to_surface * own
+        parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))
+        self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
+        radiance = environment_table(parameters)
+        tables, share = filter_environment(radiance), parameters["open_share"]
+        share.copy_(irradiance_share(self.tracer, Environment(radiance), tables, share, settings.share_rays, self._state.generator))
+
+    @torch.no_grad()
+    def look_for_metal(self, targets: list[ViewTarget]) -> None:
+        """What the photographs say now of which places are metal."""
+        parameters = self._state.parameters
+        tables = filter_environment(environment_table(parameters))
+        parameters["metal"].copy_(metal_evidence(self.tracer, targets, parameters["open_share"], tables, self.edges))
+
+
+def mesh_from_surface_fit(state: FitState, faces: Tensor) -> TriangleMesh:
+    """The mesh as it is now; its normals are the fitted ones."""
+    p = {name: value.detach() for name, value in state.parameters.items()}
+    return TriangleMesh(
+        p["vertices"].contiguous(),
+        faces,
+        torch.nn.functional.normalize(p["normals"], dim=-1),
+        torch.sigmoid(p["albedo_logits"]),
+        torch.sigmoid(p["roughness_logits"]),
+        torch.sigmoid(p["metallic_logits"]),
+    )

@@ -1,0 +1,65 @@
+"""What stage 1 sees of a view: maps of the surfels, shaded once a pixel by split sum, linear; differentiable.
+
+In: parameters by name, filter_environment's tables, a camera. Out: StageOneMaps. Maps are divided by coverage before they are shaded.
+Sources: docs/sources.md: huang2024 (surfels), yao2025 (deferred reflection).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drgs.maths.brdf import f0_from_base
+from drgs.maths.frames import rotation_from_quat_wxyz
+from drgs.maths.spherical_harmonics import evaluate_sh
+from drgs.reconstruct.fit.light.split_sum import shade_split_sum
+from drgs.render.visible.rasterize import RasterSettings, face_camera, facing_normals, rasterize
+from drgs.scene.camera import Camera, pixel_rays_world
+
+
+@dataclass(frozen=True, eq=False)
+class StageOneMaps:
+    """What one view looks like to stage 1."""
+
+    radiance_linear: Float[Tensor, "height width 3"]
+    """(height, width, 3); 0 where nothing is covered."""
+    coverage: Float[Tensor, "height width"]
+    normal_world: Float[Tensor, "height width 3"]
+    depth: Float[Tensor, "height width"]
+    roughness: Float[Tensor, "height width"]
+    residual: Float[Tensor, "covered 3"]
+    """(covered pixel, 3) radiance that the material and the unshadowed light do not explain."""
+
+
+def render_stage_one(
+    parameters: dict[str, Tensor], tables: Float[Tensor, "texel 3"], camera: Camera, near: float, sh_degree: int
+) -> StageOneMaps:
+    """Blend, normalise by coverage, shade once a pixel; differentiable."""
+    rotation = rotation_from_quat_wxyz(parameters["quats"])
+    tangents = rotation[:, :, :2] * parameters["log_scales"].exp()[:, None, :]
+    centers = parameters["centers"]
+    with torch.no_grad():
+        to_surfel = torch.nn.functional.normalize(centers - camera.center_world, dim=-1)
+    metallic = torch.sigmoid(parameters["metallic_logits"])
+    sh = parameters["sh_dc"] if sh_degree == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"]], 1)
+    albedo = torch.sigmoid(parameters["albedo_logits"])
+    surface = [albedo * (1 - metallic)[:, None], f0_from_base(albedo, metallic), torch.sigmoid(parameters["roughness_logits"])[:, None]]
+    features = torch.cat([facing_normals(rotation[:, :, 2], centers, camera), *surface, evaluate_sh(sh, to_surfel, sh_degree)], 1)
+    maps = rasterize(centers, tangents, torch.sigmoid(parameters["opacity_logits"]), features, camera, RasterSettings(near=near))
+    # Maps are divided by coverage; a pixel hardly covered keeps a bounded gradient.
+    inverse = 1 / maps.coverage.clamp(min=0.02)
+    assert maps.depth_sum is not None  # asked for by RasterSettings.depth
+    depth = maps.depth_sum * inverse + maps.depth_origin
+    pixels = (maps.coverage.detach().flatten() > 0.02).nonzero().squeeze(1)
+    values = (maps.features.flatten(1)[:, pixels] * inverse.flatten()[pixels]).T
+    _, directions = pixel_rays_world(camera)
+    wo = -directions.reshape(-1, 3)[pixels]
+    normal = face_camera(values[:, :3], wo)
+    radiance = shade_split_sum(values[:, 3:6], values[:, 10:13], values[:, 6:9], values[:, 9], normal, wo, tables)
+    size = (camera.height, camera.width)
+
+    def image(packed: Float[Tensor, "pixel channel"]) -> Float[Tensor, "height width channel"]:
+        return packed.new_zeros(camera.height * camera.width, packed.shape[1]).index_copy(0, pixels, packed).view(*size, -1)
+
+    return StageOneMaps(image(radiance), maps.coverage, image(normal), depth, image(values[:, 9:10])[..., 0], values[:, 10:13])

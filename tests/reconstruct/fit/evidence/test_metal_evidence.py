@@ -1,0 +1,103 @@
+"""Metal told from paint by pictures of both, drawn by the very formula that is inverted."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from drgs.maths.brdf import f0_from_base
+from drgs.maths.color import srgb_from_linear
+from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
+from drgs.reconstruct.fit.light.mesh_light import at_corners, corner_weights
+from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
+from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.reconstruct.geometry.mesh_edges import mesh_edges
+from drgs.render.intersect.trace_rays import build_tracer, trace_rays
+from drgs.scene.camera import pixel_rays_world
+from drgs.scene.mesh import TriangleMesh
+from tests.reconstruct.geometry.test_integrate_normals import views_of_a_unit_sphere
+from tests.render.closed_form_scenes import sphere_mesh
+
+
+def light() -> torch.Tensor:
+    """(128, 256, 3): a dim room with windows."""
+    radiance = torch.full((128, 256, 3), 0.2)
+    generator = torch.Generator().manual_seed(1)
+    for row, column in zip(
+        torch.randint(10, 100, (14,), generator=generator), torch.randint(0, 236, (14,), generator=generator), strict=True
+    ):
+        radiance[row : row + 14, column : column + 18] = 2 * torch.rand(3, generator=generator)
+    return radiance
+
+
+def pictures(mesh: TriangleMesh, tables: torch.Tensor) -> list[ViewTarget]:
+    tracer, targets = build_tracer(mesh), []
+    for camera in views_of_a_unit_sphere()[0]:
+        origin, directions = pixel_rays_world(camera)
+        flat = directions.reshape(-1, 3)
+        hits = trace_rays(origin.expand_as(flat), flat, tracer)
+        hit = hits.hit.nonzero().squeeze(1)
+        corners, weights = mesh.faces[hits.face[hit].long()].long(), corner_weights(hits.barycentric[hit])
+        normal = torch.nn.functional.normalize(at_corners(mesh.normals, corners, weights), dim=-1)
+        albedo, metallic = at_corners(mesh.albedo, corners, weights), at_corners(mesh.metallic, corners, weights)
+        radiance = shade_split_sum(
+            albedo * (1 - metallic)[:, None], 0 * albedo, f0_from_base(albedo, metallic), at_corners(mesh.roughness, corners, weights),
+            normal, -flat[hit], tables,
+        )  # fmt: skip
+        photo, mask = torch.zeros(len(flat), 3), torch.zeros(len(flat))
+        photo[hit], mask[hit] = srgb_from_linear(radiance).clamp(0, 1), 1.0
+        size = (camera.height, camera.width)
+        photo, mask = photo.view(*size, 3), mask.view(size)
+        targets.append(ViewTarget(camera, photo, photo, mask, slice(0, size[0]), slice(0, size[1])))
+    return targets
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_each_is_known_for_what_it_is_whatever_was_thought_before(metallic: float):
+    mesh = dataclasses.replace(sphere_mesh(subdivisions=3, albedo=0.6, roughness=0.25), metallic=torch.full((642,), metallic))
+    tables = filter_environment(light())
+    targets = pictures(mesh, tables)
+    guessed = dataclasses.replace(mesh, metallic=torch.full((642,), 0.5), albedo=torch.full((642, 3), 0.3))
+    evidence = metal_evidence(build_tracer(guessed), targets, torch.ones(642, 3), tables, mesh_edges(mesh.faces))
+    seen = evidence != 0  # the twelve views go around the equator
+    assert float(seen.float().mean()) > 0.3
+    assert float(((2 * metallic - 1) * evidence > 0.5)[seen].float().mean()) > 0.95
+
+
+def test_a_sphere_half_of_metal_is_divided_where_it_is():
+    mesh = sphere_mesh(subdivisions=4, albedo=0.6, roughness=0.3)
+    mesh = dataclasses.replace(mesh, metallic=(mesh.vertices[:, 2] > 0).float())
+    tables = filter_environment(light())
+    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces))
+    away = (mesh.vertices[:, 2].abs() > 0.3) & (evidence != 0)
+    assert int(away.sum()) > 200
+    right = (evidence > 0) == (mesh.vertices[:, 2] > 0)
+    assert float(right[away].float().mean()) > 0.95
+
+
+def test_what_no_view_shows_is_left_open():
+    mesh = sphere_mesh(subdivisions=3)
+    tables = filter_environment(light())
+    evidence = metal_evidence(
+        build_tracer(mesh), pictures(mesh, tables)[:1], torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces)
+    )
+    assert float(evidence.abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_wrong_normals_do_not_turn_one_into_the_other(metallic: float):
+    mesh = dataclasses.replace(sphere_mesh(subdivisions=4, albedo=0.6, roughness=0.25), metallic=torch.full((2562,), metallic))
+    tables = filter_environment(light())
+    targets = pictures(mesh, tables)
+    tilt = 0.15 * torch.sin(9 * mesh.vertices.roll(1, 1))
+    tilted = dataclasses.replace(mesh, normals=torch.nn.functional.normalize(mesh.normals + tilt, dim=-1))
+    evidence = metal_evidence(build_tracer(tilted), targets, torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces))
+    around = mesh.vertices[:, 2].abs() < 0.6
+    assert float(((2 * metallic - 1) * evidence > 0)[around].float().mean()) > 0.98
+
+
+def test_paint_that_looks_the_same_from_everywhere_is_not_called_metal_for_want_of_proof():
+    mesh = sphere_mesh(subdivisions=3, albedo=0.6, roughness=1.0)
+    tables = filter_environment(torch.ones(128, 256, 3))
+    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces))
+    assert float(evidence.max()) < 0.3

@@ -1,0 +1,119 @@
+"""Stage 2 on the mesh: rays on a convex object, gradients of crossed halves, a fit that finds colours, repeats itself and resumes."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
+from drgs.reconstruct.fit.fit_loop import FitReport, FitState
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.surface.fit_mesh_materials import (
+    IncidentLight,
+    MeshMaterialSettings,
+    crossed_halves,
+    fit_mesh_materials,
+    start_mesh_materials,
+    traced_light,
+)
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, start_surface
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, mesh_from_surface_fit
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.render.records import SampleCounts
+from drgs.scene.views import Views
+from tests.reconstruct.fit.convex_rays import assert_only_the_sky_is_seen, rays_of_convex
+from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
+from tests.reconstruct.surfel_spheres import surfel_sphere
+from tests.reconstruct.tiny_capture import SPHERE_RADIUS
+from tests.render.closed_form_scenes import sphere_mesh
+
+
+def test_on_a_convex_surface_rays_above_it_see_the_sky_and_others_bring_nothing():
+    mesh = sphere_mesh(subdivisions=3)
+    points, rays = rays_of_convex(mesh)
+    light = IncidentLight(build_tracer(mesh), torch.ones_like(mesh.vertices), filter_environment(torch.ones(128, 256, 3)))
+    assert_only_the_sky_is_seen(points, rays, *traced_light(light, points, points.normal_world, rays))
+
+
+def test_the_gradient_of_crossed_halves_does_not_lean_towards_low_variance():
+    # An estimate of 1 with noise in proportion to its parameter: with one set for value and derivative the gradient of |estimate - 1| is
+    # the noise's mean size; with crossed sets it is 0 in the mean.
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(2, 200_000, 3, generator=generator)
+    spread = torch.tensor(0.3, requires_grad=True)
+    photo = torch.ones(200_000, 3)
+    halves = [1 + spread * noise[k] for k in (0, 1)]
+    (crossed,) = torch.autograd.grad(crossed_halves(*halves, photo), spread, retain_graph=True)
+    (plain,) = torch.autograd.grad((halves[0] - photo).abs().mean(), spread)
+    assert abs(float(crossed)) < 0.01 < 0.7 < float(plain)
+
+
+def test_the_value_of_crossed_halves_is_the_error_of_their_mean():
+    halves = [torch.full((4, 3), value, requires_grad=True) for value in (0.2, 0.6)]
+    loss = crossed_halves(*halves, torch.full((4, 3), 0.5)).detach()
+    assert abs(float(loss) - 0.1) < 1e-6
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
+    return painted_views(tmp_path_factory.mktemp("capture"))
+
+
+def short(iterations: int, **changes) -> MeshMaterialSettings:
+    return MeshMaterialSettings(iterations=iterations, points_a_step=128, samples=SampleCounts(4, 2, 2), **changes)
+
+
+def started(settings: MeshMaterialSettings) -> FitState:
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    surface = start_surface(surfels, placed_sphere(), grey_light(), SurfaceSettings(), SPHERE_RADIUS)
+    return start_mesh_materials(surface, settings, SPHERE_RADIUS)
+
+
+def fitted(
+    views: Views, settings: MeshMaterialSettings, stop_at: int | None = None, state: FitState | None = None
+) -> tuple[FitState, list[FitReport]]:
+    state = state or started(settings)
+    reports: list[FitReport] = []
+    stop = lambda: stop_at is not None and state.iteration >= stop_at  # noqa: E731
+    fit_mesh_materials(views, placed_sphere().faces, state, settings, reports.append, stop)
+    return state, reports
+
+
+@pytest.mark.slow
+def test_a_grey_sphere_takes_on_the_colours_of_its_photographs(views: Views):
+    state, reports = fitted(views, short(40, rounds=1))
+    assert [r.iteration for r in reports] == list(range(1, 41))
+    assert reports[-1].psnr > reports[0].psnr + 3.0
+    mesh = mesh_from_surface_fit(state, placed_sphere().faces)
+    assert torch.equal(mesh.vertices, placed_sphere().vertices)
+    normal = (mesh.vertices - CENTER) / SPHERE_RADIUS
+    for channel in range(3):  # the paint's red grows with the normal's x, and so on
+        assert float(torch.corrcoef(torch.stack([mesh.albedo[:, channel], normal[:, channel]]))[0, 1]) > 0.5
+
+
+def test_between_rounds_the_surface_follows_and_keeps_its_outline(views: Views):
+    once, twice = (fitted(views, short(4, rounds=rounds, moves=MoveSettings(share_rays=4)))[0].parameters for rounds in (1, 2))
+    assert torch.equal(once["vertices"], placed_sphere().vertices)
+    moved = (twice["vertices"] - once["vertices"]).norm(dim=-1)
+    assert float(moved.max()) > 0.001 * SPHERE_RADIUS and float(moved.mean()) < 0.02 * SPHERE_RADIUS
+
+
+def test_the_same_seed_gives_the_same_bits(views: Views):
+    results = [fitted(views, short(3, seed=5))[0].parameters for _ in range(2)]
+    other = fitted(views, short(3, seed=6))[0].parameters
+    assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
+    assert not torch.equal(results[0]["albedo_logits"], other["albedo_logits"])
+
+
+def test_a_resumed_fit_ends_with_the_same_numbers(views: Views, tmp_path: Path):
+    settings = short(7)
+    whole, _ = fitted(views, settings)
+    stopped, _ = fitted(views, settings, stop_at=4)
+    assert stopped.iteration == 4
+    write_tensors(tmp_path / "x", fit_tensors(stopped), {})
+    resumed = started(settings)
+    restore_fit(read_tensors(tmp_path / "x", torch.device("cpu"))[0], resumed)
+    fitted(views, settings, state=resumed)
+    assert resumed.iteration == 7
+    for name, value in whole.parameters.items():
+        assert torch.equal(resumed.parameters[name], value), name

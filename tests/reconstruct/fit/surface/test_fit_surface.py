@@ -1,0 +1,92 @@
+"""The surface's fit on the painted sphere: it finds size and colours, repeats itself, and goes on where it stopped."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
+from drgs.reconstruct.fit.fit_loop import FitReport, FitState
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, fit_surface, start_surface
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, mesh_from_surface_fit
+from drgs.scene.views import Views
+from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
+from tests.reconstruct.surfel_spheres import surfel_sphere
+from tests.reconstruct.tiny_capture import SPHERE_RADIUS
+
+SHRUNK = 0.93
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
+    return painted_views(tmp_path_factory.mktemp("capture"))
+
+
+def short(**changes) -> SurfaceSettings:
+    return SurfaceSettings(**{"rounds": 2, "steps_a_round": 3, "moves": MoveSettings(share_rays=4)} | changes)
+
+
+def started(settings: SurfaceSettings) -> FitState:
+    surfels = surfel_sphere(600, radius=SHRUNK * SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    return start_surface(surfels, placed_sphere(SHRUNK), grey_light(), settings, SPHERE_RADIUS)
+
+
+def fitted(
+    views: Views, settings: SurfaceSettings, stop_at: int | None = None, state: FitState | None = None
+) -> tuple[FitState, list[FitReport]]:
+    state = state or started(settings)
+    reports: list[FitReport] = []
+    fit_surface(views, placed_sphere(SHRUNK), state, settings, reports.append, lambda: stop_at is not None and state.iteration >= stop_at)
+    return state, reports
+
+
+@pytest.mark.slow
+def test_a_grey_sphere_that_is_too_small_takes_on_the_size_and_the_colours_of_its_photographs(views: Views):
+    state, reports = fitted(views, short(rounds=3, steps_a_round=12))
+    mesh = mesh_from_surface_fit(state, placed_sphere().faces)
+    normal = (mesh.vertices - CENTER) / SPHERE_RADIUS
+    assert abs(float(normal.norm(dim=1).mean()) - 1) < 0.01
+    assert reports[-1].psnr > reports[0].psnr + 3.0
+    assert float((mesh.normals * torch.nn.functional.normalize(normal, dim=-1)).sum(1).mean()) > 0.98
+    for channel in range(3):
+        assert float(torch.corrcoef(torch.stack([mesh.albedo[:, channel], normal[:, channel]]))[0, 1]) > 0.5
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_bits(views: Views):
+    results = [fitted(views, short(seed=5))[0].parameters for _ in range(2)]
+    other = fitted(views, short(seed=6))[0].parameters
+    assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
+    assert not torch.equal(results[0]["albedo_logits"], other["albedo_logits"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop_at", [2, 3])
+def test_a_fit_resumed_inside_a_round_or_between_two_ends_with_the_same_numbers(views: Views, tmp_path: Path, stop_at: int):
+    settings = short()
+    whole, _ = fitted(views, settings)
+    stopped, _ = fitted(views, settings, stop_at)
+    assert stopped.iteration == stop_at
+    write_tensors(tmp_path / "x", fit_tensors(stopped), {})
+    resumed = started(settings)
+    restore_fit(read_tensors(tmp_path / "x", torch.device("cpu"))[0], resumed)
+    fitted(views, settings, state=resumed)
+    assert resumed.iteration == 6
+    for name, value in whole.parameters.items():
+        assert torch.equal(resumed.parameters[name], value), name
+
+
+def test_of_large_photographs_some_pixels_are_looked_at(views: Views):
+    few = short(rounds=1, pixels_a_step=200)
+    (some, reports), (same, _), (all_, _) = fitted(views, few), fitted(views, few), fitted(views, short(rounds=1))
+    assert torch.equal(some.parameters["normals"], same.parameters["normals"])
+    assert not torch.equal(some.parameters["normals"], all_.parameters["normals"])
+    changed = (some.parameters["albedo_logits"] != started(few).parameters["albedo_logits"]).any(1)
+    assert float(changed.float().mean()) > 0.05
+    assert reports[-1].psnr > 5
+
+
+def test_no_rounds_leave_the_mesh_as_it_was(views: Views):
+    settings = short(rounds=0)
+    state, reports = fitted(views, settings)
+    assert reports == [] and torch.equal(mesh_from_surface_fit(state, placed_sphere().faces).vertices, placed_sphere(SHRUNK).vertices)

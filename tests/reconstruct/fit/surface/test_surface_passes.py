@@ -1,0 +1,68 @@
+"""Passes of the surface's fit: weights go on from pass to pass, and a sphere finds its size over two of them."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+
+from drgs.reconstruct.fit.surface import surface_passes
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, start_surface
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings
+from drgs.reconstruct.fit.surface.surface_passes import PassSettings, SurfaceFit, fit_surface_in_passes, settings_of_pass
+from drgs.reconstruct.geometry.extract_mesh import MeshSettings
+from drgs.reconstruct.geometry.remesh import NothingEnclosed
+from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
+from tests.reconstruct.surfel_spheres import surfel_sphere
+from tests.reconstruct.tiny_capture import SPHERE_RADIUS
+
+SHRUNK = 0.93
+
+
+def test_weights_go_on_where_the_pass_before_ended_and_rates_fall():
+    settings = PassSettings(passes=4)
+    each = [settings_of_pass(settings, index) for index in range(4)]
+    for before, after in pairwise(each):
+        assert before.weight_smooth_end == pytest.approx(after.weight_smooth)
+        assert before.weight_bend_end == pytest.approx(after.weight_bend)
+    assert (each[0].weight_smooth, each[-1].weight_smooth_end) == pytest.approx((1.0, 0.02))
+    falling = [one.rates.normals for one in each]
+    assert falling == sorted(falling, reverse=True) and falling[0] ** 8 == pytest.approx(0.02**7 * 0.002)
+    assert falling[-1] ** 8 == pytest.approx(0.02 * 0.002**7)
+    assert [one.fall_from for one in each] == [1.0, 1.0, 1.0, settings.surface.fall_from]
+    assert len({one.seed for one in each}) == 4
+
+
+@pytest.mark.slow
+def test_a_sphere_that_is_too_small_is_as_large_as_its_photographs_after_two_passes(tmp_path):
+    settings = PassSettings(
+        2,
+        SurfaceSettings(rounds=1, steps_a_round=6, moves=MoveSettings(share_rays=4)),
+        MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
+    )
+    surfels = surfel_sphere(600, radius=SHRUNK * SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    start = placed_sphere(SHRUNK)
+    told: list[int] = []
+    fit = SurfaceFit(start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS), start.faces)
+    views = painted_views(tmp_path)
+    assert not fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, should_stop=lambda: fit.state.iteration == 2)
+    assert (fit.index, fit.state.iteration) == (0, 2)
+    assert fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, lambda r: told.append(r.iteration))
+    assert abs(float((fit.mesh.vertices - CENTER).norm(dim=1).mean()) / SPHERE_RADIUS - 1) < 0.01
+    assert not torch.equal(fit.faces, start.faces) and told == list(range(3, 13))
+
+
+def test_a_surface_that_cannot_be_meshed_anew_stays_as_it_was_and_the_user_is_told(monkeypatch: pytest.MonkeyPatch):
+    def nothing(*_: object) -> None:
+        raise NothingEnclosed("the mesh of 8 faces encloses nothing at 40 cells; expected a closed surface")
+
+    monkeypatch.setattr(surface_passes, "remesh", nothing)
+    settings = PassSettings(3, carvings=1)
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    start = placed_sphere(1.0)
+    fit = SurfaceFit(start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS), start.faces)
+    monkeypatch.setattr(surface_passes, "carve_hollows", lambda fit, *_: fit.state.parameters["vertices"].data.fill_(0.0))
+    surface_passes.carve_and_start_next_pass(fit, [], settings, SPHERE_RADIUS)
+    assert fit.index == 1 and torch.equal(fit.faces, start.faces) and torch.equal(fit.mesh.vertices, start.vertices)
+    assert fit.remark == (
+        "after pass 1 the mesh before was kept, for the mesh of 8 faces encloses nothing at 40 cells; expected a closed surface"
+    )
