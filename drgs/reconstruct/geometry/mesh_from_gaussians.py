@@ -87,7 +87,7 @@ def parts_in_hull(
     hull_faces: Int[Tensor, "triangle 3"],
     reach: float,
 ) -> tuple[Float[Tensor, "new_vertex 3"], Int[Tensor, "new_face 3"]]:
-    """The parts that lie in the hull or no farther than `reach` [world units] outside; the largest where none does."""
+    """The largest part, and those that lie in the hull or no farther than `reach` [world units] outside."""
     places, triangles = vertices.cpu().double().numpy(), faces.cpu().numpy().astype(np.int64)
     label = component_labels(len(places), triangles)
     if label.max() == 0:
@@ -96,9 +96,8 @@ def parts_in_hull(
     held = igl.fast_winding_number(outer, outer_faces, places) > 0.5
     held |= igl.point_mesh_squared_distance(places, outer, outer_faces)[0] < reach * reach
     kept = np.bincount(label, held) >= PART_IN_HULL * np.bincount(label)
-    if not kept.any():
-        areas = np.bincount(label[triangles[:, 0]], face_areas(places, triangles))
-        kept = np.arange(len(areas)) == areas.argmax()
+    # Where poses or masks contradict each other the hull is too small for the object itself.
+    kept[np.bincount(label[triangles[:, 0]], face_areas(places, triangles)).argmax()] = True
     points, triangles = used_only(places, triangles[kept[label[triangles[:, 0]]]])
     return torch.from_numpy(points).to(vertices), torch.from_numpy(triangles).to(faces)
 

@@ -70,5 +70,13 @@ def test_where_nothing_lies_in_the_hull_the_largest_part_is_kept() -> None:
     assert float(vertices[:, 0].max()) < 0.0
 
 
+def test_the_largest_part_is_kept_beside_one_that_a_wrong_hull_holds() -> None:
+    mesh = balls(3)
+    small = dataclasses.replace(balls(1), vertices=0.5 * (balls(1).vertices - torch.tensor(PLACES[0])) + torch.tensor(PLACES[2]))
+    vertices, faces = parts_in_hull(mesh.vertices, mesh.faces, small.vertices, small.faces, 0.02)
+    assert len(faces) == 2 * len(mesh.faces) // 3
+    assert float(vertices[:, 0].min()) < -0.9
+
+
 def test_fewer_faces_are_of_all_parts() -> None:
     assert parts(reduced_mesh(balls(3), 2000, 1.2)) == 3
