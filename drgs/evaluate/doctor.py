@@ -4,6 +4,7 @@ In: a folder. Out: plain JSON data. A folder that cannot be read is a finding, n
 """
 
 import math
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -77,7 +78,7 @@ def doctor(folder: Path) -> dict[str, Any]:
     ):
         report[section], found = examine()
         findings += found
-    report["size"] = report.pop("pictures")["size"]
+    report |= report.pop("pictures")
     report["summary"] = _summary(report)
     report["findings"] = [asdict(finding) for finding in findings]
     report["advice"] = [finding.advice for finding in findings if finding.advice]
@@ -88,24 +89,25 @@ def _summary(report: dict[str, Any]) -> str:
     width, height = report["size"]
     masks = report["masks"]
     about = f"with masks; the object fills {100 * masks['mean_coverage']:.0f} % of them" if masks["present"] else "without masks"
-    return f"{report['views']} pictures of {width}x{height} {about}."
+    others = f" and {len(report['sizes']) - 1} other sizes" if len(report["sizes"]) > 1 else ""
+    return f"{report['views']} pictures of {width}x{height}{others} {about}."
 
 
 _Section = tuple[dict[str, Any], list[Finding]]
 
 
 def _pictures(capture: Capture) -> _Section:
-    pinhole, count = capture.photographs[0].pinhole, len(capture.photographs)
+    sizes = Counter((photograph.pinhole.width, photograph.pinhole.height) for photograph in capture.photographs)
+    count, largest = len(capture.photographs), max(sizes, key=max)
     findings = []
     if count < FEW_VIEWS:
         findings.append(Finding("warning", f"{count} views are few.", f"Take {FEW_VIEWS} to 100 pictures, all around the object."))
-    if max(pinhole.width, pinhole.height) > LARGE_SIDE:
+    if max(largest) > LARGE_SIDE:
         findings.append(
-            Finding(
-                "info", f"Pictures of {pinhole.width}x{pinhole.height} are larger than a build needs.", "Shrink them for a first build."
-            )
+            Finding("info", f"Pictures of {largest[0]}x{largest[1]} are larger than a build needs.", "Shrink them for a first build.")
         )
-    return {"size": [pinhole.width, pinhole.height]}, findings
+    usual = [[*size, pictures] for size, pictures in sizes.most_common()]
+    return {"size": usual[0][:2], "sizes": usual}, findings
 
 
 def _files(folder: Path, capture: Capture) -> _Section:
@@ -138,9 +140,11 @@ def _intrinsics(capture: Capture) -> _Section:
     pinholes = [photograph.pinhole for photograph in capture.photographs]
     focal = np.array([[pinhole.fx, pinhole.fy] for pinhole in pinholes])
     offset = np.array([[pinhole.cx - pinhole.width / 2, pinhole.cy - pinhole.height / 2] for pinhole in pinholes])
-    angle = float(np.degrees(2 * np.arctan(0.5 * pinholes[0].width / focal[:, 0].mean())))
+    size = np.array([[pinhole.width, pinhole.height] for pinhole in pinholes])
+    angle = float(np.degrees(2 * np.arctan(0.5 * size[:, 0] / focal[:, 0])).mean())
     findings = []
-    spread = float(focal[:, 0].max() / focal[:, 0].min())
+    relative = focal[:, 0] / size.max(1)
+    spread = float(relative.max() / relative.min())
     if spread > 1.05:
         findings.append(
             Finding("info", f"Focal lengths differ by {100 * (spread - 1):.0f} % between views (zoom, or a calibration per picture).")
@@ -154,7 +158,7 @@ def _intrinsics(capture: Capture) -> _Section:
                 "Check fl_x and fl_y of the camera file.",
             )
         )
-    shift = float((np.abs(offset) / [pinholes[0].width, pinholes[0].height]).max())
+    shift = float((np.abs(offset) / size).max())
     if shift > 0.2:
         findings.append(
             Finding(
@@ -181,10 +185,13 @@ def _masks(views: Views, points: InitialPoints) -> _Section:
             "Save pictures with an alpha channel, or put masks of the same names (white object, black background) in masks/.",
         )
         return {"present": False, "mean_coverage": None, "touching_border": [], "empty": [], "disagreeing": []}, [finding]
-    inside = views.coverage > 127
-    share = inside.float().mean((1, 2))
-    border = torch.cat([inside[:, 0], inside[:, -1], inside[:, :, 0], inside[:, :, -1]], 1).any(1)
-    touching = [name for name, touches in zip(names, border.tolist(), strict=True) if touches]
+    masks = [coverage > 127 for coverage in views.coverage]
+    share = torch.stack([inside.float().mean() for inside in masks])
+    touching = [
+        name
+        for name, inside in zip(names, masks, strict=True)
+        if bool(torch.cat([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).any())
+    ]
     empty = [name for name, value in zip(names, share.tolist(), strict=True) if value == 0]
     agreement = _mask_agreement(views, points)
     disagreeing = [name for name, value in zip(names, agreement, strict=True) if value < POOR_AGREEMENT and name not in empty]
@@ -236,9 +243,9 @@ def _mask_agreement(views: Views, points: InitialPoints) -> list[float]:
     if points.hull_vertices is None:
         return [1.0] * len(views.cameras)
     vertices = points.hull_vertices.numpy()[:: 1 + len(points.hull_vertices) // EXAMINED_POINTS]
-    stride = max(2, views.coverage.shape[-1] // 100)
     agreement = []
     for camera, coverage in zip(views.cameras, views.coverage, strict=True):
+        stride = max(2, coverage.shape[-1] // 100)
         mask = torch.nn.functional.max_pool2d((coverage > 127).float()[None], stride, stride, ceil_mode=True)[0].numpy() > 0
         column, row, seen, _ = project_points(camera, vertices)
         drawn = np.zeros_like(mask)
@@ -322,11 +329,9 @@ def _directions(views: Views, points: InitialPoints) -> _Section:
 
 
 def _exposure(views: Views, points: InitialPoints) -> _Section:
-    inside = views.coverage > 200
-    clipped = (views.images_srgb >= CLIPPED_BYTE).any(-1) & inside
-    object_pixels = inside.sum().clamp(min=1)
-    clipped_share = float(clipped.sum() / object_pixels)
-    black_share = float(((views.images_srgb <= 1).all(-1) & inside).sum() / object_pixels)
+    object_pixels = torch.cat([image[mask > 200] for image, mask in zip(views.images_srgb, views.coverage, strict=True)])
+    clipped_share = float((object_pixels >= CLIPPED_BYTE).any(-1).sum()) / max(1, len(object_pixels))
+    black_share = float((object_pixels <= 1).all(-1).sum()) / max(1, len(object_pixels))
     stops = _exposure_of_views(views, points)
     findings = []
     if clipped_share > MUCH_CLIPPED:
@@ -361,13 +366,13 @@ def _exposure_of_views(views: Views, points: InitialPoints) -> Float[ndarray, "v
     """(view,) stops by which the points a view sees are brighter there than in the median view; highlights are outvoted."""
     positions, usual = points.points_world.numpy(), luminance(linear_from_srgb(points.colors_srgb)).numpy()
     stops = []
-    for camera, image, coverage in zip(views.cameras, views.images_srgb.numpy(), views.coverage.numpy(), strict=True):
+    for camera, image, coverage in zip(views.cameras, views.images_srgb, views.coverage, strict=True):
         column, row, seen, _ = project_points(camera, positions)
-        seen &= coverage[row, column] > 200
+        seen &= coverage.numpy()[row, column] > 200
         if points.normals_world is not None:
             seen &= ((camera.center_world - points.points_world) * points.normals_world).sum(1).numpy() > 0
         if seen.any():
-            here = luminance(linear_from_srgb(torch.from_numpy(image[row[seen], column[seen]]).float() / 255)).numpy()
+            here = luminance(linear_from_srgb(image[torch.from_numpy(row[seen]), torch.from_numpy(column[seen])].float() / 255)).numpy()
             stops.append(float(np.median(np.log2((here + 1e-3) / (usual[seen] + 1e-3)))))
     return np.array(stops or [0.0])
 

@@ -385,5 +385,7 @@ def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMes
 
 def kept_photographs(views: Views) -> bytes:
     """Small copies for comparing by eye, cut out where the capture has masks of its own: ones that the build found are a guess."""
-    pictures = torch.cat([views.images_srgb, views.coverage[..., None]], -1) if views.has_masks else views.images_srgb
+    pictures = views.images_srgb
+    if views.has_masks:
+        pictures = tuple(torch.cat([image, mask[..., None]], -1) for image, mask in zip(pictures, views.coverage, strict=True))
     return encode_photographs([picture.numpy() for picture in pictures])

@@ -79,7 +79,7 @@ class Workplace:
 def capture_digest(views: Views) -> str:
     """Hex digest of the photos, masks and poses: a checkpoint belongs to these and no others."""
     digest = hashlib.sha256()
-    for part in (views.images_srgb, views.coverage, *(camera.camera_from_world for camera in views.cameras)):
+    for part in (*views.images_srgb, *views.coverage, *(camera.camera_from_world for camera in views.cameras)):
         digest.update(part.contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
 
@@ -100,10 +100,10 @@ def masks_stage(place: Workplace, views: Views, points: InitialPoints, settings:
         masked = find_masks(views, points, settings, device, report, place.should_stop)
         if masked is None:
             raise BuildStopped
-        return {"coverage": masked.coverage}
+        return {f"coverage.{index}": mask for index, mask in enumerate(masked.coverage)}
 
     kept = _kept_or_made(place, MASKS, torch.device("cpu"), found)
-    return replace(views, coverage=kept["coverage"], has_masks=True)
+    return replace(views, coverage=tuple(kept[f"coverage.{index}"] for index in range(len(views.coverage))), has_masks=True)
 
 
 def points_of_found_masks(masked: Views, points: InitialPoints, count: int, seed: int) -> InitialPoints:

@@ -13,10 +13,10 @@ class Views:
     """Photographs of one object. Written by load_views, read by fit_gaussians and fit_materials."""
 
     cameras: tuple[Camera, ...]
-    images_srgb: UInt8[Tensor, "view height width 3"]
-    """Straight (un-premultiplied) 8-bit sRGB; all views of a capture share one size."""
-    coverage: UInt8[Tensor, "view height width"]
-    """Mask: 255 object, 0 background."""
+    images_srgb: tuple[UInt8[Tensor, "_height _width 3"], ...]
+    """Of each view: straight (un-premultiplied) 8-bit sRGB, of its camera's size."""
+    coverage: tuple[UInt8[Tensor, "_height _width"], ...]
+    """Of each view, its mask: 255 object, 0 background."""
     points_world: Float[Tensor, "point 3"] | None
     """Sparse points of the capture (COLMAP), or None."""
     point_colors_srgb: Float[Tensor, "point 3"] | None

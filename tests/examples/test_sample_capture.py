@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+import torch
 
 from drgs.reconstruct.capture.load_views import load_cameras, load_views
 
@@ -17,11 +18,12 @@ def test_the_sample_capture_has_enough_masked_views() -> None:
     views = load_views(CAPTURE)
     assert views.has_masks and views.source == "nerf-synthetic"
     assert len(views.cameras) >= 48
-    assert tuple(views.images_srgb.shape[1:]) == (256, 256, 3)
-    share = (views.coverage > 127).float().mean((1, 2))
+    assert all(image.shape == (256, 256, 3) for image in views.images_srgb)
+    coverage = torch.stack(views.coverage)
+    share = (coverage > 127).float().mean((1, 2))
     assert float(share.min()) > 0.05
     # Nothing is cut off by the picture's border.
-    assert int(views.coverage[:, [0, -1]].max()) == 0 and int(views.coverage[:, :, [0, -1]].max()) == 0
+    assert int(coverage[:, [0, -1]].max()) == 0 and int(coverage[:, :, [0, -1]].max()) == 0
 
 
 def test_the_sample_capture_holds_test_views_that_training_does_not_name() -> None:

@@ -118,7 +118,7 @@ def test_the_photographs_of_the_capture_are_kept_with_the_asset(build: Build):
 
 
 def test_a_capture_without_masks_keeps_whole_photographs():
-    views = Views((), torch.zeros(1, 8, 8, 3, dtype=torch.uint8), torch.zeros(1, 8, 8, dtype=torch.uint8), None, None, False, "nerfstudio")
+    views = Views((), (torch.zeros(8, 8, 3, dtype=torch.uint8),), (torch.zeros(8, 8, dtype=torch.uint8),), None, None, False, "nerfstudio")
     for has_masks, bands in ((True, ("R", "G", "B", "A")), (False, ("R", "G", "B"))):
         packed = kept_photographs(replace(views, has_masks=has_masks))
         picture = zipfile.ZipFile(io.BytesIO(packed)).read("0000.webp")

@@ -19,8 +19,8 @@ def masks_of_a_ball() -> Views:
         origin, direction = pixel_rays_world(camera)
         nearest = torch.linalg.cross(direction, origin.expand_as(direction)).norm(dim=-1)
         coverage.append(((nearest < 1) * 255).to(torch.uint8))
-    masks = torch.stack(coverage)
-    return Views(cameras, masks[..., None].repeat(1, 1, 1, 3), masks, None, None, has_masks=True, source="made")
+    pictures = tuple(mask[..., None].repeat(1, 1, 3) for mask in coverage)
+    return Views(cameras, pictures, tuple(coverage), None, None, has_masks=True, source="made")
 
 
 @pytest.mark.parametrize("radius", [1.0, 0.8, 0.5])

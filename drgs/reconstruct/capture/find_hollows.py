@@ -9,6 +9,7 @@ pass through; where enough do, depth is the field's, else the hull's, and all de
 In: Views with masks, their hull. Out: a closed surface inside the hull, or that hull where it is believed everywhere.
 """
 
+import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -84,8 +85,8 @@ def find_hollows(
     should_stop: Callable[[], bool] | None = None,
 ) -> VisualHull | None:
     """The hull without its hollows; the very hull where none are believed; None when should_stop() said so."""
-    solid = float((views.coverage > 127).flatten(1).sum(1).float().median())
-    targets = view_targets(views, min(1.0, (settings.pixels / max(solid, 1.0)) ** 0.5), device)
+    solid = statistics.median_low(int((mask > 127).sum()) for mask in views.coverage)
+    targets = view_targets(views, min(1.0, (settings.pixels / max(solid, 1)) ** 0.5), device)
     low, high = (torch.from_numpy(np.asarray(x, np.float32)).to(device) for x in (hull.vertices_world.min(0), hull.vertices_world.max(0)))
     radius, center = float((high - low).max()) / 2, (low + high) / 2
     outer = _surface(*clean_mesh(*_tensors(hull, device), HULL_MESH, 1e-5 * radius))

@@ -18,7 +18,7 @@ from drgs.reconstruct.fit.fit_loop import FitReport
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, start_fit
 from drgs.render.visible.rasterize import RasterSettings, rasterize
 from drgs.render.visible.rasterize.near_plane import near_plane
-from drgs.scene.camera import scaled_camera
+from drgs.scene.camera import Camera, scaled_camera
 from drgs.scene.gaussians import Gaussians, surfel_tangents
 from drgs.scene.views import Views
 
@@ -49,19 +49,17 @@ def find_masks(
 
 def smaller_views(views: Views, side: int) -> Views:
     """The capture with pictures of at most `side` pixels, averaged."""
-    height, width = views.coverage.shape[1:]
-    factor = side / max(height, width)
-    if factor >= 1:
-        return views
-    cameras = tuple(scaled_camera(camera, factor) for camera in views.cameras)
-    size = (cameras[0].height, cameras[0].width)
+    cameras = tuple(scaled_camera(camera, min(1.0, side / max(camera.height, camera.width))) for camera in views.cameras)
 
-    def shrunk(pictures: torch.Tensor) -> torch.Tensor:
-        small = [torch.nn.functional.interpolate(picture[None].float(), size, mode="area")[0].round() for picture in pictures]
-        return torch.stack(small).to(torch.uint8)
+    def shrunk(picture: torch.Tensor, camera: Camera) -> torch.Tensor:
+        size = (camera.height, camera.width)
+        return torch.nn.functional.interpolate(picture[None].float(), size, mode="area")[0].round().to(torch.uint8)
 
-    images = shrunk(views.images_srgb.permute(0, 3, 1, 2)).permute(0, 2, 3, 1).contiguous()
-    return replace(views, cameras=cameras, images_srgb=images, coverage=shrunk(views.coverage[:, None])[:, 0])
+    images = [shrunk(image.permute(2, 0, 1), camera) for image, camera in zip(views.images_srgb, cameras, strict=True)]
+    masks = [shrunk(mask[None], camera)[0] for mask, camera in zip(views.coverage, cameras, strict=True)]
+    return replace(
+        views, cameras=cameras, images_srgb=tuple(image.permute(1, 2, 0).contiguous() for image in images), coverage=tuple(masks)
+    )
 
 
 def with_drawn_masks(views: Views, gaussians: Gaussians, radius: float) -> Views:
@@ -73,4 +71,4 @@ def with_drawn_masks(views: Views, gaussians: Gaussians, radius: float) -> Views
     for camera in views.cameras:
         maps = rasterize(gaussians.centers, tangents, opacities, empty, camera.to(empty.device), settings)
         masks.append((255 * (maps.coverage > 0.5)).to(torch.uint8).cpu())
-    return replace(views, coverage=torch.stack(masks), has_masks=True)
+    return replace(views, coverage=tuple(masks), has_masks=True)

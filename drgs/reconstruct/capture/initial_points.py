@@ -128,10 +128,10 @@ def _sparse_points_on_object(views: Views) -> tuple[Float[ndarray, "point 3"], F
     points, colors = points[finite], colors[finite]
     if views.has_masks and len(points):
         seen, on_mask = np.zeros(len(points)), np.zeros(len(points))
-        for camera, coverage in zip(views.cameras, views.coverage.cpu().numpy(), strict=True):
+        for camera, coverage in zip(views.cameras, views.coverage, strict=True):
             column, row, inside, _ = project_points(camera, points)
             seen += inside
-            on_mask += inside & (coverage[row, column] > 127)
+            on_mask += inside & (coverage.numpy()[row, column] > 127)
         kept = (seen >= 2) & (on_mask >= SMALLEST_MASK_AGREEMENT * seen)
         points, colors = points[kept], colors[kept]
     if len(points) > 16:
@@ -216,13 +216,13 @@ def _median_colors(
     for vote, index in zip(votes, chosen, strict=True):
         camera = views.cameras[index]
         column, row, visible, depth = project_points(camera, points)
-        visible &= views.coverage[index].cpu().numpy()[row, column] > 200
+        visible &= views.coverage[index].numpy()[row, column] > 200
         if normals is not None:
             to_camera = camera.center_world.cpu().numpy() - points
             visible &= (normals * to_camera).sum(1) > 0.15 * np.linalg.norm(to_camera, axis=1)
         if hull is not None:
             visible &= depth < _nearest_depth(camera, hull)[row, column] + 3 * hull.cell
-        color = views.images_srgb[index].cpu().numpy()[row[visible], column[visible]]
+        color = views.images_srgb[index].numpy()[row[visible], column[visible]]
         vote[torch.from_numpy(visible)] = torch.from_numpy(color.astype(np.float32) / 255)
     return torch.nan_to_num(torch.nanmedian(votes, dim=0).values, nan=0.5).numpy()
 

@@ -20,7 +20,6 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 from drgs.warp_torch import launch, warp_array, warp_device
 
@@ -67,6 +66,7 @@ def outvote(
     points: wp.array[wp.vec3],
     pixel_from_world: wp.array[wp.vec4],
     masks: wp.array3d[wp.uint8],
+    sizes: wp.array[wp.vec2i],
     outvoted: int,
     fewest_seen: int,
     # outputs
@@ -77,13 +77,13 @@ def outvote(
     are, where it is not 0."""
     i = first + wp.tid()
     point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
-    width = masks.shape[2]
-    height = masks.shape[1]
     smallest = wp.vec4(1.0, 1.0, 1.0, 1.0)
     seen = int(0)  # Warp: a variable that a loop changes must not be a constant
     for view in range(masks.shape[0]):
         depth = wp.dot(pixel_from_world[3 * view + 2], point)
         if depth > 0.0:
+            width = sizes[view][0]
+            height = sizes[view][1]
             x = wp.dot(pixel_from_world[3 * view], point) / depth
             y = wp.dot(pixel_from_world[3 * view + 1], point) / depth
             # A view that does not see the point says nothing about it.
@@ -154,27 +154,23 @@ def camera_geometry(views: Views) -> tuple[Float[ndarray, "view 4 4"], Float[nda
 
 def _with_small_masks(views: Views, side: int) -> Views:
     """Masks averaged over squares of whole pixels, cameras to match; the pictures are left alone, nothing here reads them."""
-    factor = math.ceil(max(views.coverage.shape[1:]) / side)
-    if factor == 1:
-        return views
-    small = [
-        torch.nn.functional.avg_pool2d(mask.float()[None], factor, ceil_mode=True)[0].round().to(torch.uint8)
-        for mask in views.coverage.cpu()
-    ]
-    height, width = small[0].shape
-    shrink = torch.diag(torch.tensor([1 / factor, 1 / factor, 1.0]))
-    cameras = tuple(Camera(c.camera_from_world.cpu(), shrink @ c.intrinsics.cpu(), width, height, c.name) for c in views.cameras)
-    return replace(
-        views, cameras=cameras, coverage=torch.stack(small), images_srgb=torch.zeros(len(small), height, width, 3, dtype=torch.uint8)
-    )
+    cameras, masks = [], []
+    for camera, mask in zip(views.cameras, views.coverage, strict=True):
+        factor = math.ceil(max(mask.shape) / side)
+        if factor > 1:
+            mask = torch.nn.functional.avg_pool2d(mask.float()[None], factor, ceil_mode=True)[0].round().to(torch.uint8)
+            shrink = torch.diag(torch.tensor([1 / factor, 1 / factor, 1.0]))
+            camera = replace(camera, intrinsics=shrink @ camera.intrinsics, width=mask.shape[1], height=mask.shape[0])
+        cameras.append(camera)
+        masks.append(mask)
+    return replace(views, cameras=tuple(cameras), coverage=tuple(masks))
 
 
 def _first_box(views: Views) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]] | None:
     """Cube around the point where rays through the mask centroids meet, as large as the masks' cones are there."""
     camera_from_world, intrinsics, centers = camera_geometry(views)
-    coverage = views.coverage.cpu().numpy()
     kept, directions, corner_rays = [], [], []
-    for index, mask in enumerate(coverage):
+    for index, mask in enumerate(coverage.numpy() for coverage in views.coverage):
         ys, xs = np.nonzero(mask[::2, ::2] > 127)
         if len(xs) == 0:
             continue
@@ -204,7 +200,7 @@ class _Carver:
         count = len(views.cameras)
         # Neighbours in the file are neighbours in space; views far apart empty a point sooner.
         order = np.argsort((np.arange(count) * 0.6180339887) % 1.0)
-        self.masks = views.coverage.cpu().numpy()[order]
+        self.masks = [views.coverage[index].numpy() for index in order]
         self.cameras = [views.cameras[index] for index in order]
         self.pixel_from_world = torch.stack(
             [(c.intrinsics.double() @ c.camera_from_world.double()[:3]).float().cpu() for c in self.cameras]
@@ -241,21 +237,25 @@ class _Carver:
 
     def _widened(
         self, points: Float[Tensor, "point 3"], cell: float, widen: Callable[[ndarray, int], ndarray]
-    ) -> UInt8[ndarray, "view height width"]:
+    ) -> list[UInt8[ndarray, "_height _width"]]:
         """Masks in which each pixel stands for all pixels that a cell's half diagonal covers around it."""
-        widened = np.empty_like(self.masks)
+        widened = []
         middle = points.mean(0)
-        for index, (camera, projection) in enumerate(zip(self.cameras, self.pixel_from_world, strict=True)):
+        for mask, camera, projection in zip(self.masks, self.cameras, self.pixel_from_world, strict=True):
             depth = max(float(projection[2, :3] @ middle + projection[2, 3]), 2 * cell)
             # One pixel more than the projection: lookups are bilinear.
             reach = math.ceil(0.87 * cell * float(camera.intrinsics[0, 0]) / depth * 1.15) + 1
-            widened[index] = widen(self.masks[index], 2 * min(reach, min(self.masks.shape[1:]) // 2) + 1)
+            widened.append(widen(mask, 2 * min(reach, min(mask.shape) // 2) + 1))
         return widened
 
     def _outvote(
-        self, points: Float[Tensor, "point 3"], masks: UInt8[ndarray, "view height width"]
+        self, points: Float[Tensor, "point 3"], masks: list[UInt8[ndarray, "_height _width"]]
     ) -> tuple[Float[Tensor, "point"], Int32[Tensor, "point"]]:
         points = points.float().contiguous()
+        heights, widths = ([mask.shape[axis] for mask in masks] for axis in (0, 1))
+        stacked = np.zeros((len(masks), max(heights), max(widths)), np.uint8)
+        for place, mask in zip(stacked, masks, strict=True):
+            place[: mask.shape[0], : mask.shape[1]] = mask
         field, seen = torch.zeros(len(points)), torch.zeros(len(points), dtype=torch.int32)
         launch(
             outvote,
@@ -263,7 +263,8 @@ class _Carver:
             inputs=[
                 warp_array(points, wp.vec3),
                 warp_array(self.pixel_from_world.reshape(-1, 4), wp.vec4),
-                warp_array(torch.from_numpy(masks)),
+                warp_array(torch.from_numpy(stacked)),
+                warp_array(torch.tensor([widths, heights], dtype=torch.int32).T.contiguous(), wp.vec2i),
                 self.outvoted,
                 self.fewest_seen,
             ],

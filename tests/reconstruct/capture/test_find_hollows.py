@@ -70,7 +70,7 @@ def photographed(object_: AbstractTracer, shade: Callable[[Tensor, Tensor, Tenso
         images.append((255 * color.clamp(0, 1)).to(torch.uint8).reshape(SIDE, SIDE, 3))
         masks.append((255 * hits.hit).to(torch.uint8).reshape(SIDE, SIDE))
         cameras.append(camera)
-    return Views(tuple(cameras), torch.stack(images), torch.stack(masks), None, None, True, "nerf-synthetic")
+    return Views(tuple(cameras), tuple(images), tuple(masks), None, None, True, "nerf-synthetic")
 
 
 def height_inside(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -125,7 +125,7 @@ def test_a_search_that_is_stopped_finds_nothing(painted: Views) -> None:
 def test_photographs_in_which_nothing_is_solid_keep_the_hull(painted: Views) -> None:
     hull = visual_hull(painted)
     assert hull is not None
-    assert find_hollows(replace(painted, coverage=painted.coverage // 2), hull, SETTINGS, 0, CPU) is hull
+    assert find_hollows(replace(painted, coverage=tuple(mask // 2 for mask in painted.coverage)), hull, SETTINGS, 0, CPU) is hull
 
 
 def constant_grid(density: float, inside: float = 1.0) -> RadianceGrid:

@@ -10,7 +10,7 @@ import torch
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings, axes_meeting_point, visual_hull
-from drgs.scene.camera import Camera
+from drgs.scene.camera import Camera, scaled_camera
 from drgs.scene.views import Views
 from tests.reconstruct import tiny_capture as tiny
 
@@ -92,11 +92,27 @@ def test_large_masks_give_the_hull_of_their_averages(sphere: Views) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("fill", [0, 255])
 def test_one_wrong_mask_is_outvoted(fill: int, sphere: Views) -> None:
-    coverage = sphere.coverage.clone()
-    coverage[5] = fill
+    coverage = tuple(torch.full_like(mask, fill) if view == 5 else mask for view, mask in enumerate(sphere.coverage))
     radii = _radii(initial_points(replace(sphere, coverage=coverage), COUNT, seed=0).points_world)
     assert radii.min() > 0.96
     assert np.median(radii) < 1.06
+
+
+def test_pictures_of_several_sizes_carve_the_same_hull(sphere: Views) -> None:
+    def at(share: float, camera: Camera, mask: torch.Tensor) -> tuple[Camera, torch.Tensor]:
+        smaller = scaled_camera(camera, share)
+        small = torch.nn.functional.interpolate(mask[None, None].float(), (smaller.height, smaller.width), mode="area")[0, 0]
+        return smaller, small.round().to(torch.uint8)
+
+    pairs = [
+        at(0.5 if view % 3 else 1.0, camera, mask) for view, (camera, mask) in enumerate(zip(sphere.cameras, sphere.coverage, strict=True))
+    ]
+    mixed = visual_hull(replace(sphere, cameras=tuple(camera for camera, _ in pairs), coverage=tuple(mask for _, mask in pairs)))
+    even = visual_hull(sphere)
+    assert mixed is not None and even is not None
+    radii = [_radii(torch.from_numpy(hull.vertices_world)) for hull in (mixed, even)]
+    assert abs(np.median(radii[0]) - np.median(radii[1])) < 0.01
+    assert radii[0].min() > 0.93
 
 
 def test_what_few_close_views_alone_see_is_not_the_object(sphere: Views) -> None:
@@ -108,16 +124,14 @@ def test_what_few_close_views_alone_see_is_not_the_object(sphere: Views) -> None
         return replace(camera, intrinsics=torch.tensor([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]))
 
     def disc(share: float) -> torch.Tensor:
-        y, x = torch.meshgrid(*((torch.arange(size) + 0.5) / size - 0.5 for size in sphere.coverage.shape[1:]), indexing="ij")
+        y, x = torch.meshgrid(*((torch.arange(size) + 0.5) / size - 0.5 for size in sphere.coverage[0].shape), indexing="ij")
         return ((x**2 + y**2).sqrt() < 0.5 * share).to(torch.uint8) * 255
 
     # The sphere just fits into each picture, but eight neighbours stand so near that it fills theirs.
     around = [zoomed(camera, 0.9) for camera in sphere.cameras]
     near = [zoomed(sphere.cameras[0], 4.0 + 0.01 * k) for k in range(8)]
-    coverage = torch.stack([disc(0.9)] * len(around) + [disc(4.0)] * len(near))
-    views = replace(
-        sphere, cameras=(*around, *near), coverage=coverage, images_srgb=sphere.images_srgb[:1].expand(len(coverage), -1, -1, -1)
-    )
+    coverage = (*[disc(0.9)] * len(around), *[disc(4.0)] * len(near))
+    views = replace(sphere, cameras=(*around, *near), coverage=coverage, images_srgb=sphere.images_srgb[:1] * len(coverage))
     hull = visual_hull(views)
     assert hull is not None
     assert _radii(torch.from_numpy(hull.vertices_world)).max() < 1.3
@@ -126,7 +140,7 @@ def test_what_few_close_views_alone_see_is_not_the_object(sphere: Views) -> None
 def test_two_separate_parts_both_get_points(sphere: Views) -> None:
     # A small second ball beside the first, drawn into every mask by its own silhouette.
     center, radius = np.array([0.1, 0.75, 0.2]), 0.12
-    coverage = sphere.coverage.clone()
+    coverage = tuple(mask.clone() for mask in sphere.coverage)
     for index, camera in enumerate(sphere.cameras):
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.intrinsics.double().numpy()).T
@@ -148,10 +162,10 @@ def test_the_same_seed_gives_the_same_points_and_another_does_not(sphere: Views)
 
 def test_masks_without_a_common_shape_are_refused(sphere: Views) -> None:
     # Each mask is a corner of its picture that the others do not see.
-    coverage = torch.zeros_like(sphere.coverage)
-    for index in range(len(coverage)):
-        coverage[index, :8, :8] = 255 if index % 2 else 0
-        coverage[index, -8:, -8:] = 0 if index % 2 else 255
+    coverage = tuple(torch.zeros_like(mask) for mask in sphere.coverage)
+    for index, mask in enumerate(coverage):
+        mask[:8, :8] = 255 if index % 2 else 0
+        mask[-8:, -8:] = 0 if index % 2 else 255
     with pytest.raises(ValueError, match="no common shape"):
         initial_points(replace(sphere, coverage=coverage), COUNT, seed=0)
 
@@ -180,7 +194,7 @@ def test_without_masks_the_bounds_ignore_points_of_the_room(sphere: Views) -> No
     room = np.concatenate([tiny.sphere_points(300)[0], random.uniform(-20, 20, (2000, 3))])
     views = replace(
         sphere,
-        coverage=torch.full_like(sphere.coverage, 255),
+        coverage=tuple(torch.full_like(mask, 255) for mask in sphere.coverage),
         has_masks=False,
         points_world=torch.from_numpy(room).float(),
         point_colors_srgb=torch.full((len(room), 3), 0.5),
@@ -191,7 +205,7 @@ def test_without_masks_the_bounds_ignore_points_of_the_room(sphere: Views) -> No
 
 
 def test_without_masks_points_are_random_where_all_cameras_look(sphere: Views) -> None:
-    views = replace(sphere, coverage=torch.full_like(sphere.coverage, 255), has_masks=False)
+    views = replace(sphere, coverage=tuple(torch.full_like(mask, 255) for mask in sphere.coverage), has_masks=False)
     points = initial_points(views, COUNT, seed=0)
     assert points.origin == "random" and points.normals_world is None and points.hull_faces is None
     np.testing.assert_allclose(points.bounds_center.numpy(), 0, atol=1e-3)  # the cameras look at the origin

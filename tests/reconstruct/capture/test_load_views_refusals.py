@@ -50,7 +50,6 @@ def _mirror(matrix: list) -> None:
 SYNTHETIC_FAULTS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "missing image": (lambda folder: (folder / "train" / "r_004.png").unlink(), ["r_004.png", "no such image", "transforms_train.json"]),
     "wrong size": (_edit(lambda d: d.update(w=100, h=80, fl_x=90.0)), ["r_000.png", "72x56", "100x80"]),
-    "two sizes": (_resize("r_005.png", (144, 112)), ["r_005.png", "144x112", "72x56", "one size"]),
     "unreadable image": (lambda folder: (folder / "train" / "r_001.png").write_bytes(b"not a picture"), ["r_001.png", "not a readable"]),
     "half an image": (
         lambda folder: (folder / "train" / "r_001.png").write_bytes((folder / "train" / "r_001.png").read_bytes()[:200]),

@@ -160,7 +160,7 @@ def check_angle(name: str, value: object, where: str) -> float:
 
 
 def check_photographs(photographs: Sequence[Photograph], where: Path) -> None:
-    """Enough views, of one size, with files as large as their cameras say."""
+    """Enough views, with files as large as their cameras say."""
     if len(photographs) < FEWEST_VIEWS:
         raise ValueError(f"{where}: {len(photographs)} views, expected at least {FEWEST_VIEWS}.")
     for photograph in photographs:
@@ -168,13 +168,6 @@ def check_photographs(photographs: Sequence[Photograph], where: Path) -> None:
         if size != camera_size:
             raise ValueError(
                 f"{photograph.image}: the image is {size[0]}x{size[1]}, but its camera is for {camera_size[0]}x{camera_size[1]} pixels."
-            )
-    first = photographs[0]
-    for photograph in photographs:
-        if (photograph.pinhole.width, photograph.pinhole.height) != (first.pinhole.width, first.pinhole.height):
-            raise ValueError(
-                f"{photograph.image}: the image is {photograph.pinhole.width}x{photograph.pinhole.height}, but {first.image.name} is "
-                f"{first.pinhole.width}x{first.pinhole.height}, expected one size for all views of a capture."
             )
     for photograph in photographs:
         check_pinhole(photograph.pinhole, f"{where}: camera of {photograph.image.name}")

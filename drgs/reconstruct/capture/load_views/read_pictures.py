@@ -1,4 +1,4 @@
-"""Decode the pictures and masks of a capture into one pair of arrays, optionally smaller.
+"""Decode the pictures and masks of a capture, optionally smaller.
 
 Shrinking averages areas of linear, premultiplied light: colour of the background must not bleed into the object's edge.
 """
@@ -13,10 +13,12 @@ import torch
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import Image
+from torch import Tensor
 
 from drgs.exchange.pictures import as_eight_bits
 from drgs.maths.color import linear_from_srgb, srgb_from_linear
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, camera_of, resize_pinhole
+from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
 DECODE_THREADS = 2
@@ -29,37 +31,32 @@ _BYTE_OF_LINEAR = (srgb_from_linear(torch.linspace(0, 1, _BYTE_STEPS).double()) 
 
 
 def read_pictures(capture: Capture, max_side: int | None) -> Views:
-    """Views of a checked capture, the longer side at most `max_side` pixels."""
-    native = capture.photographs[0].pinhole
-    scale = min(1.0, max_side / max(native.width, native.height)) if max_side else 1.0
-    width, height = max(1, round(native.width * scale)), max(1, round(native.height * scale))
-    count = len(capture.photographs)
-    images = np.empty((count, height, width, 3), np.uint8)
-    coverage = np.empty((count, height, width), np.uint8)
+    """Views of a checked capture, the longer side of each at most `max_side` pixels."""
 
-    def decode(index: int) -> bool:
-        color, alpha, has_mask = _decode(capture.photographs[index])
+    def read(photograph: Photograph) -> tuple[Camera, Tensor, Tensor, bool]:
+        """Camera, colour, coverage, and whether there is a mask."""
+        pinhole = photograph.pinhole
+        scale = min(1.0, max_side / max(pinhole.width, pinhole.height)) if max_side else 1.0
+        width, height = max(1, round(pinhole.width * scale)), max(1, round(pinhole.height * scale))
+        color, alpha, has_mask = _decode(photograph)
         if (height, width) != alpha.shape:
             color, alpha = shrink(color, alpha, width, height)
-        images[index], coverage[index] = color, alpha
-        return has_mask
+        camera = camera_of(photograph.camera_from_world, resize_pinhole(pinhole, width, height), photograph.name)
+        return camera, torch.from_numpy(color.copy()), torch.from_numpy(alpha.copy()), has_mask
 
     with ThreadPoolExecutor(DECODE_THREADS) as pool:
-        has_masks = list(pool.map(decode, range(count)))
+        cameras, images, coverage, has_masks = zip(*pool.map(read, capture.photographs), strict=True)
     if any(has_masks) and not all(has_masks):
         lacking = [photograph.image for photograph, has_mask in zip(capture.photographs, has_masks, strict=True) if not has_mask]
-        raise ValueError(f"{lacking[0]}: neither alpha nor a mask ({len(lacking)} of {count} images), but the others have one.")
-    cameras = tuple(
-        camera_of(photo.camera_from_world, resize_pinhole(photo.pinhole, width, height), photo.name) for photo in capture.photographs
-    )
+        raise ValueError(f"{lacking[0]}: neither alpha nor a mask ({len(lacking)} of {len(cameras)} images), but the others have one.")
     return Views(
         cameras=cameras,
-        images_srgb=torch.from_numpy(images),
-        coverage=torch.from_numpy(coverage),
+        images_srgb=images,
+        coverage=coverage,
         points_world=None if capture.points_world is None else torch.from_numpy(capture.points_world),
         point_colors_srgb=None if capture.point_colors_srgb is None else torch.from_numpy(capture.point_colors_srgb),
         # An alpha channel that is opaque everywhere says nothing.
-        has_masks=all(has_masks) and bool((coverage < 128).any()),
+        has_masks=all(has_masks) and any(bool((mask < 128).any()) for mask in coverage),
         source=capture.source,
     )
 

@@ -153,7 +153,7 @@ class _Steps:
 
     def _drawn_target(self, iteration: int) -> ViewTarget:
         half_size = iteration < int(self.settings.half_size_share * self.settings.iterations)
-        factor = (0.5 if half_size else 1.0) * size_factor(self.views.cameras[0], self.settings.most_pixels)
+        factor = (0.5 if half_size else 1.0) * size_factor(self.views.cameras, self.settings.most_pixels)
         if factor != self.target_factor:
             self.targets = view_targets(self.views, factor, self.state.parameters["centers"].device)
             self.target_factor = factor
@@ -165,9 +165,9 @@ class _Steps:
         return min(self.settings.sh_degree, int((progress - self.settings.sh_start) * 10) + 1)
 
 
-def size_factor(camera: Camera, most_pixels: int) -> float:
-    """By which a photograph is reduced; 1 where it is small enough."""
-    return min(1.0, math.sqrt(most_pixels / (camera.width * camera.height)))
+def size_factor(cameras: tuple[Camera, ...], most_pixels: int) -> float:
+    """By which photographs are reduced, so that the largest has so many; 1 where it is small enough."""
+    return min(1.0, math.sqrt(most_pixels / max(camera.width * camera.height for camera in cameras)))
 
 
 def normal_share(progress: float) -> float:
