@@ -167,8 +167,13 @@ def _intrinsics(capture: Capture) -> _Section:
                 "Check cx and cy, unless pictures were cropped.",
             )
         )
+    bent = [photograph.lens.model for photograph in capture.photographs if photograph.lens is not None]
+    if bent:
+        models = ", ".join(sorted(set(bent)))
+        findings.append(Finding("info", f"{len(bent)} pictures are undistorted before anything else ({models})."))
     summary = {
         "model": "pinhole",
+        "undistorted_pictures": len(bent),
         "focal_pixels": [round(float(focal.min()), 2), round(float(focal.max()), 2)],
         "field_of_view_degrees": round(angle, 2),
         "principal_point_offset_pixels": [round(float(value), 2) for value in offset.mean(0)],

@@ -6,6 +6,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from drgs.scene.camera import Camera
+from drgs.scene.lens import Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,3 +25,5 @@ class Views:
     """False when the capture has neither alpha nor masks: coverage is then 255 everywhere."""
     source: str
     """Which reader recognised the folder: nerf-synthetic, nerfstudio, colmap, nero."""
+    lenses: tuple[Lens | None, ...] = ()
+    """As the photographs on disc were calibrated, one a view: None where it was a pinhole already. The images here are undistorted."""

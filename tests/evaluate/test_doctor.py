@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from drgs.evaluate.doctor import doctor
+from drgs.scene.lens import Lens
 from tests.reconstruct import tiny_capture as tiny
 
 
@@ -28,6 +29,16 @@ def test_a_good_capture_is_reported_without_warnings(tmp_path: Path) -> None:
     assert report["scale"]["bounds_radius"] == pytest.approx(tiny.SPHERE_RADIUS, rel=0.25)
     assert report["masks"]["agreement"] > 0.9
     assert report["initial_points"]["origin"] == "hull"
+
+
+@pytest.mark.slow
+def test_a_capture_with_lens_distortion_is_reported_as_it_will_be_built(tmp_path: Path) -> None:
+    lens = Lens("SIMPLE_RADIAL", (tiny.FX, tiny.CX, tiny.CY, -0.3), tiny.WIDTH, tiny.HEIGHT)
+    report = doctor(tiny.write_colmap(tmp_path, binary=True, lens=lens))
+    assert report["ok"] and _sentences(report) == ""
+    assert "24 pictures are undistorted before anything else (SIMPLE_RADIAL)." in _sentences(report, "info")
+    assert report["intrinsics"]["undistorted_pictures"] == tiny.VIEWS
+    assert report["masks"]["agreement"] > 0.9
 
 
 @pytest.mark.slow

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from drgs.scene.lens import PARAMETER_NAMES, Lens, pixels_from_plane
+
 WIDTH, HEIGHT = 72, 56
 FX, FY, CX, CY = 90.0, 84.0, 38.5, 26.0
 SPHERE_CENTER = np.array([0.1, -0.15, 0.2])
@@ -63,11 +65,20 @@ def color_of_normal(normal: np.ndarray) -> np.ndarray:
     return np.round((0.5 + 0.4 * normal) * 255).astype(np.uint8)
 
 
-def sphere_views(count: int = VIEWS, square: bool = False) -> list[TinyView]:
+def plane_from_pixels(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """Directions (x, y, 1) that a lens shows there, by fixed-point iteration, for lenses that bend moderately."""
+    plane = (pixels - lens.principal_point) / lens.focal_lengths
+    for _ in range(200):
+        plane = plane + 0.7 * (pixels - pixels_from_plane(lens, plane)) / lens.focal_lengths
+    return plane
+
+
+def sphere_views(count: int = VIEWS, square: bool = False, lens: Lens | None = None) -> list[TinyView]:
     """Views of the sphere. With `square`, intrinsics are FX, FX and the picture's middle, as camera_angle_x says."""
     fx, fy, cx, cy = (FX, FX, WIDTH / 2, HEIGHT / 2) if square else (FX, FY, CX, CY)
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], -1)
+    lens = lens or Lens("PINHOLE", (fx, fy, cx, cy), WIDTH, HEIGHT)
+    plane = plane_from_pixels(lens, np.stack(np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5), -1))
+    rays = np.concatenate([plane, np.ones_like(plane[..., :1])], -1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     views = []
     for index, position in enumerate(camera_positions(count)):
@@ -139,14 +150,14 @@ def _quat_wxyz(rotation: np.ndarray) -> np.ndarray:
     return vector[[3, 0, 1, 2]]
 
 
-def write_colmap(folder: Path, binary: bool, model: str = "PINHOLE", masks: str = "{name}.jpg.png") -> Path:
+def write_colmap(folder: Path, binary: bool, model: str = "PINHOLE", masks: str = "{name}.jpg.png", lens: Lens | None = None) -> Path:
     """sparse/0 with one camera, JPEG-named PNG pictures... as .png, masks beside them, points on the sphere."""
-    views = sphere_views()
+    views = sphere_views(lens=lens)
     sparse = folder / "sparse" / "0"
     for part in (sparse, folder / "images", folder / "masks"):
         part.mkdir(parents=True)
-    parameters = {"PINHOLE": (FX, FY, CX, CY), "SIMPLE_PINHOLE": (FX, CX, CY), "OPENCV": (FX, FY, CX, CY, 0.1, 0, 0, 0)}[model]
-    number = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "OPENCV": 4}[model]
+    lens = lens or Lens(model, {"PINHOLE": (FX, FY, CX, CY), "SIMPLE_PINHOLE": (FX, CX, CY)}[model], WIDTH, HEIGHT)
+    parameters, number = lens.parameters, list(PARAMETER_NAMES).index(lens.model)
     points, colors = sphere_points()
     images_txt, images_bin = ["# comment"], struct.pack("<Q", len(views))
     for index, view in enumerate(views):
@@ -163,7 +174,7 @@ def write_colmap(folder: Path, binary: bool, model: str = "PINHOLE", masks: str 
         images_bin += struct.pack("<Q", observations) + struct.pack("<ddq", 1.0, 2.0, -1) * observations
     if binary:
         (sparse / "cameras.bin").write_bytes(
-            struct.pack("<QiiQQ", 1, 7, number, WIDTH, HEIGHT) + struct.pack(f"<{len(parameters)}d", *parameters)
+            struct.pack("<QiiQQ", 1, 7, number, lens.width, lens.height) + struct.pack(f"<{len(parameters)}d", *parameters)
         )
         (sparse / "images.bin").write_bytes(images_bin)
         rows = [
@@ -173,7 +184,7 @@ def write_colmap(folder: Path, binary: bool, model: str = "PINHOLE", masks: str 
         (sparse / "points3D.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
     else:
         words = " ".join(map(str, parameters))
-        (sparse / "cameras.txt").write_text(f"# Camera list\n7 {model} {WIDTH} {HEIGHT} {words}\n")
+        (sparse / "cameras.txt").write_text(f"# Camera list\n7 {lens.model} {lens.width} {lens.height} {words}\n")
         (sparse / "images.txt").write_text("\n".join(images_txt) + "\n")
         lines = [f"{i} {p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]} 0.5 1 2" for i, (p, c) in enumerate(zip(points, colors, strict=True))]
         (sparse / "points3D.txt").write_text("# points\n" + "\n".join(lines) + "\n")

@@ -1,6 +1,7 @@
 """Captures that are fine: every layout yields the same cameras, pictures and masks."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 from drgs.reconstruct.capture.load_views import load_cameras, load_views
 from drgs.reconstruct.capture.load_views.read_pictures import shrink
 from drgs.scene.camera import pixel_rays_world
+from drgs.scene.lens import PARAMETER_NAMES, Lens
 from tests.reconstruct import tiny_capture as tiny
 
 LAYOUTS = {
@@ -37,6 +39,98 @@ def test_rays_of_every_layout_hit_the_sphere_exactly_where_its_mask_is(layout: s
         wrong += int((hit != (coverage.numpy() == 255)).sum())
     # float32 poses may turn a pixel at the rim.
     assert wrong <= 2
+
+
+INTRINSICS = (tiny.FX, tiny.FY, tiny.CX, tiny.CY)
+BENT: dict[str, tuple[Lens, Callable[[Path, Lens], Path]]] = {
+    "colmap, barrel": (
+        Lens("OPENCV", (*INTRINSICS, -0.3, 0.05, 0.01, -0.02), tiny.WIDTH, tiny.HEIGHT),
+        lambda folder, lens: tiny.write_colmap(folder, binary=True, lens=lens),
+    ),
+    "colmap, pincushion": (
+        Lens("SIMPLE_DIVISION", (tiny.FX, tiny.CX, tiny.CY, 0.3), tiny.WIDTH, tiny.HEIGHT),
+        lambda folder, lens: tiny.write_colmap(folder, binary=False, lens=lens),
+    ),
+    "nerfstudio, three radial coefficients": (
+        Lens("FULL_OPENCV", (*INTRINSICS, -0.2, 0.1, 0.01, 0.02, 0.3, 0.0, 0.0, 0.0), tiny.WIDTH, tiny.HEIGHT),
+        lambda folder, lens: tiny.write_nerfstudio(folder, tiny.sphere_views(lens=lens), k1=-0.2, k2=0.1, p1=0.01, p2=0.02, k3=0.3),
+    ),
+    "nerfstudio, fisheye": (
+        Lens("OPENCV_FISHEYE", (*INTRINSICS, 0.1, -0.2, 0.3, 0.1), tiny.WIDTH, tiny.HEIGHT),
+        lambda folder, lens: tiny.write_nerfstudio(
+            folder, tiny.sphere_views(lens=lens), k1=0.1, k2=-0.2, k3=0.3, k4=0.1, camera_model="OPENCV_FISHEYE"
+        ),
+    ),
+    "instant-ngp": (
+        Lens("OPENCV", (*INTRINSICS, -0.2, 0.0, 0.0, 0.0), tiny.WIDTH, tiny.HEIGHT),
+        lambda folder, lens: tiny.write_nerf_synthetic(
+            folder, tiny.sphere_views(lens=lens), k1=-0.2, **dict(zip(("fl_x", "fl_y", "cx", "cy"), INTRINSICS, strict=True))
+        ),
+    ),
+    "instant-ngp, fisheye": (
+        Lens("OPENCV_FISHEYE", (*INTRINSICS, 0.1, 0.0, 0.0, 0.0), tiny.WIDTH, tiny.HEIGHT),
+        lambda folder, lens: tiny.write_nerf_synthetic(
+            folder,
+            tiny.sphere_views(lens=lens),
+            k1=0.1,
+            is_fisheye=True,
+            **dict(zip(("fl_x", "fl_y", "cx", "cy"), INTRINSICS, strict=True)),
+        ),
+    ),
+}
+"""Captures taken through a lens, and that lens."""
+
+
+@pytest.mark.parametrize("name", BENT)
+def test_rays_of_undistorted_views_hit_the_sphere_where_its_mask_is(name: str, tmp_path: Path) -> None:
+    lens, write = BENT[name]
+    views = load_views(write(tmp_path, lens))
+    assert views.lenses == (lens,) * tiny.VIEWS
+    wrong = edge = 0
+    for camera, coverage, image in zip(views.cameras, views.coverage, views.images_srgb, strict=True):
+        origin, directions = pixel_rays_world(camera)
+        distance = tiny.hits_sphere(origin.double().numpy(), directions.double().numpy())
+        hit, mask = ~np.isnan(distance), coverage.numpy()
+        sure = (mask == 0) | (mask == 255)
+        wrong += int((hit != (mask == 255))[sure].sum())
+        edge += int((~sure).sum())
+        place = origin.numpy() + np.nan_to_num(distance)[..., None] * directions.numpy()
+        painted = tiny.color_of_normal(np.clip((place - tiny.SPHERE_CENTER) / tiny.SPHERE_RADIUS, -1, 1)).astype(int)
+        inside = hit & (mask == 255)
+        assert np.abs(image.numpy()[inside] - painted[inside]).mean() < 1.5
+    # Pixels that one of two neighbours says: the mask was painted in whole pixels.
+    assert wrong <= 0.02 * edge
+
+
+def test_what_was_undistorted_is_shrunk_as_any_other_picture(tmp_path: Path) -> None:
+    lens, write = BENT["colmap, barrel"]
+    folder = write(tmp_path, lens)
+    large, small = load_views(folder), load_views(folder, max_side=32)
+    assert max(small.images_srgb[0].shape[:2]) == 32
+    camera, other = large.cameras[0], small.cameras[0]
+    sides = torch.tensor([[other.width / camera.width], [other.height / camera.height], [1.0]])
+    torch.testing.assert_close(other.intrinsics, sides * camera.intrinsics)
+    torch.testing.assert_close(small.coverage[0].float().mean(), large.coverage[0].float().mean(), rtol=0.03, atol=0)
+
+
+def test_views_of_several_lenses_are_undistorted_each_by_its_own(tmp_path: Path) -> None:
+    folder = tiny.write_nerfstudio(tmp_path)
+    document = json.loads((folder / "transforms.json").read_text())
+    for frame in document["frames"][::2]:
+        frame["k1"] = -0.4
+    (folder / "transforms.json").write_text(json.dumps(document))
+    views = load_views(folder)
+    for lens, camera, image in zip(views.lenses, views.cameras, views.images_srgb, strict=True):
+        assert image.shape[:2] == (camera.height, camera.width)
+        assert (camera.width > tiny.WIDTH) == (lens is not None)
+    assert sum(lens is not None for lens in views.lenses) == tiny.VIEWS // 2
+
+
+def test_a_lens_with_all_coefficients_zero_leaves_pictures_alone(tmp_path: Path) -> None:
+    zeros = (0.0,) * (len(PARAMETER_NAMES["FULL_OPENCV"]) - 4)
+    views = load_views(tiny.write_colmap(tmp_path, binary=True, lens=Lens("FULL_OPENCV", (*INTRINSICS, *zeros), tiny.WIDTH, tiny.HEIGHT)))
+    assert views.lenses == (None,) * tiny.VIEWS
+    np.testing.assert_array_equal(views.images_srgb[3].numpy(), tiny.sphere_views()[3].rgba[..., :3])
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -149,7 +243,11 @@ def test_shrinking_averages_linear_light_of_the_object_only() -> None:
 
 
 def test_cameras_of_a_file_are_those_of_its_capture(tmp_path: Path) -> None:
-    for write, name in ((tiny.write_nerf_synthetic, "transforms_train.json"), (tiny.write_nerfstudio, "transforms.json")):
+    for write, name in (
+        (tiny.write_nerf_synthetic, "transforms_train.json"),
+        (tiny.write_nerfstudio, "transforms.json"),
+        (lambda folder: tiny.write_nerfstudio(folder / "bent", k1=-0.2), "transforms.json"),
+    ):
         folder = write(tmp_path / name)
         for camera, other in zip(load_cameras(folder / name), load_views(folder).cameras, strict=True):
             torch.testing.assert_close(camera.camera_from_world, other.camera_from_world)

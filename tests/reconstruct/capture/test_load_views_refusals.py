@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from drgs.reconstruct.capture.load_views import load_cameras, load_views
+from drgs.reconstruct.capture.load_views import load_views
+from drgs.scene.lens import Lens
 from tests.reconstruct import tiny_capture as tiny
 
 
@@ -68,7 +69,20 @@ SYNTHETIC_FAULTS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "absurd focal length": (_edit(lambda d: d.update(fl_x=2.0)), ["fx = 2", "72x56", "expected 7 to 7200"]),
     "absurd principal point": (_edit(lambda d: d.update(fl_x=90.0, cx=5000.0)), ["principal point (5000", "72x56"]),
     "text as focal length": (_edit(lambda d: d.update(fl_x="90")), ["fl_x = '90'", "number"]),
-    "distortion": (_edit(lambda d: d.update(k1=-0.05)), ["k1 = -0.05", "colmap image_undistorter"]),
+    "a lens that folds": (_edit(lambda d: d.update(k1=-2.5)), ["r_000", "lens OPENCV (k1 = -2.5", "folds the 72x56 image"]),
+    "no number as distortion": (_edit(lambda d: d.update(k1="0.1")), ["lens distortion k1 = '0.1'", "a number"]),
+    "infinite distortion": (_edit(lambda d: d.update(p2=math.inf)), ["lens distortion p2 = inf", "finite"]),
+    "a coefficient of two meanings": (
+        _edit(lambda d: d.update(k4=0.1)),
+        ["lens distortion k4 = 0.1", "expected 0 with camera_model OPENCV"],
+    ),
+    "a fisheye with tangential distortion": (
+        _edit(lambda d: d.update(camera_model="OPENCV_FISHEYE", p1=0.1)),
+        ["lens distortion p1 = 0.1", "expected 0 with camera_model OPENCV_FISHEYE"],
+    ),
+    "a panorama": (_edit(lambda d: d.update(camera_model="EQUIRECTANGULAR")), ["EQUIRECTANGULAR", "cut pinhole pictures out of it"]),
+    "an unknown camera model": (_edit(lambda d: d.update(camera_model="VR180_L")), ["camera_model 'VR180_L'", "expected one of PINHOLE"]),
+    "a camera model that is no name": (_edit(lambda d: d.update(camera_model=[5])), ["camera_model [5]", "expected one of PINHOLE"]),
     "path out of the folder": (_frame(1, file_path="../../etc/passwd"), ["leads outside"]),
     "absolute path": (_frame(1, file_path="/etc/passwd"), ["leads outside"]),
     "no file_path": (_edit(lambda d: d["frames"][3].pop("file_path")), ["frame 3", "file_path"]),
@@ -127,18 +141,6 @@ def test_folders_that_are_no_capture_are_refused(tmp_path: Path) -> None:
         load_views(tiny.write_colmap(tmp_path / "colmap", binary=True), split="test")
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_a_colmap_camera_with_distortion_is_refused_with_the_command_that_undistorts(binary: bool, tmp_path: Path) -> None:
-    folder = tiny.write_colmap(tmp_path / "my capture", binary, model="OPENCV")
-    with pytest.raises(ValueError) as refusal:
-        load_views(folder)
-    command = (
-        f"colmap image_undistorter --image_path '{folder}/images' --input_path '{folder}/sparse/0' "
-        f"--output_path '{tmp_path}/my capture_undistorted' --output_type COLMAP"
-    )
-    assert "OPENCV" in str(refusal.value) and str(refusal.value).endswith(command)
-
-
 COLMAP_4_MODELS = (
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5), ("SIMPLE_FISHEYE", 3), ("FISHEYE", 4), ("EUCM", 6),
     ("EQUIRECTANGULAR", 2),
@@ -147,18 +149,47 @@ COLMAP_4_MODELS = (
 
 
 def _camera_file(folder: Path, *cameras: tuple[int, int]) -> None:
-    """cameras.bin with cameras 7, 8, ... of these model numbers and parameter counts."""
-    rows = [struct.pack(f"<iiQQ{count}d", 7 + k, number, 64, 48, *[10.0] * count) for k, (number, count) in enumerate(cameras)]
+    """cameras.bin with cameras 6, 7, ... of these model numbers and parameter counts; the images are of camera 7."""
+    rows = [struct.pack(f"<iiQQ{count}d", 6 + k, number, 64, 48, *[10.0] * count) for k, (number, count) in enumerate(cameras)]
     (folder / "sparse" / "0" / "cameras.bin").write_bytes(struct.pack("<Q", len(cameras)) + b"".join(rows))
 
 
 @pytest.mark.parametrize(("number", "model"), list(enumerate(COLMAP_4_MODELS, start=11)))
 def test_every_camera_model_of_colmap_4_is_called_by_its_name(number: int, model: tuple[str, int], tmp_path: Path) -> None:
     folder = tiny.write_colmap(tmp_path, binary=True)
-    # A pinhole before it: the parameters of each are skipped by their right count.
-    _camera_file(folder, (1, 4), (number, model[1]))
-    what_to_do = "cut pinhole pictures out of it" if model[0] == "EQUIRECTANGULAR" else "undistort first: colmap image_undistorter"
-    with pytest.raises(ValueError, match=f"camera model {model[0]}, expected PINHOLE or SIMPLE_PINHOLE; .*{what_to_do}"):
+    # A pinhole before and behind it: the parameters of each are skipped by their right count.
+    _camera_file(folder, (1, 4), (number, model[1]), (1, 4))
+    expected = (
+        f"camera model {model[0]}, .*cut pinhole pictures out of it" if model[0] == "EQUIRECTANGULAR" else f"camera 7: lens {model[0]}"
+    )
+    if model[0] in ("SIMPLE_FISHEYE", "FISHEYE"):  # for which those numbers are a lens
+        expected = "the image is 72x56, but its camera is for 64x48 pixels"
+    with pytest.raises(ValueError, match=expected):
+        load_views(folder)
+
+
+def test_a_camera_that_no_image_has_may_be_a_panorama(tmp_path: Path) -> None:
+    folder = tiny.write_colmap(tmp_path, binary=False)
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(cameras.read_text() + "8 EQUIRECTANGULAR 64 32 64 32\n")
+    assert len(load_views(folder).cameras) == tiny.VIEWS
+
+
+def test_a_colmap_camera_of_an_unknown_model_is_refused(tmp_path: Path) -> None:
+    folder = tiny.write_colmap(tmp_path, binary=False)
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(cameras.read_text().replace("PINHOLE", "PIN"))
+    with pytest.raises(ValueError, match=r"cameras\.txt: camera model 'PIN', expected one of SIMPLE_PINHOLE, "):
+        load_views(folder)
+
+
+def test_a_distorted_picture_must_have_the_size_of_its_lens(tmp_path: Path) -> None:
+    folder = tiny.write_colmap(
+        tmp_path, binary=True, lens=Lens("SIMPLE_RADIAL", (tiny.FX, tiny.CX, tiny.CY, -0.2), tiny.WIDTH, tiny.HEIGHT)
+    )
+    path = folder / "images" / "r_004.png"
+    Image.open(path).resize((74, 57)).save(path)
+    with pytest.raises(ValueError, match=r"r_004\.png: the image is 74x57, but its camera is for 72x56 pixels"):
         load_views(folder)
 
 
@@ -210,14 +241,6 @@ def test_one_missing_mask_is_named_and_a_mask_of_another_size_too(tmp_path: Path
     mask.unlink()
     with pytest.raises(ValueError, match=r"r_006\.png: no such mask \(1 of 24"):
         load_views(folder)
-
-
-def test_a_fisheye_is_refused_even_without_coefficients(tmp_path: Path) -> None:
-    folder = tiny.write_nerfstudio(tmp_path, camera_model="OPENCV_FISHEYE")
-    with pytest.raises(ValueError, match=r"OPENCV_FISHEYE is not a pinhole; undistort first: colmap image_undistorter"):
-        load_views(folder)
-    with pytest.raises(ValueError, match="not a pinhole"):
-        load_cameras(folder / "transforms.json")
 
 
 def test_a_named_point_file_must_exist_inside_the_capture(tmp_path: Path) -> None:

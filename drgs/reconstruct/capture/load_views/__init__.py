@@ -5,8 +5,8 @@
     COLMAP           sparse/0 or sparse (bin or txt), images/
     NeRO             K.png, K-depth.png, K-camera.pkl
 
-Masks come from alpha, from `mask_path` or from a masks/ folder; black is background. Whatever makes a capture unusable raises
-ValueError with one sentence. Nothing here looks at test views, true meshes or environments that may lie beside a capture.
+Masks come from alpha, from `mask_path` or from a masks/ folder; black is background. Pictures through a lens that bends straight lines are
+undistorted, so that cameras are always pinholes. Whatever makes a capture unusable raises ValueError with one sentence. Nothing here looks at test views, true meshes or environments that may lie beside a capture.
 """
 
 from pathlib import Path
@@ -22,9 +22,8 @@ from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.load_views.transforms_json import (
     frame_camera_from_world,
     frame_names,
-    frame_pinhole,
+    frame_optics,
     read_transforms,
-    refuse_distortion,
 )
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
@@ -74,6 +73,7 @@ def read_capture(folder: Path, split: Literal["train", "test"] = "train") -> Cap
 def load_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera]:
     """Cameras of a transforms json, NeRF-synthetic or nerfstudio; the images it names need not exist.
 
+    Of a lens that bends straight lines it is the camera of the undistorted picture, as a build has it.
     The picture size is the one the file states, else that of the first image where it exists, else 400x400.
 
     Args:
@@ -89,8 +89,7 @@ def load_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera
     cameras = []
     for frame, name in zip(frames, frame_names(frames), strict=True):
         where = f"{path}: frame {frame['file_path']}"
-        refuse_distortion(document, frame, where, "colmap image_undistorter")
-        pinhole = frame_pinhole(document, frame, where, lambda: first_size or size or FALLBACK_SIZE)
+        pinhole, _ = frame_optics(document, frame, where, lambda: first_size or size or FALLBACK_SIZE)
         if size is not None:
             pinhole = _reframe(pinhole, *size)
         cameras.append(camera_of(frame_camera_from_world(frame, where), pinhole, name))

@@ -12,6 +12,7 @@ from jaxtyping import Float, Float64
 from numpy import ndarray
 
 from drgs.scene.camera import Camera
+from drgs.scene.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,15 @@ class Photograph:
     camera_from_world: Float64[ndarray, "4 4"]
     """OpenCV axes."""
     pinhole: Pinhole
+    """Of the undistorted picture."""
+    lens: Lens | None = None
+    """Through which the picture on disc was taken; None where it is a pinhole's already."""
+
+    @property
+    def size_on_disc(self) -> tuple[int, int]:
+        """(width, height) that the picture's file must have."""
+        picture = self.pinhole if self.lens is None else self.lens
+        return picture.width, picture.height
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,8 @@ LEAST_FOCAL, MOST_FOCAL = 0.1, 100.0
 ORTHONORMAL_TOLERANCE = 1e-2
 MOST_DISTANCE = 1e9
 """Of a camera from the origin [world units]: farther ones leave no digits of float32 for the object."""
+NO_PANORAMA = "a panorama cannot be undistorted: cut pinhole pictures out of it and reconstruct from those"
+"""What to do about COLMAP's and nerfstudio's camera model EQUIRECTANGULAR."""
 MOST_NAME = 1000
 MOST_SHOWN = 60
 """Characters of a wrong value in a sentence."""
@@ -164,7 +166,7 @@ def check_photographs(photographs: Sequence[Photograph], where: Path) -> None:
     if len(photographs) < FEWEST_VIEWS:
         raise ValueError(f"{where}: {len(photographs)} views, expected at least {FEWEST_VIEWS}.")
     for photograph in photographs:
-        size, camera_size = image_size(photograph.image), (photograph.pinhole.width, photograph.pinhole.height)
+        size, camera_size = image_size(photograph.image), photograph.size_on_disc
         if size != camera_size:
             raise ValueError(
                 f"{photograph.image}: the image is {size[0]}x{size[1]}, but its camera is for {camera_size[0]}x{camera_size[1]} pixels."

@@ -5,7 +5,6 @@ Poses in the files are world-to-camera with OpenCV axes, as inside. Principal po
 Source: COLMAP documentation, "Output Format".
 """
 
-import shlex
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,13 +15,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, Pinhole
-from drgs.reconstruct.capture.load_views.checks import find_masks, is_file, rigid_camera_from_world
+from drgs.reconstruct.capture.load_views.checks import NO_PANORAMA, find_masks, is_file, rigid_camera_from_world, shown
+from drgs.reconstruct.capture.load_views.undistort import optics_of
+from drgs.scene.lens import PARAMETER_NAMES, Lens
 
-PARAMETER_COUNTS = {
-    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12, "FOV": 5,
-    "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16, "SIMPLE_DIVISION": 4,
-    "DIVISION": 5, "SIMPLE_FISHEYE": 3, "FISHEYE": 4, "EUCM": 6, "EQUIRECTANGULAR": 2,
-}  # fmt: skip
+PARAMETER_COUNTS = {**{model: len(names) for model, names in PARAMETER_NAMES.items()}, "EQUIRECTANGULAR": 2}
 """COLMAP's camera models in the order of their numbers in cameras.bin, with the length of their parameter lists (as of COLMAP 4.2)."""
 MODEL_NAMES = tuple(PARAMETER_COUNTS)
 
@@ -44,13 +41,6 @@ class _ColmapImage:
     translation: tuple[float, ...]
 
 
-def undistort_command(images: Path, model: Path, folder: Path) -> str:
-    """The command that turns pictures with lens distortion into pinhole ones, which are read here."""
-    output = folder.with_name(f"{folder.name}_undistorted")
-    paths = [shlex.quote(str(path)) for path in (images, model, output)]
-    return f"colmap image_undistorter --image_path {paths[0]} --input_path {paths[1]} --output_path {paths[2]} --output_type COLMAP"
-
-
 def find_model(folder: Path) -> Path | None:
     """The folder with the camera file, or None."""
     for candidate in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
@@ -69,12 +59,11 @@ def read_colmap(folder: Path) -> Capture:
         if part == "images" and not (model / f"{part}{suffix}").is_file():
             raise ValueError(f"{model / part}{suffix}: no such file beside cameras{suffix}.")
     images_root = folder / "images" if (folder / "images").is_dir() else folder
-    undistort = undistort_command(images_root, model, folder)
     read_cameras, read_images, read_points = (
         (_cameras_bin, _images_bin, _points_bin) if suffix == ".bin" else (_cameras_txt, _images_txt, _points_txt)
     )
     try:
-        pinholes = {camera.camera_id: _pinhole(camera, model / f"cameras{suffix}", undistort) for camera in read_cameras(model / "cameras")}
+        cameras = {camera.camera_id: camera for camera in read_cameras(model / "cameras")}
         images = sorted(read_images(model / "images"), key=lambda image: image.name)
         points = read_points(model / "points3D") if (model / f"points3D{suffix}").is_file() else np.zeros((0, 6))
     except (struct.error, IndexError, UnicodeDecodeError) as error:
@@ -93,7 +82,7 @@ def read_colmap(folder: Path) -> Capture:
     masks = find_masks(paths, images_root, folder / "masks")
     photographs = []
     for image, path, mask in zip(images, paths, masks, strict=True):
-        if image.camera_id not in pinholes:
+        if image.camera_id not in cameras:
             raise ValueError(
                 f"{model}/images{suffix}: image {image.name} has camera {image.camera_id}, which cameras{suffix} does not hold."
             )
@@ -102,9 +91,8 @@ def read_colmap(folder: Path) -> Capture:
         camera_from_world[:3, :3] = _rotation_from_quat(np.array(image.quat_wxyz), where)
         camera_from_world[:3, 3] = image.translation
         name = str(Path(image.name).with_suffix("")).replace("/", "_")
-        photographs.append(
-            Photograph(name, path, mask, False, rigid_camera_from_world(camera_from_world, where), pinholes[image.camera_id])
-        )
+        pinhole, lens = _optics(cameras[image.camera_id], model / f"cameras{suffix}")
+        photographs.append(Photograph(name, path, mask, False, rigid_camera_from_world(camera_from_world, where), pinhole, lens))
     has_points = len(points) > 0
     return Capture(
         "colmap",
@@ -114,17 +102,13 @@ def read_colmap(folder: Path) -> Capture:
     )
 
 
-def _pinhole(camera: _ColmapCamera, path: Path, undistort: str) -> Pinhole:
-    if camera.model == "SIMPLE_PINHOLE":
-        focal, cx, cy = camera.parameters
-        return Pinhole(focal, focal, cx, cy, camera.width, camera.height)
-    if camera.model == "PINHOLE":
-        fx, fy, cx, cy = camera.parameters
-        return Pinhole(fx, fy, cx, cy, camera.width, camera.height)
-    found = f"{path}: camera model {camera.model}, expected PINHOLE or SIMPLE_PINHOLE"
-    if camera.model == "EQUIRECTANGULAR":  # COLMAP's undistorter refuses it
-        raise ValueError(f"{found}; a panorama cannot be undistorted: cut pinhole pictures out of it and reconstruct from those")
-    raise ValueError(f"{found}; undistort first: {undistort}")
+def _optics(camera: _ColmapCamera, path: Path) -> tuple[Pinhole, Lens | None]:
+    if camera.model == "EQUIRECTANGULAR":
+        raise ValueError(f"{path}: camera model {camera.model}, expected that of a lens; {NO_PANORAMA}.")
+    if camera.model not in PARAMETER_NAMES:
+        raise ValueError(f"{path}: camera model {shown(camera.model)}, expected one of {', '.join(PARAMETER_NAMES)}.")
+    lens = Lens(camera.model, camera.parameters, camera.width, camera.height)
+    return optics_of(lens, f"{path}: camera {camera.camera_id}")
 
 
 def _rotation_from_quat(quat_wxyz: Float[ndarray, "4"], where: str) -> Float[ndarray, "3 3"]:

@@ -9,14 +9,12 @@ from pathlib import Path
 
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph
 from drgs.reconstruct.capture.load_views.checks import find_image, find_masks, image_size
-from drgs.reconstruct.capture.load_views.colmap import undistort_command
 from drgs.reconstruct.capture.load_views.transforms_json import (
     frame_camera_from_world,
     frame_masks,
     frame_names,
-    frame_pinhole,
+    frame_optics,
     read_transforms,
-    refuse_distortion,
 )
 
 
@@ -37,8 +35,7 @@ def read_nerf_synthetic(folder: Path, split: str) -> Capture:
     photographs = []
     for frame, name, image, mask in zip(frames, frame_names(frames), images, masks, strict=True):
         where = f"{path}: frame {frame['file_path']}"
-        refuse_distortion(document, frame, where, undistort_command(folder / "images", folder / "sparse" / "0", folder))
         camera_from_world = frame_camera_from_world(frame, where)
-        pinhole = frame_pinhole(document, frame, where, partial(image_size, image))
-        photographs.append(Photograph(name, image, mask, False, camera_from_world, pinhole))
+        pinhole, lens = frame_optics(document, frame, where, partial(image_size, image))
+        photographs.append(Photograph(name, image, mask, False, camera_from_world, pinhole, lens))
     return Capture("nerf-synthetic", tuple(photographs), None, None)

@@ -14,14 +14,12 @@ from numpy import ndarray
 
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph
 from drgs.reconstruct.capture.load_views.checks import check_file_name, find_image, image_size, is_file
-from drgs.reconstruct.capture.load_views.colmap import undistort_command
 from drgs.reconstruct.capture.load_views.transforms_json import (
     frame_camera_from_world,
     frame_masks,
     frame_names,
-    frame_pinhole,
+    frame_optics,
     read_transforms,
-    refuse_distortion,
 )
 
 
@@ -30,16 +28,14 @@ def read_nerfstudio(folder: Path) -> Capture:
     path = folder / "transforms.json"
     document = read_transforms(path)
     frames = document["frames"]
-    undistort = undistort_command(folder / "images", folder / "colmap" / "sparse" / "0", folder)
     images = [find_image(folder, frame["file_path"], path) for frame in frames]
     masks = frame_masks(folder, images, folder / "images", frames, path)
     photographs = []
     for frame, name, image, mask in zip(frames, frame_names(frames), images, masks, strict=True):
         where = f"{path}: frame {frame['file_path']}"
-        refuse_distortion(document, frame, where, undistort)
         camera_from_world = frame_camera_from_world(frame, where)
-        pinhole = frame_pinhole(document, frame, where, partial(image_size, image))
-        photographs.append(Photograph(name, image, mask, False, camera_from_world, pinhole))
+        pinhole, lens = frame_optics(document, frame, where, partial(image_size, image))
+        photographs.append(Photograph(name, image, mask, False, camera_from_world, pinhole, lens))
     points_world, point_colors_srgb = _read_points(folder, document.get("ply_file_path"), path)
     return Capture("nerfstudio", tuple(photographs), points_world, point_colors_srgb)
 

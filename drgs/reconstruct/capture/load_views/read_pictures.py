@@ -1,4 +1,4 @@
-"""Decode the pictures and masks of a capture, optionally smaller.
+"""Decode the pictures and masks of a capture, undistorted and optionally smaller.
 
 Shrinking averages areas of linear, premultiplied light: colour of the background must not bleed into the object's edge.
 """
@@ -16,8 +16,9 @@ from PIL import Image
 from torch import Tensor
 
 from drgs.exchange.pictures import as_eight_bits
-from drgs.maths.color import linear_from_srgb, srgb_from_linear
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, camera_of, resize_pinhole
+from drgs.reconstruct.capture.load_views.linear_light import premultiplied, straight
+from drgs.reconstruct.capture.load_views.undistort import undistort
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
@@ -25,9 +26,6 @@ DECODE_THREADS = 2
 NERO_DEPTH_OF_ONE = 15.0
 """Depth [world units] of the value 65535 in NeRO's depth pictures."""
 NERO_BACKGROUND_DEPTH = 14.5
-_LINEAR_OF_BYTE = linear_from_srgb(torch.arange(256) / 255).numpy().astype(np.float32)
-_BYTE_STEPS = 8192
-_BYTE_OF_LINEAR = (srgb_from_linear(torch.linspace(0, 1, _BYTE_STEPS).double()) * 255).numpy()
 
 
 def read_pictures(capture: Capture, max_side: int | None) -> Views:
@@ -39,6 +37,8 @@ def read_pictures(capture: Capture, max_side: int | None) -> Views:
         scale = min(1.0, max_side / max(pinhole.width, pinhole.height)) if max_side else 1.0
         width, height = max(1, round(pinhole.width * scale)), max(1, round(pinhole.height * scale))
         color, alpha, has_mask = _decode(photograph)
+        if photograph.lens is not None:
+            color, alpha = undistort(color, alpha, photograph.lens, pinhole)
         if (height, width) != alpha.shape:
             color, alpha = shrink(color, alpha, width, height)
         camera = camera_of(photograph.camera_from_world, resize_pinhole(pinhole, width, height), photograph.name)
@@ -58,6 +58,7 @@ def read_pictures(capture: Capture, max_side: int | None) -> Views:
         # An alpha channel that is opaque everywhere says nothing.
         has_masks=all(has_masks) and any(bool((mask < 128).any()) for mask in coverage),
         source=capture.source,
+        lenses=tuple(photograph.lens for photograph in capture.photographs),
     )
 
 
@@ -116,7 +117,5 @@ def shrink(
         return np.asarray(Image.fromarray(channel).resize((width, height), Image.Resampling.BOX))
 
     alpha_small = average(alpha_share)
-    linear = np.stack([average(_LINEAR_OF_BYTE[color_srgb[..., channel]] * alpha_share) for channel in range(3)], -1)
-    linear /= np.maximum(alpha_small, 1e-6)[..., None]
-    steps = np.clip(linear * (_BYTE_STEPS - 1) + 0.5, 0, _BYTE_STEPS - 1).astype(np.int32)
-    return np.round(_BYTE_OF_LINEAR[steps]).astype(np.uint8), np.round(alpha_small * 255).astype(np.uint8)
+    light = np.stack([average(premultiplied(color_srgb[..., channel], alpha_share)) for channel in range(3)], -1)
+    return straight(light, alpha_small), np.round(alpha_small * 255).astype(np.uint8)

@@ -1,6 +1,7 @@
 """The camera file NeRF-synthetic and nerfstudio share: `frames`, each with a file_path and an OpenGL camera-to-world matrix.
 
-Intrinsics stand once for all frames or in each frame, as fl_x, fl_y, cx, cy, w, h or as camera_angle_x.
+Intrinsics stand once for all frames or in each frame, as fl_x, fl_y, cx, cy, w, h or as camera_angle_x; what bends straight lines as
+camera_model (or instant-ngp's is_fisheye) with k1, k2, k3, k4, p1, p2.
 Source: service reference, input conventions; the nerfstudio data conventions page.
 """
 
@@ -17,7 +18,7 @@ from numpy import ndarray
 from drgs.reconstruct.capture.load_views.capture import Pinhole, pinhole_from_angle
 from drgs.reconstruct.capture.load_views.checks import (
     IMAGE_SUFFIXES,
-    MOST_SHOWN,
+    NO_PANORAMA,
     check_angle,
     check_file_name,
     check_pinhole,
@@ -27,10 +28,19 @@ from drgs.reconstruct.capture.load_views.checks import (
     rigid_camera_from_world,
     shown,
 )
+from drgs.reconstruct.capture.load_views.undistort import optics_of
+from drgs.scene.lens import PARAMETER_NAMES, Lens
 
-DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
-PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
-"""nerfstudio's camera_model values that are a pinhole once the distortion is zero."""
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""In OpenCV's order, which is that of COLMAP's FULL_OPENCV."""
+LENS_MODELS = {
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "OPENCV"),
+    "FULL_OPENCV": "FULL_OPENCV",
+    **dict.fromkeys(("OPENCV_FISHEYE", "FISHEYE"), "OPENCV_FISHEYE"),
+}
+"""What camera_model says, and the lens that is meant."""
+USED_KEYS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "FULL_OPENCV": DISTORTION_KEYS, "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
+"""By lens. With OPENCV k4 is refused: nerfstudio takes it as the factor of r^8, OpenCV as one of the divisor, and no file says which."""
 MOST_SIDE = 65536
 """Of a picture [pixels]."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -106,17 +116,6 @@ def frame_masks(folder: Path, images: list[Path], images_root: Path, frames: lis
     return [next(others) if name is None else find_image(folder, name, path) for name in own]
 
 
-def refuse_distortion(document: dict[str, Any], frame: dict[str, Any], where: str, undistort: str) -> None:
-    """Only pinhole pictures are accepted; `undistort` is the command that makes them."""
-    model = frame.get("camera_model", document.get("camera_model", "PINHOLE"))
-    if model not in PINHOLE_MODELS:
-        raise ValueError(f"{where}: camera_model {str(model)[:MOST_SHOWN]} is not a pinhole; undistort first: {undistort}")
-    for key in DISTORTION_KEYS:
-        value = frame.get(key, document.get(key, 0.0))
-        if not isinstance(value, int | float) or not abs(value) < 1e-12:
-            raise ValueError(f"{where}: lens distortion {key} = {shown(value)}, expected 0; undistort first: {undistort}")
-
-
 def declared_size(document: dict[str, Any], frame: dict[str, Any], where: str) -> tuple[int, int] | None:
     """(w, h) as the file states it, or None."""
     width, height = frame.get("w", document.get("w")), frame.get("h", document.get("h"))
@@ -132,16 +131,25 @@ def declared_size(document: dict[str, Any], frame: dict[str, Any], where: str) -
     return whole("w", width), whole("h", height)
 
 
-def frame_pinhole(document: dict[str, Any], frame: dict[str, Any], where: str, picture_size: Callable[[], tuple[int, int]]) -> Pinhole:
-    """Intrinsics of a frame; the frame's own values win over the document's.
+def frame_optics(
+    document: dict[str, Any], frame: dict[str, Any], where: str, picture_size: Callable[[], tuple[int, int]]
+) -> tuple[Pinhole, Lens | None]:
+    """Intrinsics of a frame's picture once it is undistorted, and the lens where it has to be; the frame's values win over the document's.
 
     Args:
         picture_size: called when the file states no size.
     """
-    width, height = declared_size(document, frame, where) or picture_size()
+    values = document | frame
+    pinhole = _pinhole(values, where, declared_size(document, frame, where) or picture_size())
+    return optics_of(_lens(values, pinhole, where), where)
+
+
+def _pinhole(values: dict[str, Any], where: str, size: tuple[int, int]) -> Pinhole:
+    """What the file says of the focal lengths and the principal point."""
+    width, height = size
 
     def number(key: str) -> float | None:
-        value = frame.get(key, document.get(key))
+        value = values.get(key)
         return None if value is None else finite_number(value, f"{where}: {key}")
 
     focal_x, focal_y = number("fl_x"), number("fl_y")
@@ -155,11 +163,28 @@ def frame_pinhole(document: dict[str, Any], frame: dict[str, Any], where: str, p
             width,
             height,
         )
-    elif frame.get("camera_angle_x", document.get("camera_angle_x")) is not None:
-        angle_x = check_angle("camera_angle_x", frame.get("camera_angle_x", document.get("camera_angle_x")), where)
-        angle_y = frame.get("camera_angle_y", document.get("camera_angle_y"))
+    elif values.get("camera_angle_x") is not None:
+        angle_x, angle_y = check_angle("camera_angle_x", values["camera_angle_x"], where), values.get("camera_angle_y")
         pinhole = pinhole_from_angle(angle_x, None if angle_y is None else check_angle("camera_angle_y", angle_y, where), width, height)
     else:
         raise ValueError(f'{where}: no intrinsics, expected "camera_angle_x" or "fl_x".')
     check_pinhole(pinhole, where)
     return pinhole
+
+
+def _lens(values: dict[str, Any], pinhole: Pinhole, where: str) -> Lens:
+    """The lens that the file describes, with these intrinsics."""
+    named = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV")
+    if named == "EQUIRECTANGULAR":
+        raise ValueError(f"{where}: camera_model {named}, expected that of a lens; {NO_PANORAMA}.")
+    model = LENS_MODELS.get(named.upper()) if isinstance(named, str) else None
+    if model is None:
+        raise ValueError(f"{where}: camera_model {shown(named)}, expected one of {', '.join(LENS_MODELS)}.")
+    numbers = {key: finite_number(values.get(key, 0.0), f"{where}: lens distortion {key}") for key in DISTORTION_KEYS}
+    unused = next((key for key, number in numbers.items() if number and key not in USED_KEYS[model]), None)
+    if unused is not None:
+        raise ValueError(f"{where}: lens distortion {unused} = {numbers[unused]:g}, expected 0 with camera_model {named}.")
+    if model == "OPENCV" and numbers["k3"]:
+        model = "FULL_OPENCV"
+    coefficients = tuple(numbers[key] for key in PARAMETER_NAMES[model][4:])
+    return Lens(model, (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, *coefficients), pinhole.width, pinhole.height)
