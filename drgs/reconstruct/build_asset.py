@@ -4,6 +4,7 @@ Reads like the method: each step is a function of its own file, each stage with 
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -234,7 +235,7 @@ def build_stages(
     asset, thumbnail = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
-    provenance |= {"outline_agreement": round(agreement, 4)}
+    provenance |= {"outline_agreement": round(agreement, 4)} | calibrations(views)
     asset = replace(asset, provenance=provenance, cameras=views.cameras)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
     reporter.report("pack", 1.0, "; ".join(filter(None, ("done", complaint(agreement)))))
@@ -381,6 +382,12 @@ def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMes
         "mesh": asdict(mesh_report(mesh.vertices, mesh.faces)),
         "seconds": seconds,
     }
+
+
+def calibrations(views: Views) -> dict[str, Any]:
+    """The lenses of the photographs before they were undistorted, which cameras.json no longer tells; empty where there were none."""
+    counts = Counter(lens for lens in views.lenses if lens is not None)
+    return {"lenses": [asdict(lens) | {"pictures": count} for lens, count in counts.items()]} if counts else {}
 
 
 def kept_photographs(views: Views) -> bytes:

@@ -1,6 +1,7 @@
 """From a capture to an asset on a tiny preset: what is written, how it stops and resumes, and what is refused."""
 
 import io
+import json
 import shutil
 import zipfile
 from dataclasses import dataclass, fields, replace
@@ -14,7 +15,7 @@ from PIL import Image
 
 from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photograph
 from drgs.reconstruct import report_progress
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, kept_photographs
+from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, calibrations, kept_photographs
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.densify import DensifySettings
@@ -34,6 +35,7 @@ from drgs.reconstruct.report_progress import encode_preview
 from drgs.reconstruct.stages import stage_two_preview
 from drgs.render.records import SampleCounts
 from drgs.scene.asset import Asset, load_asset, load_photographs
+from drgs.scene.lens import Lens
 from drgs.scene.views import Views
 from tests.reconstruct.surfel_spheres import joined, surfel_sphere
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
@@ -161,6 +163,17 @@ def test_provenance_says_how_the_asset_came_about(build: Build, capture: Path):
         capture.name,
     )
     assert set(facts["seconds"]) >= {"read", "fit", "mesh", "materials"} and all(s >= 0 for s in facts["seconds"].values())
+
+
+def test_provenance_keeps_each_lens_once_with_the_number_of_its_pictures():
+    views = Views((), (), (), None, None, False, "colmap")
+    assert calibrations(views) == {}
+    fisheye, wide = Lens("SIMPLE_FISHEYE", (20.0, 32.0, 24.0), 64, 48), Lens("SIMPLE_RADIAL", (50.0, 32.0, 24.0, -0.1), 64, 48)
+    found = json.loads(json.dumps(calibrations(replace(views, lenses=(wide, None, fisheye, wide)))))
+    assert found["lenses"] == [
+        {"model": "SIMPLE_RADIAL", "parameters": [50.0, 32.0, 24.0, -0.1], "width": 64, "height": 48, "pictures": 2},
+        {"model": "SIMPLE_FISHEYE", "parameters": [20.0, 32.0, 24.0], "width": 64, "height": 48, "pictures": 1},
+    ]
 
 
 def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
