@@ -87,7 +87,7 @@ class Denoiser(StrEnum):
 
 EXPORT_HELP = "; ".join(f"{name}: {FILE_KINDS[name].title}" for name in EXPORT_FORMATS)
 AssetPath = Annotated[Path, typer.Argument(metavar="ASSET", help="Asset folder, or the same zipped.")]
-DatasetPath = Annotated[Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP or NeRO folder.")]
+DatasetPath = Annotated[Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP, Metashape or NeRO folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 DataFolder = Annotated[
     Path | None,

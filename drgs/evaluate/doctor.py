@@ -41,7 +41,7 @@ TILTED_UP = 30.0
 """[degrees]"""
 WHAT_IS_READ = (
     "Mend that first. A capture is a folder with transforms_train.json (NeRF-synthetic), transforms.json (nerfstudio), "
-    "sparse/ and images/ (COLMAP) or NeRO's cameras, and with all pictures that these name."
+    "sparse/ and images/ (COLMAP), Metashape's *.xml or NeRO's cameras, and with all pictures that these name."
 )
 
 

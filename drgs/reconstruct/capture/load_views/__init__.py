@@ -1,8 +1,9 @@
-"""Read posed photographs of an object, in the four layouts people have them in, into Views.
+"""Read posed photographs of an object, in the five layouts people have them in, into Views.
 
     NeRF-synthetic   transforms_train.json, RGBA pictures
     nerfstudio       transforms.json
     COLMAP           sparse/0 or sparse (bin or txt), images/
+    Metashape        *.xml of its cameras, images/ or pictures beside it
     NeRO             K.png, K-depth.png, K-camera.pkl
 
 Masks come from alpha, from `mask_path` or from a masks/ folder; black is background. Pictures through a lens that bends straight lines are
@@ -15,6 +16,7 @@ from typing import Literal
 from drgs.reconstruct.capture.load_views.capture import Capture, Pinhole, camera_of
 from drgs.reconstruct.capture.load_views.checks import check_photographs, image_size, is_file, is_folder
 from drgs.reconstruct.capture.load_views.colmap import find_model, read_colmap
+from drgs.reconstruct.capture.load_views.metashape import find_cameras_file, read_metashape
 from drgs.reconstruct.capture.load_views.nerf_synthetic import read_nerf_synthetic
 from drgs.reconstruct.capture.load_views.nerfstudio import read_nerfstudio
 from drgs.reconstruct.capture.load_views.nero import read_nero
@@ -61,10 +63,12 @@ def read_capture(folder: Path, split: Literal["train", "test"] = "train") -> Cap
         capture = read_nerfstudio(folder)
     elif find_model(folder) is not None:
         capture = read_colmap(folder)
+    elif find_cameras_file(folder) is not None:
+        capture = read_metashape(folder)
     else:
         raise ValueError(
             f"{folder}: not a capture, expected transforms_train.json (NeRF-synthetic), transforms.json (nerfstudio), "
-            "sparse/0/cameras.bin or .txt (COLMAP) or *-camera.pkl (NeRO)."
+            "sparse/0/cameras.bin or .txt (COLMAP), *.xml (Metashape) or *-camera.pkl (NeRO)."
         )
     check_photographs(capture.photographs, folder)
     return capture
