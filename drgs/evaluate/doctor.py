@@ -11,10 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from numpy import ndarray
 
-from drgs.maths.color import linear_from_srgb, luminance
+from drgs.reconstruct.capture.exposures import VARIED_STOPS, brightness_stops, jumps, spread
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points, project_points
 from drgs.reconstruct.capture.load_views import read_capture
 from drgs.reconstruct.capture.load_views.capture import Capture
@@ -33,8 +31,6 @@ WIDE_GAP = 50.0
 SMALL_COVERAGE, LARGE_COVERAGE = 0.03, 0.8
 CLIPPED_BYTE = 254
 MUCH_CLIPPED = 0.05
-VARIED_BRIGHTNESS = 0.35
-"""Standard deviation of the views' exposures [stops], measured on points that several views share."""
 POOR_AGREEMENT = 0.85
 """Intersection over union of a mask with what all masks together say."""
 TILTED_UP = 30.0
@@ -337,7 +333,7 @@ def _exposure(views: Views, points: InitialPoints) -> _Section:
     object_pixels = torch.cat([image[mask > 200] for image, mask in zip(views.images_srgb, views.coverage, strict=True)])
     clipped_share = float((object_pixels >= CLIPPED_BYTE).any(-1).sum()) / max(1, len(object_pixels))
     black_share = float((object_pixels <= 1).all(-1).sum()) / max(1, len(object_pixels))
-    stops = _exposure_of_views(views, points)
+    stops = brightness_stops(views, points)
     findings = []
     if clipped_share > MUCH_CLIPPED:
         findings.append(
@@ -351,35 +347,20 @@ def _exposure(views: Views, points: InitialPoints) -> _Section:
         findings.append(
             Finding("warning", f"{100 * black_share:.0f} % of the object's pixels are black.", "Use longer exposures or more light.")
         )
-    if float(stops.std()) > VARIED_BRIGHTNESS:
+    if jumps(stops, views) > VARIED_STOPS:
         findings.append(
             Finding(
                 "warning",
-                f"The same points differ in brightness by {stops.std():.2f} stops between views.",
+                f"The same points differ in brightness by {spread(stops):.2f} stops between views; a build takes that for their exposures.",
                 "Lock exposure and white balance, and keep the light still.",
             )
         )
     summary = {
         "clipped_share": round(clipped_share, 4),
         "black_share": round(black_share, 4),
-        "brightness_variation_stops": round(float(stops.std()), 4),
+        "brightness_variation_stops": round(spread(stops), 4),
     }
     return summary, findings
-
-
-def _exposure_of_views(views: Views, points: InitialPoints) -> Float[ndarray, "view"]:
-    """(view,) stops by which the points a view sees are brighter there than in the median view; highlights are outvoted."""
-    positions, usual = points.points_world.numpy(), luminance(linear_from_srgb(points.colors_srgb)).numpy()
-    stops = []
-    for camera, image, coverage in zip(views.cameras, views.images_srgb, views.coverage, strict=True):
-        column, row, seen, _ = project_points(camera, positions)
-        seen &= coverage.numpy()[row, column] > 200
-        if points.normals_world is not None:
-            seen &= ((camera.center_world - points.points_world) * points.normals_world).sum(1).numpy() > 0
-        if seen.any():
-            here = luminance(linear_from_srgb(image[torch.from_numpy(row[seen]), torch.from_numpy(column[seen])].float() / 255)).numpy()
-            stops.append(float(np.median(np.log2((here + 1e-3) / (usual[seen] + 1e-3)))))
-    return np.array(stops or [0.0])
 
 
 def _points(views: Views, points: InitialPoints) -> _Section:

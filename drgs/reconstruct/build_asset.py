@@ -3,6 +3,7 @@
 Reads like the method: each step is a function of its own file, each stage with what it keeps in `stages.py`; here they meet, with presets. Checkpoints live in OUT.build/ beside the asset; a build that was stopped or killed goes on from the last one.
 """
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
@@ -16,6 +17,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from drgs.exchange.photographs import encode_photographs
+from drgs.reconstruct.capture.exposures import with_gains_of_fit, with_gains_of_points
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.find_masks import with_drawn_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
@@ -30,7 +32,7 @@ from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings, SurfaceFit
-from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, gaussians_from_state
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, gaussians_from_state
 from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings, gaussians_from_materials
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, gaussians_from_mesh_fit
 from drgs.reconstruct.fit.view_targets import view_targets
@@ -205,6 +207,7 @@ def build_stages(
         views = load_views(dataset, max_side=preset.image_side)
         photographs = views
         points = initial_points(views, preset.points, settings.seed)
+        views = with_gains_of_points(views, points)
         identity = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
         place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, should_stop or (lambda: False))
         if not settings.resume:
@@ -222,6 +225,7 @@ def build_stages(
         fit = fit_stage(place, views, points, fit_settings, device)
         if not views.has_masks:
             views = with_drawn_masks(views, gaussians_from_state(fit), points.bounds_radius)
+        views = with_gains_of_fit(views, drawn_object(fit.parameters, points.bounds_radius, fit_settings.sh_degree))
     yield "fit", None
 
     with timed("mesh"):
@@ -235,7 +239,7 @@ def build_stages(
     asset, thumbnail = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
-    provenance |= {"outline_agreement": round(agreement, 4)} | calibrations(views)
+    provenance |= {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
     asset = replace(asset, provenance=provenance, cameras=views.cameras)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
     reporter.report("pack", 1.0, "; ".join(filter(None, ("done", complaint(agreement)))))
@@ -388,6 +392,11 @@ def calibrations(views: Views) -> dict[str, Any]:
     """The lenses of the photographs before they were undistorted, which cameras.json no longer tells; empty where there were none."""
     counts = Counter(lens for lens in views.lenses if lens is not None)
     return {"lenses": [asdict(lens) | {"pictures": count} for lens, count in counts.items()]} if counts else {}
+
+
+def _exposures(views: Views) -> dict[str, Any]:
+    """Of each photograph, by how many stops it was exposed more than the mean; nothing where all are alike."""
+    return {} if views.gains is None else {"exposure_stops": [round(math.log2(gain), 3) for gain in views.gains]}
 
 
 def kept_photographs(views: Views) -> bytes:

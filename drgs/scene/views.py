@@ -27,3 +27,5 @@ class Views:
     """Which reader recognised the folder: nerf-synthetic, nerfstudio, colmap, metashape, nero."""
     lenses: tuple[Lens | None, ...] = ()
     """As the photographs on disc were calibrated, one a view: None where it was a pinhole already. The images here are undistorted."""
+    gains: tuple[float, ...] | None = None
+    """Of each view, how much more of the light its exposure keeps than the mean one (mean of logarithms 0); None: all alike."""

@@ -12,12 +12,15 @@ SSIM_RADIUS = 5
 
 
 def display_image(
-    radiance_linear: Float[Tensor, "*pixels 3"], coverage: Float[Tensor, "*pixels"], photo_srgb: Float[Tensor, "*pixels 3"]
+    radiance_linear: Float[Tensor, "*pixels 3"],
+    coverage: Float[Tensor, "*pixels"],
+    photo_srgb: Float[Tensor, "*pixels 3"],
+    ceiling: float = 1.0,
 ) -> Float[Tensor, "*pixels 3"]:
-    """Radiance (..., 3) as the camera would have stored it, times coverage: sRGB, and no reward for passing 1 where the photo is saturated."""
+    """Radiance (..., 3) as the camera would have stored it, times coverage: sRGB, and no reward for passing `ceiling` where the photo is saturated."""
     srgb = srgb_from_linear(radiance_linear)
-    saturated = photo_srgb >= 254 / 255
-    return torch.where(saturated, srgb.clamp(max=1), srgb) * coverage[..., None]
+    saturated = photo_srgb >= 254 / 255 * ceiling
+    return torch.where(saturated, srgb.clamp(max=ceiling), srgb) * coverage[..., None]
 
 
 def _window_matrix(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drgs.maths.color import linear_from_srgb, srgb_from_linear
 from drgs.scene.camera import Camera, scaled_camera
 from drgs.scene.views import Views
 
@@ -21,11 +22,13 @@ class ViewTarget:
     photo: Float[Tensor, "height width 3"]
     """SRGB times mask."""
     saturation: Float[Tensor, "height width 3"]
-    """SRGB as stored."""
+    """SRGB as stored; of views with gains, as the mean exposure would have stored it, above 1 where that clips."""
     mask: Float[Tensor, "height width"]
     rows: slice
     columns: slice
     """Box around the mask: outside it only coverage is compared."""
+    ceiling: float = 1.0
+    """Value of `saturation` from which the camera's sensor clipped."""
 
     @property
     def box(self) -> tuple[slice, slice]:
@@ -34,10 +37,13 @@ class ViewTarget:
 
 
 def view_targets(views: Views, factor: float, device: torch.device) -> list[ViewTarget]:
-    """Photos at `factor` times their size, premultiplied by their masks."""
+    """Photos at `factor` times their size, of one exposure, premultiplied by their masks."""
     targets = []
-    for camera, image, mask in zip(views.cameras, views.images_srgb, views.coverage, strict=True):
-        photo, alpha = image.float() / 255, mask.float() / 255
+    gains = views.gains or (1.0,) * len(views.cameras)
+    for camera, image, mask, gain in zip(views.cameras, views.images_srgb, views.coverage, gains, strict=True):
+        photo, alpha, ceiling = image.float() / 255, mask.float() / 255, 1.0
+        if gain != 1:
+            photo, ceiling = srgb_from_linear(linear_from_srgb(photo) / gain), float(srgb_from_linear(torch.tensor(1 / gain)))
         small = scaled_camera(camera, factor)
         if factor != 1:
             stacked = torch.cat([photo * alpha[..., None], alpha[..., None], photo], -1).permute(2, 0, 1)[None]
@@ -49,7 +55,7 @@ def view_targets(views: Views, factor: float, device: torch.device) -> list[View
         margin = 8
         box = [slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else slice(0, 1) for x in (rows, columns)]
         premultiplied, photo, alpha = (x.contiguous().to(device) for x in (premultiplied, photo, alpha))
-        targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, *box))
+        targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, *box, ceiling))
     return targets
 
 

@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy import ndarray
-from PIL import Image
+from PIL import ExifTags, Image
 from torch import Tensor
 
 from drgs.exchange.pictures import as_eight_bits
+from drgs.reconstruct.capture.exposures import gains_of_files
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, camera_of, resize_pinhole
 from drgs.reconstruct.capture.load_views.linear_light import premultiplied, straight
 from drgs.reconstruct.capture.load_views.undistort import undistort
@@ -31,21 +32,21 @@ NERO_BACKGROUND_DEPTH = 14.5
 def read_pictures(capture: Capture, max_side: int | None) -> Views:
     """Views of a checked capture, the longer side of each at most `max_side` pixels."""
 
-    def read(photograph: Photograph) -> tuple[Camera, Tensor, Tensor, bool]:
-        """Camera, colour, coverage, and whether there is a mask."""
+    def read(photograph: Photograph) -> tuple[Camera, Tensor, Tensor, bool, float | None]:
+        """Camera, colour, coverage, whether there is a mask, and the exposure where the file tells."""
         pinhole = photograph.pinhole
         scale = min(1.0, max_side / max(pinhole.width, pinhole.height)) if max_side else 1.0
         width, height = max(1, round(pinhole.width * scale)), max(1, round(pinhole.height * scale))
-        color, alpha, has_mask = _decode(photograph)
+        color, alpha, has_mask, exposure = _decode(photograph)
         if photograph.lens is not None:
             color, alpha = undistort(color, alpha, photograph.lens, pinhole)
         if (height, width) != alpha.shape:
             color, alpha = shrink(color, alpha, width, height)
         camera = camera_of(photograph.camera_from_world, resize_pinhole(pinhole, width, height), photograph.name)
-        return camera, torch.from_numpy(color.copy()), torch.from_numpy(alpha.copy()), has_mask
+        return camera, torch.from_numpy(color.copy()), torch.from_numpy(alpha.copy()), has_mask, exposure
 
     with ThreadPoolExecutor(DECODE_THREADS) as pool:
-        cameras, images, coverage, has_masks = zip(*pool.map(read, capture.photographs), strict=True)
+        cameras, images, coverage, has_masks, exposures = zip(*pool.map(read, capture.photographs), strict=True)
     if any(has_masks) and not all(has_masks):
         lacking = [photograph.image for photograph, has_mask in zip(capture.photographs, has_masks, strict=True) if not has_mask]
         raise ValueError(f"{lacking[0]}: neither alpha nor a mask ({len(lacking)} of {len(cameras)} images), but the others have one.")
@@ -59,6 +60,7 @@ def read_pictures(capture: Capture, max_side: int | None) -> Views:
         has_masks=all(has_masks) and any(bool((mask < 128).any()) for mask in coverage),
         source=capture.source,
         lenses=tuple(photograph.lens for photograph in capture.photographs),
+        gains=gains_of_files(exposures),
     )
 
 
@@ -71,22 +73,35 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise ValueError(f"{path}: the image cannot be decoded ({error}).") from error
 
 
-def _decode(photograph: Photograph) -> tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "height width"], bool]:
-    """Colour (h, w, 3), alpha (h, w), and whether alpha came from the file or a mask rather than from nothing."""
+def _decode(photograph: Photograph) -> tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "height width"], bool, float | None]:
+    """Colour (h, w, 3), alpha (h, w), whether alpha came from the file or a mask rather than from nothing, and the exposure if it is told."""
     with _opened(photograph.image) as image:
+        exposure = _exposure(image)
         picture = as_eight_bits(image)
         has_alpha = "A" in picture.getbands() or "transparency" in picture.info
         pixels = np.asarray(picture.convert("RGBA" if has_alpha else "RGB"))
     color = pixels[..., :3]
     alpha = pixels[..., 3] if has_alpha else np.full(pixels.shape[:2], 255, np.uint8)
     if photograph.mask is None:
-        return color, alpha, has_alpha
+        return color, alpha, has_alpha, exposure
     mask = _mask_of_depth(photograph.mask) if photograph.mask_is_depth else _mask_channel(photograph.mask)
     if mask.shape != alpha.shape:
         raise ValueError(
             f"{photograph.mask}: the mask is {mask.shape[1]}x{mask.shape[0]}, but its image {photograph.image.name} is {alpha.shape[1]}x{alpha.shape[0]}."
         )
-    return color, np.minimum(alpha, mask), True
+    return color, np.minimum(alpha, mask), True, exposure
+
+
+def _exposure(image: Image.Image) -> float | None:
+    """Time [s] times sensitivity [ISO] over the f-number's square, by EXIF; None where one is missing or no positive number."""
+    told = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    values = [told.get(tag) for tag in (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)]
+    try:
+        seconds, sensitivity, f_number = (float(value) for value in values if value is not None)
+    except (TypeError, ValueError, ZeroDivisionError):  # too few of them, or no numbers
+        return None
+    exposure = seconds * sensitivity / f_number**2 if f_number else 0.0
+    return exposure if np.isfinite(exposure) and exposure > 0 else None
 
 
 def _mask_of_depth(path: Path) -> UInt8[ndarray, "height width"]:

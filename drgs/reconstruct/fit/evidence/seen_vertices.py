@@ -46,7 +46,7 @@ def seen_vertices(tracer: AbstractTracer, target: ViewTarget) -> SeenVertices:
     index = seen.nonzero().squeeze(1)
     column, row = place[index].long().unbind(1)
     colour = target.saturation[row, column]
-    index_ok = (target.mask[row, column] > SOLID) & (colour.amax(-1) < SATURATED)
+    index_ok = (target.mask[row, column] > SOLID) & (colour.amax(-1) < SATURATED * target.ceiling)
     index, place = index[index_ok], place[index][index_ok]
     origin = mesh.vertices[index] + 4 * tracer.lift * mesh.normals[index]
     open_ = ~trace_rays(origin, wo[index], tracer).hit

@@ -141,7 +141,7 @@ class _Steps:
         points, face_normal = self._points(target, self.solid[view], normals, materials)
         if len(points.pixel):
             photo = target.saturation.reshape(-1, 3)[points.pixel.long()]
-            first, second = (self._shown(points, face_normal, environment, photo, 2 * iteration + half) for half in (0, 1))
+            first, second = (self._shown(points, face_normal, environment, photo, target.ceiling, 2 * iteration + half) for half in (0, 1))
             terms["traced"] = crossed_halves(first, second, photo)
             mean = 0.5 * (first + second).detach()
             squared_error = float((mean.clamp(0, 1) - photo).square().mean())
@@ -179,7 +179,7 @@ class _Steps:
         )
         return points, self.surface.tracer.face_normals[face]
 
-    def _shown(self, points: ShadingPoints, face_normal: Tensor, environment: Tensor, photo: Tensor, draw: int) -> Tensor:
+    def _shown(self, points: ShadingPoints, face_normal: Tensor, environment: Tensor, photo: Tensor, ceiling: float, draw: int) -> Tensor:
         """(point, 3) colour in display space by one set of rays; gradients reach materials, normals and the light."""
         with torch.no_grad():
             table = build_environment_table(Environment(environment.detach()))
@@ -188,4 +188,4 @@ class _Steps:
             light = IncidentLight(tracer, self.state.parameters["open_share"], filter_environment(environment.detach()))
             transmittance, met = traced_light(light, points, face_normal, rays)
         radiance = integrate_samples(points, rays, transmittance, met, environment)
-        return display_image(radiance, torch.ones_like(points.roughness), photo)
+        return display_image(radiance, torch.ones_like(points.roughness), photo, ceiling)

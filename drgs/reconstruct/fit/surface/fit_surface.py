@@ -210,7 +210,7 @@ class _Steps:
             transmittance, met, at_corners(share, corners, weights),
         )  # fmt: skip
         photo = target.saturation.reshape(-1, 3)[pixels]
-        return pixels, display_image(radiance, torch.ones_like(roughness), photo)
+        return pixels, display_image(radiance, torch.ones_like(roughness), photo, target.ceiling)
 
 
 def prior_terms(

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drgs.reconstruct.capture.exposures import with_gains_of_fit
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.fit.densify import DensifySettings, ScreenGradientStats, densify, reset_opacity
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
@@ -155,14 +156,36 @@ class _Steps:
         half_size = iteration < int(self.settings.half_size_share * self.settings.iterations)
         factor = (0.5 if half_size else 1.0) * size_factor(self.views.cameras, self.settings.most_pixels)
         if factor != self.target_factor:
+            if iteration and not half_size:
+                self._look_at_exposures()
             self.targets = view_targets(self.views, factor, self.state.parameters["centers"].device)
             self.target_factor = factor
         return self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
+
+    def _look_at_exposures(self) -> None:
+        """Better gains for the second half, before radiance may depend on the view and explain exposures as well."""
+        if self.views.gains is not None:
+            degree = self._sh_degree(self._progress(self.state.iteration))
+            self.views = with_gains_of_fit(self.views, drawn_object(self.state.parameters, self.radius, degree))
 
     def _sh_degree(self, progress: float) -> int:
         if progress < self.settings.sh_start:
             return 0
         return min(self.settings.sh_degree, int((progress - self.settings.sh_start) * 10) + 1)
+
+
+def drawn_object(
+    parameters: dict[str, Tensor], radius: float, sh_degree: int
+) -> Callable[[Camera], tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]]:
+    """What a camera sees of the surfels: linear radiance where they cover all, and coverage."""
+    tables = filter_environment(environment_table(parameters)).detach()
+
+    @torch.no_grad()
+    def drawn(camera: Camera) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
+        maps = render_stage_one(parameters, tables, camera.to(tables.device), near_plane(radius), sh_degree)
+        return maps.radiance_linear, maps.coverage
+
+    return drawn
 
 
 def size_factor(cameras: tuple[Camera, ...], most_pixels: int) -> float:
@@ -180,7 +203,7 @@ def displayed(
 ) -> Float[Tensor, "height width 3"]:
     """(rows, columns, 3) sRGB within the target's box, on black or before the learned surroundings."""
     box = target.box
-    image = display_image(maps.radiance_linear[box], maps.coverage[box], target.saturation[box])
+    image = display_image(maps.radiance_linear[box], maps.coverage[box], target.saturation[box], target.ceiling)
     if background is not None:
         image = image + (1 - maps.coverage[box])[..., None] * background_image(background, target.camera)[box]
     return image

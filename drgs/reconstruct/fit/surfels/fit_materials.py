@@ -155,7 +155,10 @@ class _Steps:
         if len(pixels):
             points = points_at(maps, target.camera, pixels)
             shown = display_image(
-                self._radiance(points, environment, iteration), target.mask.flatten()[pixels], target.saturation.reshape(-1, 3)[pixels]
+                self._radiance(points, environment, iteration),
+                target.mask.flatten()[pixels],
+                target.saturation.reshape(-1, 3)[pixels],
+                target.ceiling,
             )
             photo = target.photo.reshape(-1, 3)[pixels]
             terms["traced"] = (shown - photo).abs().mean()
@@ -190,7 +193,7 @@ class _Steps:
         """Weighted loss terms that look at the whole view."""
         settings, box = self.settings, target.box
         photo = target.photo[box]
-        splat = display_image(maps.splat_radiance[box], maps.coverage[box], target.saturation[box])
+        splat = display_image(maps.splat_radiance[box], maps.coverage[box], target.saturation[box], target.ceiling)
         terms = {"splat": settings.weight_splat * (splat - photo).abs().mean()}
         if self.views.has_masks:
             terms["mask"] = settings.weight_mask * mask_loss(maps.coverage, target.mask)

@@ -3,10 +3,12 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from drgs import warp_torch
+from drgs.reconstruct.capture.exposures import with_gains, with_gains_of_fit
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
@@ -14,9 +16,10 @@ from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
-from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, fit_gaussians, gaussians_from_state, size_factor, start_fit
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, fit_gaussians, gaussians_from_state, size_factor, start_fit
 from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.scene.views import Views
+from tests.reconstruct.capture.test_exposures import exposed, some_stops
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, write_nerf_synthetic
 
 CPU = torch.device("cpu")
@@ -159,3 +162,17 @@ def test_large_photographs_are_reduced_to_so_many_pixels(views: Views, points: I
     for state, settings in zip(states, (halved, reduced), strict=True):
         run(views, state, points, settings)
     assert_same_parameters(*states)
+
+
+@pytest.mark.slow
+def test_exposures_that_are_known_roughly_are_known_well_after_the_fit(views: Views, points: InitialPoints) -> None:
+    stops = some_stops(len(views.cameras))
+    guess = stops + 0.3 * np.sin(3 * np.arange(len(stops)))
+    rough = with_gains(exposed(views, stops), guess)
+    settings = dataclasses.replace(SHORT, iterations=90, half_size_share=0.5)
+    state = start_fit(points, settings, CPU)
+    fit_gaussians(rough, state, settings, points.bounds_radius)
+    found = with_gains_of_fit(rough, drawn_object(state.parameters, points.bounds_radius, settings.sh_degree))
+    assert found.gains is not None
+    off = np.abs(np.log2(found.gains) - stops)
+    assert float(np.sqrt((off**2).mean())) < 0.5 * float(np.sqrt(((guess - guess.mean() - stops) ** 2).mean()))
