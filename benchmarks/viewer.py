@@ -7,6 +7,9 @@ first traced picture of that edit. local_fps: pictures a second that the browser
 sharp they may be. traced_fps: pictures a second from the server while the camera turns, 400x400. reconnect_s: from the server answering again to
 the page showing that it is there; picture_back_s: to its next picture, for which it first imports the renderer and loads the asset.
 bundle_gz_kb: all built files, gzipped. Medians of the repeats.
+
+What this machine allows at that time, to hold the rates against: bare_local_fps, of a page of the same size that draws nothing but a ball
+(bare_page.js), turned by the same hand; bare_traced_fps, of the same renderer by itself, in this process, without server and browser.
 """
 
 import argparse
@@ -23,9 +26,15 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from benchmarks.frame import moving
+from drgs.convert.import_mesh import import_mesh
+from drgs.scene.asset import load_asset
+from drgs_server.render.drgs_renderer import SAMPLES_PER_PASS
 from tests.web.browser import CHROMIUM_ARGUMENTS, ROOT, RunningServer, chromium_path, write_ball
 
 WAIT_MS = 60_000
+PICTURES_A_SECOND = 6
+"""About, of the renderer by itself: so many are made for each second that the camera turns."""
 FINDING_PACE = 0.7
 """Seconds in which a picture that turns finds the sharpness that the machine keeps up with."""
 
@@ -74,8 +83,8 @@ def main(arguments: list[str]) -> None:
 def measure(mesh: Path | None, repeats: int, turn_seconds: float) -> dict[str, float]:
     """Start a server and a browser, and take all figures; raises as `started` does."""
     with started(mesh) as viewer:
-        result = measure_edits_and_local(viewer, repeats, turn_seconds)
-        result |= measure_traced(viewer, turn_seconds)
+        result = measure_bare_local(viewer, turn_seconds) | measure_edits_and_local(viewer, repeats, turn_seconds)
+        result |= measure_bare_traced(viewer, turn_seconds) | measure_traced(viewer, turn_seconds)
     return result | {"bundle_gz_kb": round(bundle_bytes() / 1000, 1)}
 
 
@@ -195,6 +204,22 @@ def measure_edits_and_local(viewer: StartedViewer, repeats: int, turn_seconds: f
         "reconnect_s": round(reconnect, 2),
         "picture_back_s": round(picture_back, 2),
     }
+
+
+def measure_bare_local(viewer: StartedViewer, turn_seconds: float) -> dict[str, float]:
+    """What any page could do at the viewer's size."""
+    page = viewer.browser.new_page(viewport={"width": 800, "height": 600})
+    page.evaluate(Path(__file__).with_name("bare_page.js").read_text())
+    fps = _turn(page, "localFrames", turn_seconds)
+    page.close()
+    return {"bare_local_fps": round(fps, 1)}
+
+
+def measure_bare_traced(viewer: StartedViewer, turn_seconds: float) -> dict[str, float]:
+    """What the renderer could send if it did nothing else."""
+    asset = load_asset(viewer.mesh) if viewer.mesh.suffix == ".zip" else import_mesh(viewer.mesh)
+    frames = max(3, round(turn_seconds * PICTURES_A_SECOND))
+    return {"bare_traced_fps": round(moving(asset, 400, SAMPLES_PER_PASS, frames, None)["fps_moving"], 1)}
 
 
 def measure_traced(viewer: StartedViewer, turn_seconds: float) -> dict[str, float]:
