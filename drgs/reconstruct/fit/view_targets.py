@@ -53,9 +53,9 @@ def view_targets(views: Views, factor: float, device: torch.device) -> list[View
             premultiplied = photo * alpha[..., None]
         rows, columns = (alpha > 0).any(1).nonzero().flatten(), (alpha > 0).any(0).nonzero().flatten()
         margin = 8
-        box = [slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else slice(0, 1) for x in (rows, columns)]
+        down, across = (slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else slice(0, 1) for x in (rows, columns))
         premultiplied, photo, alpha = (x.contiguous().to(device) for x in (premultiplied, photo, alpha))
-        targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, *box, ceiling))
+        targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, down, across, ceiling))
     return targets
 
 
