@@ -1,4 +1,4 @@
-"""The command line: `drgs build · render · import · export · simulate · eval · doctor · serve · worker · bench`.
+"""The command line: `drgs pose · build · render · import · export · simulate · eval · doctor · serve · worker · bench`.
 
 Each command reads its arguments, calls one function of the library and prints. Heavy modules are imported inside the commands, so
 that `drgs --help` answers at once. Wrong input and full disks end with one sentence on stderr and exit code 1, a command that is called wrongly
@@ -79,6 +79,12 @@ class Primary(StrEnum):
     mesh = "mesh"
 
 
+class Matching(StrEnum):
+    auto = "auto"
+    exhaustive = "exhaustive"
+    sequential = "sequential"
+
+
 class Denoiser(StrEnum):
     none = "none"
     svgf = "svgf"
@@ -110,6 +116,37 @@ def about(
     version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")] = False,
 ) -> None:
     """Relightable, deformable, editable 2D Gaussians: photos in, an asset out."""
+
+
+@app.command()
+def pose(
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="Folder of pictures, with or without masks/.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Capture folder to write, for doctor and build.")],
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last finished step of a stopped search.")] = False,
+    matching: Annotated[
+        Matching, typer.Option(help="Which pairs: all, or near each other as in a video; auto: all of up to 200 pictures.")
+    ] = Matching.auto,
+    seed: Annotated[int, typer.Option()] = 0,
+    json_progress: Annotated[bool, typer.Option("--json-progress", help="Print one JSON line for each progress report on stdout.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Find the cameras of plain photographs, and write them as a capture."""
+    from drgs.cli_progress import StopOnInterrupt, build_progress
+    from drgs.reconstruct.pose.pose_photographs import PoseSettings, pose_photographs
+    from drgs.reconstruct.pose.posed_capture import summary_lines
+    from drgs.reconstruct.progress import BuildStopped
+
+    settings = PoseSettings(matching=matching.value, seed=seed, resume=resume)
+    with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
+        try:
+            found = pose_photographs(photos, out, settings, progress=report, should_stop=interrupt.is_set)
+        except BuildStopped:
+            print(f"drgs: stopped; go on with: drgs pose {photos} {out} --resume", file=sys.stderr)
+            raise typer.Exit(130) from None
+    if json_progress or as_json:
+        print(json.dumps(vars(found)), flush=True)
+    else:
+        print("\n".join(summary_lines(found)))
 
 
 @app.command()

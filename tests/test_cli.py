@@ -12,7 +12,7 @@ from drgs import __version__
 from drgs.cli import app
 from tests.patience import PATIENCE_SECONDS
 
-COMMANDS = ("build", "render", "import", "export", "simulate", "eval", "doctor", "serve", "worker", "bench")
+COMMANDS = ("pose", "build", "render", "import", "export", "simulate", "eval", "doctor", "serve", "worker", "bench")
 
 
 def drgs(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -114,6 +114,13 @@ def test_wrong_edits_are_one_sentence_that_names_the_field(tmp_path: Path):
     result = drgs_here("render", tmp_path, tmp_path / "out", "--cameras", tmp_path / "transforms.json", "--edits", edits)
     assert_one_sentence(result)
     assert "0..1" in result.stderr
+
+
+def test_pose_says_in_one_sentence_what_is_wrong_with_a_folder(tmp_path: Path):
+    (tmp_path / "photos").mkdir()
+    result = drgs_here("pose", tmp_path / "photos", tmp_path / "posed", "--json")
+    assert_one_sentence(result)
+    assert "0 pictures, expected at least 8" in result.stderr
 
 
 @pytest.mark.parametrize("arguments", [["nonsense"], ["build", "only_one"], ["export", "asset", "out.glb", "--format", "stl"]])

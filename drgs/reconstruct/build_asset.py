@@ -45,10 +45,9 @@ from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.outline_agreement import complaint, outline_agreement
-from drgs.reconstruct.progress import STAGE_SHARES, Progress
+from drgs.reconstruct.progress import STAGE_SHARES, BuildStopped, Progress
 from drgs.reconstruct.report_progress import BuildReporter
 from drgs.reconstruct.stages import (
-    BuildStopped,
     Workplace,
     bind_stage,
     capture_digest,

@@ -14,6 +14,10 @@ STAGE_SHARES = {
 """The stages of a build with each binding, in their order, and their shares of its time, for the progress bar."""
 
 
+class BuildStopped(Exception):
+    """should_stop() was true; what was finished is on disk, and a run that resumes goes on from there."""
+
+
 @dataclass(frozen=True)
 class Progress:
     """How far a build or another job is."""

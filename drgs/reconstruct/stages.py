@@ -33,6 +33,7 @@ from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.reconstruct.fit.surfels.render_stage_two import render_stage_two
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen, mesh_from_gaussians
+from drgs.reconstruct.progress import BuildStopped
 from drgs.reconstruct.report_progress import BuildReporter, encode_preview
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.visible.rasterize.near_plane import near_plane
@@ -54,10 +55,6 @@ SURFEL_MATERIALS, MATERIALS_OF_BOUND = "stage2_surfels.safetensors", "stage2_mes
 CHECKPOINTS = (HOLLOWS, FIT, MESH, SURFACE, MATERIALS, SURFELS_ON_MESH, SURFEL_MATERIALS, MATERIALS_OF_BOUND)
 PREVIEW_SIDE = 256
 """[pixels]"""
-
-
-class BuildStopped(Exception):
-    """should_stop() was true; the checkpoint is on disk."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,153 @@
+"""Decode the photographs once: turn them as EXIF says, write what COLMAP is to see, and measure how sharp each is.
+
+In: the list of photographs. Out: upright pictures and masks in the work folder, and a record of each. Alpha becomes a mask. A picture that cannot be
+decoded, or is there twice, is left out with a reason; whether enough are left is for others to say.
+"""
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+from PIL import Image, ImageOps
+
+from drgs.exchange.pictures import as_eight_bits
+from drgs.reconstruct.capture.load_views.checks import image_size
+from drgs.reconstruct.pose.list_photos import HEIC_SUFFIXES, Photo
+from drgs.reconstruct.progress import BuildStopped
+
+DECODE_THREADS = 2
+DIAGONAL_OF_35MM = 43.2666
+"""Of the frame that equivalent focal lengths refer to [mm]."""
+EXAMINED_SIDE = 1000
+"""Sharpness is measured at this size [pixels]."""
+JPEG_QUALITY = 98
+OPAQUE = 128
+"""Of a mask: from this shade on a pixel is the object's."""
+EXIF_ORIENTATION, EXIF_FOLDER, EXIF_FOCAL_35MM = 0x0112, 0x8769, 0xA405
+
+
+@dataclass(frozen=True)
+class PreparedPhoto:
+    """An upright picture in the work folder."""
+
+    name: str
+    file: str
+    """Below images/ of the work folder; its mask, where there is one, is masks/FILE.png."""
+    has_mask: bool
+    width: int
+    height: int
+    focal_pixels: float | None
+    """By EXIF."""
+    sharpness: float
+    """Variance of the Laplacian on the object, of 8-bit luma at EXAMINED_SIDE."""
+    digest: str
+    """Of the picture's file and its mask's."""
+
+
+def prepare_photos(
+    photos: list[Photo], work: Path, advance: Callable[[int], None], should_stop: Callable[[], bool]
+) -> tuple[list[PreparedPhoto], dict[str, str]]:
+    """Upright pictures below `work`, and the reason for each photograph, by name, that is left out.
+
+    Raises:
+        BuildStopped: as asked.
+    """
+    for part in ("images", "masks"):
+        shutil.rmtree(work / part, ignore_errors=True)
+        (work / part).mkdir(parents=True)
+    prepared: list[PreparedPhoto] = []
+    left_out: dict[str, str] = {}
+    first_of: dict[str, str] = {}
+    with ThreadPoolExecutor(DECODE_THREADS) as pool:
+        try:
+            for done, (photo, result) in enumerate(zip(photos, pool.map(lambda photo: _prepare(photo, work), photos), strict=True), 1):
+                if should_stop():
+                    raise BuildStopped
+                if isinstance(result, str):
+                    left_out[photo.name] = result
+                elif result.digest in first_of:
+                    left_out[photo.name] = f"the same file as {first_of[result.digest]}"
+                else:
+                    first_of[result.digest] = photo.name
+                    prepared.append(result)
+                advance(done)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return prepared, left_out
+
+
+def _prepare(photo: Photo, work: Path) -> PreparedPhoto | str:
+    """The record, or why there is none."""
+    try:
+        if photo.path.suffix.lower() in HEIC_SUFFIXES:
+            import pillow_heif
+
+            pillow_heif.register_heif_opener()
+        else:
+            image_size(photo.path)  # which refuses what is too large, too
+        with Image.open(photo.path) as image:
+            image.load()
+            exif = image.getexif()
+            focal_35mm = exif.get_ifd(EXIF_FOLDER).get(EXIF_FOCAL_35MM)
+            usable_as_it_is = image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and exif.get(EXIF_ORIENTATION, 1) == 1
+            usable_as_it_is &= "transparency" not in image.info
+            is_photographic = image.format != "PNG"
+            upright = as_eight_bits(ImageOps.exif_transpose(image))
+        alpha = np.asarray(upright.convert("RGBA"))[..., 3] if "A" in upright.getbands() or "transparency" in upright.info else None
+        mask = _mask(photo, alpha, upright.size)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        return " ".join(str(error).split()).rstrip(".")
+    file = f"{photo.name}{'.jpg' if is_photographic and alpha is None else '.png'}"
+    if usable_as_it_is:
+        _link(photo.path, work / "images" / file)
+    else:
+        upright.convert("RGB").save(work / "images" / file, quality=JPEG_QUALITY, subsampling=0)
+    if mask is not None:
+        Image.fromarray(mask).save(work / "masks" / f"{file}.png")
+    digest = hashlib.sha256(photo.path.read_bytes() + (b"" if photo.mask is None else photo.mask.read_bytes())).hexdigest()
+    focal = float(focal_35mm) / DIAGONAL_OF_35MM * float(np.hypot(*upright.size)) if focal_35mm else None
+    return PreparedPhoto(photo.name, file, mask is not None, *upright.size, focal, _sharpness(upright, mask), digest)
+
+
+def _mask(photo: Photo, alpha: UInt8[ndarray, "height width"] | None, size: tuple[int, int]) -> UInt8[ndarray, "height width"] | None:
+    """0..255 from the file's alpha and its mask; None where neither says anything."""
+    if alpha is not None and (alpha >= OPAQUE).all():
+        alpha = None
+    if photo.mask is None:
+        return alpha
+    with Image.open(photo.mask) as image:
+        picture = as_eight_bits(image)
+        rgba = np.asarray(picture.convert("RGBA"))
+        mask = rgba[..., 3] if (rgba[..., 3] < 255).any() else np.asarray(picture.convert("L"))
+    width, height = size
+    if mask.shape != (height, width):
+        raise ValueError(f"its mask {photo.mask.name} is {mask.shape[1]}x{mask.shape[0]}, the upright picture {width}x{height} pixels")
+    return mask if alpha is None else np.minimum(mask, alpha)
+
+
+def _sharpness(picture: Image.Image, mask: UInt8[ndarray, "height width"] | None) -> float:
+    """Variance of the Laplacian [squared shades] where the mask, if any, says object."""
+    scale = min(1.0, EXAMINED_SIDE / max(picture.size))
+    size = (max(3, round(picture.width * scale)), max(3, round(picture.height * scale)))
+    luma = np.asarray(picture.convert("L").resize(size, Image.Resampling.BOX), dtype=np.float32)
+    laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4 * luma[1:-1, 1:-1]
+    if mask is not None:
+        inside = np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX))[1:-1, 1:-1] == 255
+        laplacian = laplacian[inside]
+    return float(laplacian.var()) if laplacian.size else 0.0
+
+
+def _link(source: Path, target: Path) -> None:
+    """The same file under another name, copied where the file system cannot."""
+    try:
+        os.link(source.resolve(), target)
+    except OSError:
+        shutil.copyfile(source, target)
