@@ -34,7 +34,12 @@ def colmap_process(job: Path, told: Callable[[str, int, int], None], should_stop
     log = job.parent / "colmap.log"
     with log.open("w") as output:
         process = subprocess.Popen(
-            [sys.executable, "-P", str(PROGRAM), str(job)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=output, text=True
+            [sys.executable, "-P", str(PROGRAM), str(job)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=output,
+            text=True,
+            start_new_session=True,  # Ctrl-C is for us, who end it in order
         )
     assert process.stdout is not None
     lines: queue.Queue[str | None] = queue.Queue()

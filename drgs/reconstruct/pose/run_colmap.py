@@ -31,7 +31,7 @@ SMALL_SIDE = 1000
 
 def main() -> None:
     threading.Thread(target=_end_with_stdin, daemon=True).start()
-    pycolmap.logging.minloglevel = pycolmap.logging.WARNING
+    pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     work = Path(sys.argv[1]).parent
     for step, run in (("features", _extract), ("matches", _match), ("poses", _map), ("undistort", _undistort)):
@@ -179,13 +179,13 @@ def _undistort(job: dict[str, Any], work: Path) -> None:
         told = model["cameras"][str(picture["camera"])]
         camera = pycolmap.Camera.create_from_model_name(1, told["model"], 1.0, told["width"], told["height"])
         camera.params = told["parameters"]
-        undistorted, pinhole = pycolmap.undistort_image(options, pycolmap.Bitmap.read(work / "images" / file, True), camera)
+        undistorted, pinhole = pycolmap.undistort_image(options, _bitmap(work / "images" / file, True), camera)
         undistorted.set_jpeg_quality(job["jpeg_quality"])
         undistorted.write(result / "images" / file)
         pinholes[str(picture["camera"])] = _camera(pinhole)
         mask = work / "masks" / f"{file}.png"
         if mask.exists():
-            straight, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.read(mask, False), camera)
+            straight, _ = pycolmap.undistort_image(options, _bitmap(mask, False), camera)
             straight.write(result / "masks" / f"{Path(file).stem}.png")
         _tell("undistort", done, len(model["pictures"]))
     _write(work / "pinholes.json", pinholes)
@@ -214,6 +214,13 @@ class _Polled:
             except sqlite3.Error:  # being written to: the next look will do
                 continue
             _tell(self._step, min(rows, self._total), self._total)
+
+
+def _bitmap(path: Path, as_rgb: bool) -> pycolmap.Bitmap:
+    bitmap = pycolmap.Bitmap.read(path, as_rgb)
+    if bitmap is None:
+        raise ValueError(f"{path}: COLMAP cannot read it")
+    return bitmap
 
 
 def _camera(camera: Any) -> dict[str, Any]:
