@@ -16,7 +16,14 @@ from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
-from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, fit_gaussians, gaussians_from_state, size_factor, start_fit
+from drgs.reconstruct.fit.surfels.fit_gaussians import (
+    FitSettings,
+    drawn_object,
+    fit_gaussians,
+    gaussians_from_state,
+    size_factor,
+    start_fit,
+)
 from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.scene.views import Views
 from tests.reconstruct.capture.test_exposures import exposed, some_stops
