@@ -93,7 +93,9 @@ class Denoiser(StrEnum):
 
 EXPORT_HELP = "; ".join(f"{name}: {FILE_KINDS[name].title}" for name in EXPORT_FORMATS)
 AssetPath = Annotated[Path, typer.Argument(metavar="ASSET", help="Asset folder, or the same zipped.")]
-DatasetPath = Annotated[Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP, Metashape or NeRO folder.")]
+DatasetPath = Annotated[
+    Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP, Metashape or NeRO folder; pictures or a film.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 DataFolder = Annotated[
     Path | None,
@@ -120,26 +122,30 @@ def about(
 
 @app.command()
 def pose(
-    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="Folder of pictures, with or without masks/.")],
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="Folder of pictures, with or without masks/, or a film.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Capture folder to write, for doctor and build.")],
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last finished step of a stopped search.")] = False,
     matching: Annotated[
         Matching, typer.Option(help="Which pairs: all, or near each other as in a video; auto: all of up to 200 pictures.")
     ] = Matching.auto,
+    frames: Annotated[
+        int | None, typer.Option(min=8, max=1000, help="Of a film: slots of time, of each the sharpest frame.", show_default="120")
+    ] = None,
     seed: Annotated[int, typer.Option()] = 0,
     json_progress: Annotated[bool, typer.Option("--json-progress", help="Print one JSON line for each progress report on stdout.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Find the cameras of plain photographs, and write them as a capture."""
+    """Find the cameras of plain photographs or of a film, and write them as a capture."""
     from drgs.cli_progress import StopOnInterrupt, build_progress
-    from drgs.reconstruct.pose.pose_photographs import PoseSettings, pose_photographs
+    from drgs.reconstruct.pose.pose_photographs import PoseSettings
     from drgs.reconstruct.pose.posed_capture import summary_lines
+    from drgs.reconstruct.pose.posed_dataset import pose_source
     from drgs.reconstruct.progress import BuildStopped
 
     settings = PoseSettings(matching=matching.value, seed=seed, resume=resume)
     with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
         try:
-            found = pose_photographs(photos, out, settings, progress=report, should_stop=interrupt.is_set)
+            found = pose_source(photos, out, settings, frames, progress=report, should_stop=interrupt.is_set).capture
         except BuildStopped:
             print(f"drgs: stopped; go on with: drgs pose {photos} {out} --resume", file=sys.stderr)
             raise typer.Exit(130) from None
@@ -162,7 +168,7 @@ def build(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint that a stopped build left.")] = False,
     json_progress: Annotated[bool, typer.Option("--json-progress", help="Print one JSON line for each progress report on stdout.")] = False,
 ) -> None:
-    """Build an asset from posed photographs."""
+    """Build an asset from photographs; those without cameras, or a film, are posed first."""
     from drgs.cli_progress import StopOnInterrupt, build_progress
     from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
     from drgs.reconstruct.outline_agreement import complaint

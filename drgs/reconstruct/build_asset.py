@@ -45,6 +45,8 @@ from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.outline_agreement import complaint, outline_agreement
+from drgs.reconstruct.pose.pose_photographs import PoseSettings
+from drgs.reconstruct.pose.posed_dataset import needs_poses, pose_source, provenance_of
 from drgs.reconstruct.progress import STAGE_SHARES, BuildStopped, Progress
 from drgs.reconstruct.report_progress import BuildReporter
 from drgs.reconstruct.stages import (
@@ -116,6 +118,10 @@ class Preset:
 
 
 BINDINGS = tuple(STAGE_SHARES)
+POSING_SHARE = 0.7
+"""Of the stage `read`, where pictures are posed in it."""
+POSED = "posed"
+"""Folder beside the checkpoints: the capture that was made of pictures without cameras."""
 PRESETS = {
     "draft": Preset(
         8_000,
@@ -166,7 +172,8 @@ def build_asset(
     """Build an asset folder from a capture.
 
     Args:
-        dataset: a capture folder (see load_views). out: the asset folder to write; OUT.build/ beside it holds checkpoints.
+        dataset: a capture folder (see load_views), a folder of pictures without cameras, or a film: those are posed first (drgs/reconstruct/pose).
+        out: the asset folder to write; OUT.build/ beside it holds checkpoints.
         should_stop: asked between steps; when true the checkpoint is written and BuildStopped raised.
 
     Raises:
@@ -203,7 +210,8 @@ def build_stages(
 
     with timed("read"):
         reporter.report("read", 0.0, "reading the capture")
-        views = load_views(dataset, max_side=preset.image_side)
+        capture, poses = _posed(dataset, out, settings, reporter, should_stop)
+        views = load_views(capture, max_side=preset.image_side)
         photographs = views
         points = initial_points(views, preset.points, settings.seed)
         views = with_gains_of_points(views, points)
@@ -238,11 +246,29 @@ def build_stages(
     asset, thumbnail = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
-    provenance |= {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
+    provenance |= poses | {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
     asset = replace(asset, provenance=provenance, cameras=views.cameras)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
     reporter.report("pack", 1.0, "; ".join(filter(None, ("done", complaint(agreement)))))
     yield "pack", asset
+
+
+def _posed(
+    dataset: Path, out: Path, settings: BuildSettings, reporter: BuildReporter, should_stop: Callable[[], bool] | None
+) -> tuple[Path, dict[str, Any]]:
+    """The capture with cameras, and what the asset tells of how they were found; the very dataset where it has them."""
+    if not needs_poses(dataset):
+        return dataset, {}
+    place = Path(f"{out}.build") / POSED
+    place.parent.mkdir(parents=True, exist_ok=True)
+    pose_settings = PoseSettings(seed=settings.seed, resume=settings.resume)
+
+    def report(at: Progress) -> None:
+        reporter.report("read", POSING_SHARE * at.fraction, at.message)
+
+    found = pose_source(dataset, place, pose_settings, progress=report, should_stop=should_stop)
+    reporter.begun["read"] = POSING_SHARE
+    return place, {"poses": provenance_of(found)}
 
 
 @dataclass(frozen=True, eq=False)

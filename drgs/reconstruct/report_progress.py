@@ -26,6 +26,8 @@ class BuildReporter:
         self.progress = progress
         self.shares = shares
         self.started = time.monotonic()
+        self.begun: dict[str, float] = {}
+        """Share of a stage that was over before what reports on it now began."""
         self.last_preview = self.last_checkpoint = self.last_report = self.started
 
     def report(
@@ -38,6 +40,8 @@ class BuildReporter:
         checkpoint: Callable[[], None] | None = None,
     ) -> None:
         now = time.monotonic()
+        begun = self.begun.get(stage, 0.0)
+        share = begun + (1 - begun) * share
         if checkpoint is not None and now - self.last_checkpoint > CHECKPOINT_SECONDS:
             checkpoint()
             self.last_checkpoint = now

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from drgs.reconstruct.capture.load_views.checks import IMAGE_SUFFIXES, find_masks, is_folder
 from drgs.reconstruct.capture.load_views.colmap import find_model
+from drgs.reconstruct.capture.load_views.metashape import find_cameras_file
 
 FEWEST_PHOTOS = 8
 """With fewer, hardly anything is seen from enough sides, whatever their poses."""
@@ -59,10 +60,18 @@ def list_photos(folder: Path) -> list[Photo]:
     return [Photo(name, path, mask) for name, path, mask in zip(names, images, masks, strict=True)]
 
 
+def any_photo(folder: Path) -> bool:
+    """Whether pictures are there at all."""
+    suffixes = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
+    return any(path.suffix.lower() in suffixes and not _is_aside(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
 def _refuse_posed(folder: Path) -> None:
     """A folder that has cameras already is a capture, and so is the one around its images/."""
     for place in (folder, folder.resolve().parent) if folder.name == "images" else (folder,):
-        found = next((path for pattern in CAMERA_FILES for path in place.glob(pattern)), None) or find_model(place)
+        found = (
+            next((path for pattern in CAMERA_FILES for path in place.glob(pattern)), None) or find_model(place) or find_cameras_file(place)
+        )
         if found is not None:
             raise ValueError(
                 f"{found}: the pictures are part of a posed capture; build from {place} as it is, or copy the pictures alone to another folder."

@@ -40,7 +40,7 @@ from drgs.reconstruct.pose.posed_capture import (
     read_posed_capture,
     write_posed_capture,
 )
-from drgs.reconstruct.pose.prepare_photos import JPEG_QUALITY, PreparedPhoto, prepare_photos
+from drgs.reconstruct.pose.prepare_photos import JPEG_QUALITY, PreparedPhoto, prepare_photos, with_backdrop_masks
 from drgs.reconstruct.pose.upright_world import upright_world
 from drgs.reconstruct.progress import Progress
 
@@ -113,6 +113,10 @@ def pose_photographs(
     work.mkdir(parents=True, exist_ok=True)
     prepared, left_out = prepare_photos(listed, work, lambda done: report("read", done, len(listed)), should_stop)
     check_readable(photos, prepared, left_out)
+    masks_from = "files" if prepared[0].has_mask else "none"
+    if masks_from == "none":
+        prepared, others = with_backdrop_masks(prepared, work, should_stop)
+        masks_from, left_out = "backdrop" if prepared[0].has_mask else "none", left_out | others
     job = _job(prepared, settings)
     if settings.resume and (finished := read_posed_capture(out)) is not None and finished.identity == job["identity"]:
         shutil.rmtree(work)
@@ -122,7 +126,7 @@ def pose_photographs(
 
     found = _found_poses(photos, work, prepared, settings, report, should_stop)
     seconds |= {step: _document(work / f"{step}.done")["seconds"] for step in STEPS}
-    capture = _write(photos, out, listed, prepared, left_out, found, job, seconds)
+    capture = _write(photos, out, listed, prepared, left_out, found, job | {"masks_from": masks_from}, seconds)
     shutil.rmtree(work)
     report("undistort", 1, 1)
     return capture
@@ -205,6 +209,7 @@ def _write(
         left_out=dict(sorted((left_out | found.reasons).items())),
         blurred=tuple(found.blurred),
         masked=masked,
+        masks_from=job["masks_from"],
         reprojection_error=float(found.model["mean_reprojection_error"]),
         points=len(positions),
         up_from=similarity.up_from,

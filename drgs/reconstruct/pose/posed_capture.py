@@ -44,6 +44,8 @@ class PosedCapture:
     blurred: tuple[str, ...]
     """Names of pictures much less sharp than the others, placed or not."""
     masked: bool
+    masks_from: str
+    """files (alpha or masks/), backdrop (a plain one, backdrop_masks.py) or none."""
     reprojection_error: float
     """Mean [pixels of the original pictures]."""
     points: int
@@ -106,6 +108,7 @@ def summary_lines(found: PosedCapture) -> list[str]:
     lines = [
         f"{len(found.placed)} of {found.given} pictures placed, {found.reprojection_error:.2f} pixels off, {found.points} points, "
         f"{sum(found.seconds.values()):.0f} seconds",
+        *(["masked by their plain backdrop: look at masks/"] if found.masks_from == "backdrop" else []),
         *(f"left out {name}: {reason}" for name, reason in found.left_out.items()),
     ]
     if soft := [name for name in found.blurred if name in found.placed]:

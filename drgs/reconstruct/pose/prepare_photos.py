@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from PIL import Image, ImageOps
 
 from drgs.exchange.pictures import as_eight_bits
 from drgs.reconstruct.capture.load_views.checks import image_size
+from drgs.reconstruct.pose.backdrop_masks import backdrop_mask
 from drgs.reconstruct.pose.list_photos import HEIC_SUFFIXES, Photo
 from drgs.reconstruct.progress import BuildStopped
 
@@ -28,6 +29,10 @@ DIAGONAL_OF_35MM = 43.2666
 EXAMINED_SIDE = 1000
 """Sharpness is measured at this size [pixels]."""
 JPEG_QUALITY = 98
+BACKDROP_SIDE = 1000
+"""Backdrops are looked for at this size [pixels]."""
+BACKDROP_SHARE = 0.9
+"""Of pictures without masks that must have a plain backdrop, for it to be taken for one."""
 OPAQUE = 128
 """Of a mask: from this shade on a pixel is the object's."""
 EXIF_ORIENTATION, EXIF_FOLDER, EXIF_FOCAL_35MM = 0x0112, 0x8769, 0xA405
@@ -82,6 +87,40 @@ def prepare_photos(
             pool.shutdown(cancel_futures=True)
             raise
     return prepared, left_out
+
+
+def with_backdrop_masks(
+    prepared: list[PreparedPhoto], work: Path, should_stop: Callable[[], bool]
+) -> tuple[list[PreparedPhoto], dict[str, str]]:
+    """The pictures with masks where nearly all of them have a plain backdrop, and the reason for each, by name, that has none; else the same.
+
+    Raises:
+        BuildStopped: as asked.
+    """
+    masked, others = [], {}
+
+    def mask_of(photo: PreparedPhoto) -> UInt8[ndarray, "height width"] | None:
+        if should_stop():
+            raise BuildStopped
+        with Image.open(work / "images" / photo.file) as image:
+            scale = min(1.0, BACKDROP_SIDE / max(image.size))
+            small = image.convert("RGB").resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.BOX)
+        mask = backdrop_mask(np.asarray(small))
+        if mask is None:
+            return None
+        return np.asarray(Image.fromarray(mask).resize((photo.width, photo.height), Image.Resampling.BILINEAR))
+
+    with ThreadPoolExecutor(DECODE_THREADS) as pool:
+        for photo, mask in zip(prepared, pool.map(mask_of, prepared), strict=True):
+            if mask is None:
+                others[photo.name] = "its backdrop is not plain, as that of the others is"
+                if len(others) > (1 - BACKDROP_SHARE) * len(prepared):
+                    pool.shutdown(cancel_futures=True)
+                    return prepared, {}
+            else:
+                Image.fromarray(mask).save(work / "masks" / f"{photo.file}.png")
+                masked.append(replace(photo, has_mask=True))
+    return masked, others
 
 
 def _prepare(photo: Photo, work: Path) -> PreparedPhoto | str:

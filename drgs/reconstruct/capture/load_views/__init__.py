@@ -30,7 +30,7 @@ from drgs.reconstruct.capture.load_views.transforms_json import (
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
-__all__ = ["load_cameras", "load_views", "read_capture"]
+__all__ = ["has_cameras", "load_cameras", "load_views", "read_capture"]
 
 FALLBACK_SIZE = (400, 400)
 """Picture size when a camera file neither states one nor comes with its images."""
@@ -72,6 +72,12 @@ def read_capture(folder: Path, split: Literal["train", "test"] = "train") -> Cap
         )
     check_photographs(capture.photographs, folder)
     return capture
+
+
+def has_cameras(folder: Path) -> bool:
+    """Whether one of the layouts is there: read_capture then reads it, or says what is wrong with it."""
+    found = next((path for pattern in ("transforms_train.json", "transforms.json", "*-camera.pkl") for path in folder.glob(pattern)), None)
+    return found is not None or find_model(folder) is not None or find_cameras_file(folder) is not None
 
 
 def load_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera]:
