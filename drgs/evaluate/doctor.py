@@ -19,8 +19,7 @@ from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.load_views.checks import IMAGE_SUFFIXES, image_size, pictures_in
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.pose.list_photos import HEIC_SUFFIXES, list_photos
-from drgs.reconstruct.pose.posed_dataset import needs_poses
-from drgs.reconstruct.pose.video_frames import is_video
+from drgs.reconstruct.pose.posed_dataset import film_of, needs_poses
 from drgs.scene.views import Views
 
 EXAMINED_SIDE = 400
@@ -99,7 +98,7 @@ def _refusal(folder: Path, error: ValueError | OSError, advice: str) -> dict[str
 
 def _of_photographs(folder: Path) -> dict[str, Any]:
     """Of pictures without cameras, or of a film: what can be said before poses are looked for."""
-    if is_video(folder):
+    if film_of(folder) is not None:
         summary = "A film; a build first takes its sharpest frames and finds where they were taken from."
         return {"ok": True, "folder": str(folder), "source": "film", "summary": summary, "findings": [], "advice": []}
     try:

@@ -42,8 +42,18 @@ def provenance_of(source: PosedSource) -> dict[str, Any]:
 
 
 def needs_poses(source: Path) -> bool:
-    """Whether it is a film, or a folder of pictures without cameras."""
-    return is_video(source) or (is_folder(source) and not has_cameras(source) and any_photo(source))
+    """Whether it is a film, or a folder of pictures without cameras or of a film alone."""
+    return film_of(source) is not None or (is_folder(source) and not has_cameras(source) and any_photo(source))
+
+
+def film_of(source: Path) -> Path | None:
+    """The film that the source is, or that is the one thing to look at in that folder; None where there is none, or several."""
+    if is_video(source):
+        return source
+    if not is_folder(source) or has_cameras(source) or any_photo(source):
+        return None
+    films = [path for path in sorted(source.iterdir()) if is_video(path) and not path.name.startswith(".")]
+    return films[0] if len(films) == 1 else None
 
 
 def pose_source(
@@ -67,14 +77,15 @@ def pose_source(
     tell = progress or (lambda _: None)
     if is_file(source) and not is_video(source):
         raise ValueError(f"{source}: a file, expected a folder of pictures or a film ({', '.join(VIDEO_SUFFIXES)}).")
-    if not is_video(source):
+    film = film_of(source)
+    if film is None:
         return PosedSource(pose_photographs(source, out, settings, progress, should_stop), None)
 
     folder = Path(f"{out}.frames")
     shutil.rmtree(folder, ignore_errors=True)
     told = "choosing frames of the film"
     taken = video_frames(
-        source,
+        film,
         folder,
         advance=lambda share: tell(Progress("read", 0, 0, FRAMES_SHARE * share, message=told)),
         should_stop=should_stop,

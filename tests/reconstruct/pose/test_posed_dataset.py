@@ -11,7 +11,7 @@ from PIL import Image
 from drgs.evaluate.doctor import doctor
 from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, build_asset
 from drgs.reconstruct.pose.pose_photographs import PoseSettings
-from drgs.reconstruct.pose.posed_dataset import needs_poses, pose_source
+from drgs.reconstruct.pose.posed_dataset import film_of, needs_poses, pose_source
 from drgs.reconstruct.pose.prepare_photos import PreparedPhoto, with_backdrop_masks
 from drgs.reconstruct.progress import Progress
 from tests.reconstruct import tiny_capture
@@ -31,6 +31,11 @@ def test_only_pictures_without_cameras_and_films_need_poses(tmp_path: Path) -> N
     assert needs_poses(photos)
     (tmp_path / "film.MP4").write_bytes(b"")
     assert needs_poses(tmp_path / "film.MP4")
+    (tmp_path / "sent").mkdir()
+    (tmp_path / "sent" / "film.mov").write_bytes(b"")
+    assert film_of(tmp_path / "sent") == tmp_path / "sent" / "film.mov" and needs_poses(tmp_path / "sent")
+    (tmp_path / "sent" / "another.mov").write_bytes(b"")
+    assert film_of(tmp_path / "sent") is None and not needs_poses(tmp_path / "sent")
 
 
 def test_what_is_neither_is_refused(tmp_path: Path) -> None:

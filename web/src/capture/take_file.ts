@@ -24,6 +24,6 @@ export async function takeFile(file: File, choice: BuildChoice, onProgress: (sha
   } else if (name.endsWith('.zip')) {
     await buildCapture(file, choice, onProgress);
   } else {
-    notify(`“${file.name}” is none of the kinds that can be dropped here: a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr).`);
+    notify(`“${file.name}” is none of the kinds that can be dropped here: photos, a film, a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr).`);
   }
 }

@@ -1,13 +1,14 @@
 /** The page: full-window stage, panels over it, files dropped anywhere. */
 
 import { useEffect, useRef, useState } from 'preact/hooks';
+import { droppedFiles } from '../capture/dropped_files';
 import { showPhotographs, stepView, viewNumber } from '../capture/photographs';
 import { copyMaterial, pasteMaterial } from '../edit/material/presets';
 import { flash, selectAll } from '../edit/material/selection';
 import { choose, gizmoMode, removeChosen } from '../edit/shape/shape_tools';
 import { log, redo, undo } from '../session/edit_log';
 import { assets } from '../session/library';
-import { dismiss, notices, notify } from '../session/notices';
+import { attempt, dismiss, notices, notify } from '../session/notices';
 import { changeSettings, session } from '../session/session';
 import { CHANNELS } from '../stage/channels';
 import { before, flying, localPicture, wireframe } from '../stage/switches';
@@ -184,7 +185,7 @@ function DropZone() {
       if (!carriesFiles(event)) return;
       event.preventDefault();
       setOver(false);
-      void takeFiles([...event.dataTransfer!.files]);
+      void attempt(droppedFiles(event.dataTransfer!)).then((files) => takeFiles(files ?? []));
     };
     window.addEventListener('dragenter', enter);
     window.addEventListener('dragover', enter);

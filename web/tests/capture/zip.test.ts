@@ -1,5 +1,7 @@
 import { expect, it } from 'vitest';
-import { holdsAsset } from '../../src/capture/zip';
+import { unzipSync } from 'three/examples/jsm/libs/fflate.module.js';
+import { captureAmong } from '../../src/capture/dropped_files';
+import { holdsAsset, zipOf, type PlacedFile } from '../../src/capture/zip';
 
 /** A zip of empty files, with a comment at its end. */
 function zip(...names: string[]): Blob {
@@ -32,4 +34,29 @@ it('a capture is none, whatever its pictures are called', async () => {
 it('what is no zip is none', async () => {
   expect(await holdsAsset(new Blob(['asset.json']))).toBe(false);
   expect(await holdsAsset(new Blob([]))).toBe(false);
+});
+
+const placed = (path: string, text = path): PlacedFile => ({ path, file: new File([text], path.split('/').at(-1)!) });
+
+it('what is zipped here is unzipped elsewhere, names of other scripts too', async () => {
+  const files = [placed('cup/images/größe 1.jpg', 'one'.repeat(1000)), placed('cup/masks/größe 1.png'), placed('cup/empty.txt', '')];
+  const found = unzipSync(new Uint8Array(await (await zipOf(files)).arrayBuffer()));
+  expect(Object.keys(found).sort()).toEqual(files.map(({ path }) => path).sort());
+  for (const { path, file } of files) expect(new TextDecoder().decode(found[path]!)).toBe(await file.text());
+});
+
+it('a zip of what is too much is refused with a sentence', async () => {
+  const large = { path: 'film.mp4', file: { size: 5e9 } as File };
+  await expect(zipOf([large])).rejects.toThrow('1 files of 5000 MB are more than can be sent at once');
+});
+
+it('loose pictures, a film and a folder are one capture, other files are themselves', () => {
+  const pictures = captureAmong([placed('a.JPG'), placed('b.heic'), placed('sky.exr')]);
+  expect(pictures.name).toBe('photographs');
+  expect(pictures.capture.map(({ path }) => path)).toEqual(['a.JPG', 'b.heic']);
+  expect(pictures.others.map(({ name }) => name)).toEqual(['sky.exr']);
+  expect(captureAmong([placed('walk.mov')]).name).toBe('walk');
+  const folder = captureAmong([placed('cup/transforms.json'), placed('cup/images/a.png')]);
+  expect([folder.name, folder.capture.length, folder.others.length]).toEqual(['cup', 2, 0]);
+  expect(captureAmong([placed('mesh.glb'), placed('capture.zip')]).capture).toEqual([]);
 });

@@ -38,8 +38,9 @@ class PassSettings:
     """Of one pass; weights that change over a fit change over all passes."""
     mesh: MeshSettings = PASS_MESH
     carve: CarveSettings = field(default_factory=CarveSettings)
-    carvings: int = 4
-    """Passes after which hollows are looked for."""
+    carve_after: tuple[int, ...] = (1, 2)
+    """Passes, counted from 1, after which hollows are looked for: once the first has made normals and materials what can be asked, and early enough
+    for the passes behind it to smooth what was carved."""
 
 
 @dataclass(eq=False)
@@ -122,7 +123,7 @@ def _start_pass(fit: SurfaceFit, values: dict[str, Tensor], settings: PassSettin
 def carve_and_start_next_pass(fit: SurfaceFit, targets: list[ViewTarget], settings: PassSettings, radius: float) -> None:
     """The steps between two passes. A surface that carving and solves have undone is not meshed anew: the pass starts on the mesh before them."""
     before = {name: value.detach().clone() for name, value in fit.state.parameters.items()}
-    if fit.index < settings.carvings:
+    if fit.index + 1 in settings.carve_after:
         carve_hollows(fit, targets, settings.carve, radius)
     try:
         start_next_pass(fit, settings, radius)
@@ -156,5 +157,5 @@ def fit_surface_in_passes(
             return False
         if fit.index + 1 >= settings.passes:
             return True
-        targets = view_targets(views, 1.0, fit.faces.device) if fit.index < settings.carvings else []
+        targets = view_targets(views, 1.0, fit.faces.device) if fit.index + 1 in settings.carve_after else []
         carve_and_start_next_pass(fit, targets, settings, radius)

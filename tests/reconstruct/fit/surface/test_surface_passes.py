@@ -56,7 +56,7 @@ def test_a_surface_that_cannot_be_meshed_anew_stays_as_it_was_and_the_user_is_to
         raise NothingEnclosed("the mesh of 8 faces encloses nothing at 40 cells; expected a closed surface")
 
     monkeypatch.setattr(surface_passes, "remesh", nothing)
-    settings = PassSettings(3, carvings=1)
+    settings = PassSettings(3, carve_after=(1,))
     surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
     start = placed_sphere(1.0)
     fit = SurfaceFit(start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS), start.faces)

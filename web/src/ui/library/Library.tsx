@@ -3,9 +3,12 @@
 import { signal } from '@preact/signals';
 import { useRef } from 'preact/hooks';
 import * as api from '../../session/api';
+import { captureAmong, chosenFiles } from '../../capture/dropped_files';
 import { takeFile } from '../../capture/take_file';
+import { zipOf, type PlacedFile } from '../../capture/zip';
 import { buildSample, type BuildChoice } from '../../session/jobs';
 import { assets } from '../../session/library';
+import { attempt } from '../../session/notices';
 import { openAsset, session } from '../../session/session';
 import { Bar, Choice, Section } from '../fields';
 import { Icon } from '../icons';
@@ -16,8 +19,16 @@ const build = signal<BuildChoice>({ preset: 'fast', binding: 'particles' });
 /** Share of the upload under way; null while there is none. */
 const uploading = signal<{ name: string; share: number } | null>(null);
 
-export async function takeFiles(files: Iterable<File>): Promise<void> {
-  for (const file of files) {
+/** Loose pictures, a film or a folder among the files are sent as one capture. */
+export async function takeFiles(files: PlacedFile[]): Promise<void> {
+  const { name, capture, others } = captureAmong(files);
+  if (capture.length > 0) {
+    uploading.value = { name, share: 0 };
+    const zip = await attempt(zipOf(capture));
+    if (zip) others.unshift(new File([zip], `${name}.zip`));
+    uploading.value = null;
+  }
+  for (const file of others) {
     uploading.value = { name: file.name, share: 0 };
     await takeFile(file, build.value, (share) => (uploading.value = { name: file.name, share }));
     uploading.value = null;
@@ -65,22 +76,23 @@ function NewBuild() {
         <button class="primary" onClick={() => void buildSample(build.value)}>
           Build the sample
         </button>
-        <button onClick={() => file.current?.click()}>Choose a file…</button>
+        <button onClick={() => file.current?.click()}>Choose files…</button>
       </div>
       <input
         ref={file}
         class="visually-hidden"
         type="file"
-        accept=".zip,.glb,.obj,.ply"
+        accept=".zip,.glb,.obj,.ply,.jpg,.jpeg,.png,.webp,.heic,.heif,.mp4,.mov,.m4v,.webm,.mkv,.avi"
+        multiple
         tabIndex={-1}
         aria-label="Capture or mesh"
         onChange={(event) => {
-          const chosen = [...(event.currentTarget.files ?? [])];
+          const chosen = chosenFiles(event.currentTarget.files ?? []);
           event.currentTarget.value = '';
           void takeFiles(chosen);
         }}
       />
-      <p class="hint">Or drop a capture (.zip of posed photos), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr) anywhere on this page.</p>
+      <p class="hint">Or drop photos, their folder, a film, a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr) anywhere on this page.</p>
       {uploading.value && <Upload {...uploading.value} />}
     </Section>
   );
