@@ -47,7 +47,7 @@ from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.outline_agreement import complaint, outline_agreement
 from drgs.reconstruct.pose.pose_photographs import PoseSettings
 from drgs.reconstruct.pose.posed_dataset import needs_poses, pose_source, provenance_of
-from drgs.reconstruct.progress import STAGE_SHARES, BuildStopped, Progress
+from drgs.reconstruct.progress import POSED, STAGE_SHARES, BuildStopped, Progress
 from drgs.reconstruct.report_progress import BuildReporter
 from drgs.reconstruct.stages import (
     Workplace,
@@ -120,15 +120,15 @@ class Preset:
 BINDINGS = tuple(STAGE_SHARES)
 POSING_SHARE = 0.7
 """Of the stage `read`, where pictures are posed in it."""
-POSED = "posed"
-"""Folder beside the checkpoints: the capture that was made of pictures without cameras."""
 PRESETS = {
     "draft": Preset(
         8_000,
         256,
         FitSettings(iterations=400, half_size_share=0.6, densify=DensifySettings(budget=12_000)),
         replace(FAST_MESH, resolution=160, face_limit=30_000),
-        PassSettings(3, SurfaceSettings(rounds=1, steps_a_round=50), replace(PASS_MESH, resolution=120, face_limit=30_000), carve_after=(1,)),
+        PassSettings(
+            3, SurfaceSettings(rounds=1, steps_a_round=50), replace(PASS_MESH, resolution=120, face_limit=30_000), carve_after=(1,)
+        ),
         MeshMaterialSettings(iterations=80, points_a_step=1024),
         DetailSettings(most_faces=0),
         HollowSettings(RadianceGridSettings(levels=())),

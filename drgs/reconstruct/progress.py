@@ -12,6 +12,8 @@ STAGE_SHARES = {
     "mesh": {"read": 0.09, "fit": 0.28, "mesh": 0.03, "surface": 0.27, "bind": 0.1, "materials": 0.21, "pack": 0.02},
 }
 """The stages of a build with each binding, in their order, and their shares of its time, for the progress bar."""
+POSED = "posed"
+"""Folder beside a build's checkpoints: the capture that was made of pictures without cameras."""
 
 
 class BuildStopped(Exception):

@@ -10,11 +10,11 @@ from PIL import Image
 
 from drgs.deform.clip import open_clip
 from drgs.exchange.exr import encode_environment
-from drgs.reconstruct.progress import Progress
+from drgs.reconstruct.progress import POSED, Progress
 from drgs.scene.asset import Asset, save_asset
 from drgs_worker.jobs.progress import JobStopped
 from drgs_worker.jobs.start_view import turntable_view
-from drgs_worker.jobs.steps.build import RedecoupleRun
+from drgs_worker.jobs.steps.build import KEPT_CHECKPOINTS, RedecoupleRun
 from drgs_worker.jobs.steps.export import ExportRun
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
 from drgs_worker.jobs.steps.render import RenderRun
@@ -183,3 +183,17 @@ def test_an_export_writes_each_format(job: Callable[..., JobContext]) -> None:
 def test_an_asset_without_its_build_cannot_be_re_decoupled(job: Callable[..., JobContext]) -> None:
     with pytest.raises(ValueError, match="geometry was not kept"):
         run(RedecoupleRun(job({"kind": "redecouple", "asset": ASSET, "preset": "full"})))
+
+
+def test_a_re_decoupling_takes_the_poses_that_the_build_found(job: Callable[..., JobContext]) -> None:
+    context = job({"kind": "redecouple", "asset": ASSET, "preset": "full"})
+    source = context.directory.job(ASSET) / "asset.build"
+    (source / POSED / "images").mkdir(parents=True)
+    (source / POSED / "transforms.json").write_text("{}")
+    for name in KEPT_CHECKPOINTS["particles"]:
+        (source / name).write_text(name)
+    for _ in range(2):  # a step may be repeated
+        RedecoupleRun(context).run("copy")
+    work = context.folder / "asset.build"
+    assert {path.name for path in work.iterdir()} == {*KEPT_CHECKPOINTS["particles"], POSED}
+    assert (work / POSED / "transforms.json").read_text() == "{}"

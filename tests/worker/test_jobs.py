@@ -104,7 +104,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 @pytest.mark.slow
 def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:
     found = {"summary": "4 pictures.", "findings": [{"level": "warning", "sentence": "4 views are few.", "advice": "Take more."}]}
-    job = bench.submit(found=found)
+    job = bench.submit(found=found, folders=["posed", "posed.frames"])
     assert bench.state(job) == "queued"
     bench.start_worker()
     bench.wait_for(job, "done")
@@ -117,6 +117,7 @@ def test_a_job_runs_to_the_end_and_its_asset_is_listed(bench: Bench) -> None:
         "stage1.safetensors",
         "mesh.safetensors",
         "surface.safetensors",
+        "posed",
     }
     log = bench.directory.job_log(job).read_text()
     assert [line.split()[1] for line in log.splitlines()[::2]] == ["read:", "fit:", "mesh:", "surface:", "materials:", "pack:", "register:"]

@@ -83,3 +83,6 @@ def fit(request: BuildRequest, plan: dict, work: Path, progress, should_stop) ->
             progress(Progress("fit", iteration + 1, plan["iterations"], fraction, psnr=20 + fraction, preview_jpeg=b"\xff\xd8tiny"))
     if first < plan["iterations"]:
         (work / "stage1.safetensors").write_text("surfels")
+    for name in plan.get("folders", ()):
+        (work / name).mkdir(exist_ok=True)
+        (work / name / "transforms.json").write_text("{}")

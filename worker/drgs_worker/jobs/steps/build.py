@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from drgs.reconstruct.progress import STAGE_SHARES
+from drgs.reconstruct.progress import POSED, STAGE_SHARES
 from drgs_worker.jobs.builders import BuildRequest
 from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
@@ -60,7 +60,11 @@ class BuildRun(AbstractJobRun):
         retry_while_unavailable(lambda: register_asset(job.directory, job.engine, job.job_id, job.name, "build"), job.should_stop)
         work = Path(f"{built}.build")
         for path in work.iterdir() if work.is_dir() else ():
-            if path.name not in KEPT_CHECKPOINTS[self._binding]:
+            if path.name in (*KEPT_CHECKPOINTS[self._binding], POSED):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
                 path.unlink()
 
 
@@ -88,6 +92,11 @@ class RedecoupleRun(BuildRun):
             draft = work / f"{name}.part"
             shutil.copyfile(source / name, draft)
             draft.rename(work / name)
+        if (source / POSED).is_dir() and not (work / POSED).exists():
+            draft = work / f"{POSED}.part"
+            shutil.rmtree(draft, ignore_errors=True)
+            shutil.copytree(source / POSED, draft)
+            draft.rename(work / POSED)
 
     def _request(self) -> BuildRequest:
         job, given = self._job, self._job.parameters
