@@ -38,6 +38,8 @@ export interface PlacedFile {
 
 /** Bytes that a zip can hold without the extension for larger ones. */
 const MOST_BYTES = 0xffffffff;
+/** Room kept for names and headers. */
+const HEADERS_BYTES = 0x2000000;
 const UTF8_NAMES = 0x0800;
 /** 1 January 1980, the earliest date that a zip can tell. */
 const DATE = 0x0021;
@@ -63,7 +65,7 @@ async function crc32(file: Blob): Promise<number> {
  */
 export async function zipOf(files: PlacedFile[]): Promise<Blob> {
   const total = files.reduce((sum, { file }) => sum + file.size, 0);
-  if (total > 0.99 * MOST_BYTES || files.length > 0xffff) {
+  if (total > MOST_BYTES - HEADERS_BYTES || files.length > 0xffff) {
     throw new Error(`${files.length} files of ${Math.round(total / 1e6)} MB are more than can be sent at once: at most 65535 of 4250 MB.`);
   }
   const parts: BlobPart[] = [];
