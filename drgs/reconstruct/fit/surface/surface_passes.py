@@ -39,8 +39,9 @@ class PassSettings:
     mesh: MeshSettings = PASS_MESH
     carve: CarveSettings = field(default_factory=CarveSettings)
     carve_after: tuple[int, ...] = (1, 2)
-    """Passes, counted from 1, after which hollows are looked for: once the first has made normals and materials what can be asked, and early enough
-    for the passes behind it to smooth what was carved."""
+    """Passes, counted from 1, after which hollows are looked for, about a fifth and two fifths of the way: earlier, normals and materials are not what
+    carving asks (still_life, `full`: after the first two of 24 passes the mesh ends 0.64 % off, after the second and fourth of 10 0.49 %); later, too
+    few passes are left to smooth what was carved."""
 
 
 @dataclass(eq=False)
