@@ -2,7 +2,7 @@
 
 The backdrop is the colour that most of the picture's border has; the object is what differs from it by more than a shadow does. In: a picture. Out: its
 mask, or none where the border is not of one colour. Colours are compared in CIELAB, lightness below the backdrop's at a part of its weight,
-for shadows are darker and hardly differ in colour. On a wooden tankard on a white turntable (69 photographs) intersection over union with masks by hand is
+for shadows are darker and hardly differ in colour. On a wooden tankard on a white turntable (nine of 69 photographs) intersection over union with the given masks is
 0.93; what is too much is the shadow where it touches the table.
 """
 
