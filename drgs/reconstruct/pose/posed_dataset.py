@@ -3,9 +3,9 @@
 In: a path. Out: the path of a capture that load_views reads. What was found stays beside the build's checkpoints, and is not looked for again on resume.
 """
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,7 @@ def pose_source(
         frames: of a film, how many slots of time one is taken from; None: video_frames' own number.
 
     Raises:
-        ValueError: as pose_photographs and video_frames do.
+        ValueError: as pose_photographs and video_frames do, or `out`.frames holds something else than frames.
         BuildStopped: as asked.
     """
     should_stop = should_stop or (lambda: False)
@@ -82,7 +82,7 @@ def pose_source(
         return PosedSource(pose_photographs(source, out, settings, progress, should_stop), None)
 
     folder = Path(f"{out}.frames")
-    shutil.rmtree(folder, ignore_errors=True)
+    _forget_frames(folder)
     told = "choosing frames of the film"
     taken = video_frames(
         film,
@@ -98,3 +98,15 @@ def pose_source(
         tell(replace(at, fraction=FRAMES_SHARE + (1 - FRAMES_SHARE) * at.fraction))
 
     return PosedSource(pose_photographs(folder, out, settings, tell_rest, should_stop), taken)
+
+
+def _forget_frames(folder: Path) -> None:
+    """Remove what video_frames wrote there before, and nothing else."""
+    held = sorted(folder.iterdir()) if folder.exists() else []
+    foreign = next((path for path in held if not fnmatch(path.name, "frame_*.jpg")), None)
+    if foreign is not None:
+        raise ValueError(
+            f"{foreign}: not a frame of a film, expected a folder for frames alone; move it, or give another folder for the capture."
+        )
+    for path in held:
+        path.unlink()

@@ -44,6 +44,21 @@ def test_what_is_neither_is_refused(tmp_path: Path) -> None:
         pose_source(tmp_path / "notes.txt", tmp_path / "out", PoseSettings())
 
 
+def test_frames_are_not_written_over_what_is_somebody_elses(tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"no film")
+    kept = tmp_path / "out.frames" / "holiday.jpg"
+    kept.parent.mkdir()
+    kept.write_bytes(b"dear")
+    (kept.parent / "frame_000001.jpg").write_bytes(b"of a film")
+    with pytest.raises(ValueError, match=r"holiday\.jpg: not a frame of a film"):
+        pose_source(tmp_path / "film.mp4", tmp_path / "out", PoseSettings())
+    assert len(list(kept.parent.iterdir())) == 2
+    kept.unlink()
+    with pytest.raises(ValueError, match="not a readable video"):
+        pose_source(tmp_path / "film.mp4", tmp_path / "out", PoseSettings())
+    assert list(kept.parent.iterdir()) == []
+
+
 @pytest.mark.slow
 def test_a_build_of_a_film_chooses_frames_poses_them_and_tells_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "tiny", TINY)
