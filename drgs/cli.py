@@ -68,6 +68,12 @@ class BindingKind(StrEnum):
     mesh = "mesh"
 
 
+class LightKind(StrEnum):
+    auto = "auto"
+    object = "object"
+    camera = "camera"
+
+
 class DeviceName(StrEnum):
     auto = "auto"
     cpu = "cpu"
@@ -163,6 +169,10 @@ def build(
     binding: Annotated[
         BindingKind, typer.Option(help="Where Gaussians lie: as fitted, or rebuilt on the faces of the mesh.")
     ] = BindingKind.particles,
+    light: Annotated[
+        LightKind,
+        typer.Option(help="What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."),
+    ] = LightKind.auto,
     device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
     seed: Annotated[int, typer.Option()] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint that a stopped build left.")] = False,
@@ -173,12 +183,13 @@ def build(
     from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
     from drgs.reconstruct.outline_agreement import complaint
 
-    settings = BuildSettings(preset=preset.value, binding=binding.value, device=device.value, seed=seed, resume=resume)
+    settings = BuildSettings(preset=preset.value, binding=binding.value, device=device.value, seed=seed, resume=resume, light=light.value)
     with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
         try:
             asset = build_asset(dataset, out, settings, progress=report, should_stop=interrupt.is_set)
         except BuildStopped:
             bound = "" if binding == BindingKind.particles else f" --binding {binding.value}"
+            bound += "" if light == LightKind.auto else f" --light {light.value}"
             print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value}{bound} --resume", file=sys.stderr)
             raise typer.Exit(130) from None
     if json_progress:
@@ -221,6 +232,7 @@ def render(
     """Render an asset from the cameras of a file: <name>.png (RGBA, straight alpha, sRGB), and maps with --aov."""
     from drgs.cli_progress import frame_progress
     from drgs.deform.pose_scene import pose_scene
+    from drgs.evaluate.evaluate_asset import own_light_from_world
     from drgs.reconstruct.capture.load_views import load_cameras
     from drgs.render.records import RenderSettings
     from drgs.render.render_cameras import render_cameras
@@ -230,7 +242,8 @@ def render(
     if env or env_rotation:
         changes.append(EnvironmentEdit(op="environment", file=str(env.resolve()) if env else None, rotation=env_rotation))
     views = load_cameras(cameras, _size(size))
-    scene = pose_scene(_open_asset(asset, device), changes, edits.parent if edits else Path())
+    opened = _open_asset(asset, device)
+    scene = pose_scene(opened, changes, edits.parent if edits else Path())
     settings = RenderSettings(
         samples_per_pixel=spp,
         bounces=bounces,
@@ -242,7 +255,7 @@ def render(
         seed=seed,
     )
     with frame_progress("Rendering", len(views)) as advance:
-        frames = render_cameras(scene, views, out, settings, aov=aov, done=advance)
+        frames = render_cameras(scene, views, out, settings, aov, advance, own_light_from_world(opened, changes))
     if as_json:
         print(json.dumps({"out": str(out), "frames": frames}))
     elif explain:

@@ -18,6 +18,7 @@ from drgs.reconstruct.capture.load_views import read_capture
 from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.load_views.checks import IMAGE_SUFFIXES, image_size, pictures_in
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
+from drgs.reconstruct.capture.turning_light import light_found
 from drgs.reconstruct.pose.list_photos import HEIC_SUFFIXES, list_photos
 from drgs.reconstruct.pose.posed_dataset import film_of, needs_poses
 from drgs.scene.views import Views
@@ -80,6 +81,7 @@ def doctor(folder: Path) -> dict[str, Any]:
         ("directions", lambda: _directions(views, points)),
         ("exposure", lambda: _exposure(views, points)),
         ("initial_points", lambda: _points(views, points)),
+        ("light", lambda: _light(capture, views, points)),
     ):
         report[section], found = examine()
         findings += found
@@ -413,6 +415,21 @@ def _exposure(views: Views, points: InitialPoints) -> _Section:
         "brightness_variation_stops": round(spread(stops), 4),
     }
     return summary, findings
+
+
+def _light(capture: Capture, views: Views, points: InitialPoints) -> _Section:
+    """What the light stood still with."""
+    found = light_found(capture, views, points)
+    findings = []
+    if found.frame == "camera":
+        findings.append(
+            Finding(
+                "info",
+                f"The light stands still with the camera, as on a turntable, for {found.why}.",
+                "If the camera went around the object all the same, build with --light object.",
+            )
+        )
+    return {key: value for key, value in asdict(found).items() if value is not None}, findings
 
 
 def _points(views: Views, points: InitialPoints) -> _Section:

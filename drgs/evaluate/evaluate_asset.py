@@ -8,7 +8,10 @@ import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+
+from torch import Tensor
 
 from drgs.convert.export_asset import export_asset
 from drgs.deform.pose_scene import pose_scene
@@ -17,9 +20,9 @@ from drgs.maths.constants import STILL_BOUNCES
 from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
-from drgs.scene.asset import Asset
+from drgs.scene.asset import Asset, light_from_world
 from drgs.scene.camera import Camera
-from drgs.scene.edits import Edit, parse_edits
+from drgs.scene.edits import Edit, EnvironmentEdit, parse_edits
 
 
 @dataclass(frozen=True)
@@ -62,10 +65,11 @@ def _render_all(
     render_settings = RenderSettings(samples_per_pixel=settings.samples_per_pixel, bounces=settings.bounces, seed=settings.seed)
 
     def render(folder: Path, edits: list[Edit], aov: bool = False) -> None:
-        """The cameras that have a truth picture in the capture's folder of the same name."""
+        """The cameras that have a truth picture in the capture's folder of the same name, under the light of the photographs unless edits give another."""
         wanted = [camera for camera in cameras if (capture / folder / f"{camera.name}.png").exists()]
         scene = pose_scene(asset, edits, capture)
-        render_cameras(scene, wanted, renders / folder, render_settings, aov=aov, done=lambda name: done(f"{folder}/{name}"))
+        turns = own_light_from_world(asset, edits)
+        render_cameras(scene, wanted, renders / folder, render_settings, aov, lambda name: done(f"{folder}/{name}"), turns)
 
     render(Path("test"), [], aov=True)
     export_asset(asset, renders / "env.exr", "env")
@@ -78,6 +82,12 @@ def _render_all(
         # Under the training light, which the asset has recovered, the file's true one would be a hint.
         light = [] if truth.name == facts["train_env"] else _light(capture, truth.name)
         render(truth.relative_to(capture), [*bent, *light])
+
+
+def own_light_from_world(asset: Asset, edits: list[Edit]) -> Callable[[Camera], Tensor | None]:
+    """How the asset's own light turns with cameras; another light stands still with the object."""
+    other = any(isinstance(edit, EnvironmentEdit) and edit.file is not None for edit in edits)
+    return (lambda camera: None) if other else partial(light_from_world, asset)
 
 
 def _light(capture: Path, name: str) -> list[Edit]:

@@ -21,24 +21,29 @@ from drgs.reconstruct.capture.exposures import with_gains_of_fit, with_gains_of_
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.find_masks import with_drawn_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
-from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.capture.load_views import read_capture
+from drgs.reconstruct.capture.load_views.capture import Capture
+from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
+from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings, albedo_detail, divisions
 from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings, SurfaceFit
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, gaussians_from_state
 from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings, gaussians_from_materials
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, gaussians_from_mesh_fit
-from drgs.reconstruct.fit.view_targets import view_targets
+from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
-from drgs.reconstruct.geometry.divide_faces import divided_binding, divided_faces
+from drgs.reconstruct.geometry.divide_faces import DividedFaces, divided_binding, divided_faces
 from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, FULL_MESH, MeshSettings, mesh_report
 from drgs.reconstruct.geometry.face_surfels import radiating_surfels, surfels_on_faces_of
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -91,6 +96,8 @@ class BuildSettings:
     """auto, cpu or cuda."""
     seed: int = 0
     resume: bool = False
+    light: LightChoice = "auto"
+    """What the lamps stood still with while the photographs were taken."""
     materials: str | None = None
     """Preset of the stage `materials` alone: None is `preset`. It is how material and light are separated anew on kept geometry."""
 
@@ -211,11 +218,12 @@ def build_stages(
     with timed("read"):
         reporter.report("read", 0.0, "reading the capture")
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
-        views = load_views(capture, max_side=preset.image_side)
+        found = read_capture(capture)
+        views = read_pictures(found, preset.image_side)
         photographs = views
         points = initial_points(views, preset.points, settings.seed)
         views = with_gains_of_points(views, points)
-        identity = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
+        identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
         place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, should_stop or (lambda: False))
         if not settings.resume:
             forget_checkpoints(place)
@@ -225,7 +233,12 @@ def build_stages(
             points = points_of_found_masks(masked, points, preset.points, settings.seed)
         else:
             masked = views
-        points = hollows_stage(place, masked, points, preset.points, preset.hollows, settings.seed, device)
+        light = _light(settings, preset, found, masked, points)
+        if light.frame == "camera":
+            # Hollows are found by paint that looks alike from all sides, which it does not under such light.
+            views, place = with_light_of_camera(views), place.of(light="camera")
+        else:
+            points = hollows_stage(place, masked, points, preset.points, preset.hollows, settings.seed, device)
     yield "read", None
 
     with timed("fit"):
@@ -247,7 +260,8 @@ def build_stages(
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
     provenance |= poses | {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
-    asset = replace(asset, provenance=provenance, cameras=views.cameras)
+    provenance["light"] = {key: value for key, value in asdict(light).items() if value is not None}
+    asset = replace(asset, provenance=provenance, cameras=views.cameras, light_frame=light.frame)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
     reporter.report("pack", 1.0, "; ".join(filter(None, ("done", complaint(agreement)))))
     yield "pack", asset
@@ -269,6 +283,15 @@ def _posed(
     found = pose_source(dataset, place, pose_settings, progress=report, should_stop=should_stop)
     reporter.begun["read"] = POSING_SHARE
     return place, {"poses": provenance_of(found)}
+
+
+def _light(settings: BuildSettings, preset: Preset, capture: Capture, views: Views, points: InitialPoints) -> LightFound:
+    """What the light stood still with: as it was said, else as the pictures say."""
+    if settings.light != "auto":
+        return LightFound(settings.light, "it was said so")
+    if preset.materials_on == "surfels":
+        return LightFound("object", "materials are fitted on surfels")
+    return light_found(capture, views, points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,26 +397,41 @@ def _horizons(mesh: TriangleMesh) -> UInt8[Tensor, "face 8"]:
 def _detailed(views: Views, fit: SurfaceFit, binding: Binding, settings: DetailSettings) -> tuple[TriangleMesh, Binding, Certainty]:
     """The fitted mesh with faces as small as the photographs' pixels and the albedo that they show; where surfels are on it; how certain it is."""
     mesh, parameters = fit.mesh, fit.state.parameters
-    tables, share = filter_environment(environment_table(parameters)), parameters["open_share"]
-    targets = view_targets(views, 1.0, mesh.vertices.device)
-    certainty = vertex_certainty(build_tracer(mesh), targets, share, tables, parameters["metal"])
+    tracer, targets = build_tracer(mesh), view_targets(views, 1.0, mesh.vertices.device)
+    sky = None if views.light_from_world is None else seen_sky(tracer)
+    light_of = light_of_views(filter_environment(environment_table(parameters)), parameters["open_share"], mesh.albedo, sky)
+    certainty = vertex_certainty(tracer, targets, light_of, parameters["metal"])
     times = divisions(mesh, views.cameras, settings)
     for _ in range(times):
         divided = divided_faces(mesh.faces, len(mesh.vertices))
         binding = divided_binding(binding, len(mesh.faces))
         fields = {name: divided.carried(value) for name, value in vars(mesh).items() if name != "faces"}
         mesh = TriangleMesh(**fields | {"faces": divided.faces, "normals": torch.nn.functional.normalize(fields["normals"], dim=-1)})
-        share = divided.carried(share)
+        light_of = _carried_light(light_of, divided)
         certainty = Certainty(**{name: divided.carried(value.float()).half() for name, value in vars(certainty).items()})
     edges, rings = mesh_edges(mesh.faces), settings.rings * 4**times
-    albedo = albedo_detail(build_tracer(mesh), targets, share, tables, edges, rings)
+    albedo = albedo_detail(build_tracer(mesh), targets, light_of, edges, rings)
     return replace(mesh, albedo=albedo), binding, certainty
+
+
+def _carried_light(light_of: LightOf, divided: DividedFaces) -> LightOf:
+    """The light around the mesh with divided faces."""
+
+    def carried(target: ViewTarget) -> MeshLight:
+        light = light_of(target)
+        return replace(light, open_share=divided.carried(light.open_share))
+
+    return carried
 
 
 def _check(settings: BuildSettings) -> None:
     for name in (settings.preset, settings.materials or settings.preset):
         if name not in PRESETS:
             raise ValueError(f"preset {name!r} is unknown; expected one of {', '.join(PRESETS)}")
+    if settings.light not in LIGHT_CHOICES:
+        raise ValueError(f"light {settings.light!r} is unknown; expected one of {', '.join(LIGHT_CHOICES)}")
+    if settings.light == "camera" and PRESETS[settings.preset].materials_on == "surfels":
+        raise ValueError("light 'camera' needs materials that are fitted on the mesh; expected a preset that does so")
     if settings.binding not in BINDINGS:
         raise ValueError(f"binding {settings.binding!r} is unknown; expected one of {', '.join(BINDINGS)}")
 

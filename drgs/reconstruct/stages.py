@@ -21,7 +21,7 @@ from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import corner_weights, hit_radiance
+from drgs.reconstruct.fit.light.mesh_light import MeshLight, corner_weights, hit_radiance
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings, fit_mesh_materials, start_mesh_materials
 from drgs.reconstruct.fit.surface.fit_surface import start_surface
@@ -341,7 +341,8 @@ def _kept(place: Workplace, path: Path, device: torch.device) -> dict[str, Tenso
     if not (place.resume and path.exists()):
         return None
     tensors, facts = read_tensors(path, device)
-    found = {key: facts.get(key) for key in place.identity}
+    # Light that stands still with the object has no entry.
+    found = {key: facts[key] for key in (*place.identity, "light") if key in facts}
     if found != place.identity:
         raise ValueError(
             f"the checkpoint {path} is of another build (found {found}, expected {place.identity}); delete its folder or choose another OUT"
@@ -376,9 +377,9 @@ def surface_preview(fit: SurfaceFit, cameras: tuple[Camera, ...]) -> bytes:
         hits = trace_rays(origin.expand_as(direction), direction, build_tracer(mesh))
         met = hits.hit.nonzero().squeeze(1)
         corners, weights = mesh.faces[hits.face[met].long()].long(), corner_weights(hits.barycentric[met])
-        tables = filter_environment(environment_table(parameters))
+        light = MeshLight(filter_environment(environment_table(parameters)), parameters["open_share"])
         radiance = torch.zeros_like(direction)
-        radiance[met] = hit_radiance(mesh, corners, weights, -direction[met], parameters["open_share"], tables)
+        radiance[met] = hit_radiance(mesh, corners, weights, -direction[met], light)
         return encode_preview(radiance.reshape(directions.shape), hits.hit.float().reshape(directions.shape[:2]))
 
 

@@ -3,11 +3,12 @@
 import json
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import safetensors.numpy
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from drgs.exchange.exr import decode_environment, encode_environment
@@ -25,6 +26,8 @@ from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PRIMARY_SURFACES, PrimarySurface
 
+LightFrame = Literal["object", "camera"]
+LIGHT_FRAMES: tuple[LightFrame, ...] = get_args(LightFrame)
 SCHEMA_VERSION = 1
 """Of the asset folder; a reader refuses a larger one."""
 
@@ -71,6 +74,8 @@ class Asset:
     """What cameras see unless they are told otherwise; None: the Gaussians where there are some."""
     certainty: Certainty | None = None
     """What the photographs say of each vertex of the mesh, and what is a guess; None: nobody looked (imported meshes, older assets)."""
+    light_frame: LightFrame = "object"
+    """What the light of the photographs stood still with. camera: on a turntable; then `environment` is that of the first training camera."""
 
 
 def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = None, photographs_zip: bytes | None = None) -> None:
@@ -115,6 +120,7 @@ def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = No
         "meters_per_unit": asset.meters_per_unit,
         "conventions": CONVENTIONS,
         **({} if asset.primary is None else {"primary": asset.primary}),
+        **({} if asset.light_frame == "object" else {"light_frame": asset.light_frame}),
         "counts": {"surfels": surfels, "vertices": len(mesh.vertices), "faces": len(mesh.faces), "cameras": len(asset.cameras)},
         "provenance": asset.provenance,
     }
@@ -152,10 +158,21 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     primary = manifest.get("primary")
     if primary is not None and primary not in PRIMARY_SURFACES:
         raise ValueError(f"{path}: asset.json has primary {str(primary)[:40]!r}; expected {' or '.join(PRIMARY_SURFACES)}")
+    light_frame = manifest.get("light_frame", "object")
+    if light_frame not in LIGHT_FRAMES:
+        raise ValueError(f"{path}: asset.json has light_frame {str(light_frame)[:40]!r}; expected {' or '.join(LIGHT_FRAMES)}")
     environment = Environment(torch.from_numpy(radiance).to(device))
-    asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons, primary, certainty)
+    asset = Asset(gaussians, mesh, binding, environment, cameras, float(meters), provenance, horizons, primary, certainty, light_frame)
     _check(asset, str(path))
     return asset
+
+
+def light_from_world(asset: Asset, camera: Camera) -> Float[Tensor, "3 3"] | None:
+    """Rotation of directions in the world to those of the asset's environment when this camera takes a picture; None: the same."""
+    if asset.light_frame == "object":
+        return None
+    first, own = (view.camera_from_world[:3, :3].double().cpu() for view in (asset.cameras[0], camera))
+    return (first.T @ own).float()
 
 
 def load_photographs(path: Path | str) -> bytes | None:
@@ -186,6 +203,8 @@ def _check(asset: Asset, name: str) -> None:
         low, high = float(certainty.min()), float(certainty.max())
         if low < 0 or high > 1:
             raise ValueError(f"{name}: the certainty of {entry.name} is {low:g} to {high:g}; expected numbers from 0 to 1")
+    if asset.light_frame == "camera" and not asset.cameras:
+        raise ValueError(f"{name}: its light stands still with the camera, but it has no cameras; expected those of the photographs")
     if asset.primary == "gaussians" and gaussians is None:
         raise ValueError(f"{name}: its primary surface is gaussians, but it has none")
     if binding is not None:

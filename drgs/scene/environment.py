@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+TURNED_ROWS = 256
+"""Of a turned table: twice the learned one's, so that resampling blurs little."""
+
 
 @dataclass(frozen=True, eq=False)
 class Environment:
@@ -65,3 +68,15 @@ def rotate_environment(environment: Environment, degrees: float) -> Environment:
     a = torch.roll(environment.radiance, whole, dims=1)
     b = torch.roll(environment.radiance, whole + 1, dims=1)
     return Environment(a * (1 - part) + b * part)
+
+
+def turned_environment(environment: Environment, light_from_world: Float[Tensor, "3 3"]) -> Environment:
+    """The light as the world sees it, of a table whose directions are turned against the world's; resampled to at least TURNED_ROWS rows.
+
+    Args:
+        light_from_world: rotation of directions in the world to those of the table.
+    """
+    rows = max(TURNED_ROWS, environment.radiance.shape[0])
+    v, u = torch.meshgrid((torch.arange(rows) + 0.5) / rows, (torch.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
+    directions = direction_from_uv(torch.stack([u, v], -1)).to(environment.radiance)
+    return Environment(environment_radiance(environment, directions @ light_from_world.to(directions).T))

@@ -43,7 +43,7 @@ from drgs_server.api.rest_records import (
 )
 from drgs_server.client_stream import ServerError, Stream
 from drgs_server.live.messages import EditLog, Settings
-from drgs_worker.jobs.requests import BindingName, ExportRequest, RedecoupleRequest, RenderRequest, SimulateRequest
+from drgs_worker.jobs.requests import BindingName, ExportRequest, LightName, RedecoupleRequest, RenderRequest, SimulateRequest
 
 Model = TypeVar("Model", bound=BaseModel)
 Preset = Literal["draft", "fast", "full"]
@@ -88,20 +88,23 @@ class Client:
         name: str | None = None,
         idempotency_key: str | None = None,
         binding: BindingName = "particles",
+        light: LightName = "auto",
     ) -> JobInfo:
         """Start a build.
 
         Args:
             dataset: `sample`, a folder or zip of this machine (uploaded), or `server:PATH`, a folder that the server may read.
             binding: particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh.
+            light: what the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures.
             idempotency_key: the same key gives the same job, however often this is called.
         """
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         if isinstance(dataset, str) and (dataset == "sample" or dataset.startswith("server:")):
-            body = {"dataset": dataset.removeprefix("server:"), "preset": preset, "binding": binding, "seed": seed, "name": name}
+            chosen = {"preset": preset, "binding": binding, "light": light, "seed": seed, "name": name}
+            body = {"dataset": dataset.removeprefix("server:")} | chosen
             return self._call("POST", "/api/jobs", JobInfo, json=body, headers=headers)
         path = Path(dataset)
-        fields = {"preset": preset, "binding": binding, "seed": str(seed), "name": name or path.stem}
+        fields = {"preset": preset, "binding": binding, "light": light, "seed": str(seed), "name": name or path.stem}
         with _as_zip(path) as file:
             upload = {"file": (path.stem + ".zip", file, "application/zip")}
             return self._call("POST", "/api/jobs", JobInfo, data=fields, files=upload, headers=headers)

@@ -112,7 +112,7 @@ def test_where_gaussians_lie_is_chosen_with_the_build(viewer: Viewer, jobs: Jobs
     page.get_by_role("radio", name="On the mesh").check()
     with page.expect_request(lambda request: request.url.endswith("/api/jobs") and request.method == "POST") as sent:
         page.get_by_role("button", name="Build the sample").click()
-    assert sent.value.post_data_json == {"dataset": "sample", "preset": "fast", "binding": "mesh"}
+    assert sent.value.post_data_json == {"dataset": "sample", "preset": "fast", "binding": "mesh", "light": "auto"}
 
 
 def test_the_page_logged_no_errors(viewer: Viewer) -> None:

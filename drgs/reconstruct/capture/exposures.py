@@ -20,7 +20,6 @@ from torch import Tensor
 from drgs.maths.color import linear_from_srgb, luminance
 from drgs.reconstruct.capture.initial_points import InitialPoints, project_points
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
-from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
 VARIED_STOPS = 0.2
@@ -82,13 +81,13 @@ def with_gains_of_points(views: Views, points: InitialPoints) -> Views:
     return with_gains(views, stops) if jumps(stops, views) > VARIED_STOPS else views
 
 
-def with_gains_of_fit(views: Views, drawn: Callable[[Camera], tuple[Tensor, Tensor]]) -> Views:
+def with_gains_of_fit(views: Views, drawn: Callable[[ViewTarget], tuple[Tensor, Tensor]]) -> Views:
     """Gains by what a fit draws of the object, at half size; those that are known already are made better.
 
     Args:
-        drawn: linear radiance (height, width, 3) that a camera sees by the fit, and coverage (height, width).
+        drawn: linear radiance (height, width, 3) that a view's camera sees by the fit, and coverage (height, width).
     """
-    left = [_stops_left(target, *drawn(target.camera)) for target in view_targets(views, 0.5, torch.device("cpu"))]
+    left = [_stops_left(target, *drawn(target)) for target in view_targets(views, 0.5, torch.device("cpu"))]
     gains = np.ones(len(left)) if views.gains is None else np.array(views.gains)
     if views.gains is None and jumps(left, views) <= LEFT_STOPS:
         return views

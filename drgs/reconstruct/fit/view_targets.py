@@ -29,6 +29,8 @@ class ViewTarget:
     """Box around the mask: outside it only coverage is compared."""
     ceiling: float = 1.0
     """Value of `saturation` from which the camera's sensor clipped."""
+    light_from_world: Float[Tensor, "3 3"] | None = None
+    """Rotation of directions in the world to those of the light's table; None: the same."""
 
     @property
     def box(self) -> tuple[slice, slice]:
@@ -40,7 +42,8 @@ def view_targets(views: Views, factor: float, device: torch.device) -> list[View
     """Photos at `factor` times their size, of one exposure, premultiplied by their masks."""
     targets = []
     gains = views.gains or (1.0,) * len(views.cameras)
-    for camera, image, mask, gain in zip(views.cameras, views.images_srgb, views.coverage, gains, strict=True):
+    turns = views.light_from_world or (None,) * len(views.cameras)
+    for camera, image, mask, gain, turn in zip(views.cameras, views.images_srgb, views.coverage, gains, turns, strict=True):
         photo, alpha, ceiling = image.float() / 255, mask.float() / 255, 1.0
         if gain != 1:
             photo, ceiling = srgb_from_linear(linear_from_srgb(photo) / gain), float(srgb_from_linear(torch.tensor(1 / gain)))
@@ -55,7 +58,8 @@ def view_targets(views: Views, factor: float, device: torch.device) -> list[View
         margin = 8
         down, across = (slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else slice(0, 1) for x in (rows, columns))
         premultiplied, photo, alpha = (x.contiguous().to(device) for x in (premultiplied, photo, alpha))
-        targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, down, across, ceiling))
+        turn = None if turn is None else turn.to(device)
+        targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, down, across, ceiling, turn))
     return targets
 
 

@@ -83,6 +83,7 @@ _BODY: dict[str, Any] = {
                         "name": {"type": "string"},
                         "preset": {"type": "string", "enum": ["draft", "fast", "full"]},
                         "binding": {"type": "string", "enum": ["particles", "mesh"]},
+                        "light": {"type": "string", "enum": ["auto", "object", "camera"]},
                         "seed": {"type": "integer"},
                     },
                 }
@@ -168,8 +169,8 @@ def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
             raise ProblemError(409, "Only an asset that was built here can be re-decoupled, since that needs its capture and geometry.")
         row.dataset, row.preset, row.seed = built.dataset, asked.preset, built.seed
         built_preset = built.parameters.get("built_preset", built.preset)
-        binding = built.parameters.get("binding", "particles")
-        row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed, "binding": binding}
+        kept = {"binding": built.parameters.get("binding", "particles"), "light": built.parameters.get("light", "auto")}
+        row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed} | kept
     elif isinstance(asked, SimulateRequest):
         from drgs.deform.simulation_scene import parse_simulation_scene
 
@@ -196,7 +197,7 @@ def _check_render(context: ServerContext, asked: RenderRequest) -> None:
 async def _receive_capture(request: Request, context: ServerContext, job_id: str) -> tuple[BuildRequest, Path]:
     upload = await receive_upload(request, {".zip"})
     try:
-        fields = {"dataset": "upload", "name": upload.name(), **upload.given("preset", "binding", "seed")}
+        fields = {"dataset": "upload", "name": upload.name(), **upload.given("preset", "binding", "light", "seed")}
         asked = BuildRequest.model_validate(fields)
         draft, target = context.scratch.folder / job_id, context.directory.uploads / job_id
         await run_in_threadpool(unpack_zip, upload.stream, draft)

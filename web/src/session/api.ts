@@ -112,10 +112,11 @@ export const jobFiles = (id: string) => call<JobFileList>('GET', `/api/jobs/${pa
 export const jobFile = (id: string, name: string) => `/api/jobs/${part(id)}/files/${part(name)}`;
 export const jobPreview = (job: JobInfo) => `/api/jobs/${part(job.id)}/preview.jpg?v=${job.preview_version}`;
 
-export function uploadCapture(file: File, { preset, binding }: Required<Pick<BuildRequest, 'preset' | 'binding'>>, onProgress?: (share: number) => void): Promise<JobInfo> {
+export function uploadCapture(file: File, { preset, binding, light }: Required<Pick<BuildRequest, 'preset' | 'binding' | 'light'>>, onProgress?: (share: number) => void): Promise<JobInfo> {
   const form = new FormData();
   form.append('preset', preset);
   form.append('binding', binding);
+  form.append('light', light);
   form.append('name', file.name.replace(/\.zip$/i, ''));
   form.append('file', file);
   return upload('/api/jobs', form, onProgress);

@@ -92,7 +92,7 @@ async function follow(started: Promise<JobInfo>): Promise<JobInfo | null> {
 }
 
 /** How a capture becomes an asset. */
-export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding'>>;
+export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding' | 'light'>>;
 
 export const buildSample = (choice: BuildChoice) => follow(api.startJob({ dataset: 'sample', ...choice }));
 export const buildCapture = (zip: File, choice: BuildChoice, onProgress: (share: number) => void) => follow(api.uploadCapture(zip, choice, onProgress));

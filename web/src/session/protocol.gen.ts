@@ -122,6 +122,8 @@ export interface BuildRequest {
   preset?: "draft" | "fast" | "full";
   /** particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face. */
   binding?: "particles" | "mesh";
+  /** What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures. */
+  light?: "auto" | "object" | "camera";
   seed?: number;
 }
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from drgs.reconstruct.progress import Progress
 from drgs_worker.jobs.capture_report import examine_capture
 from drgs_worker.jobs.progress import JobStopped, Tell
+from drgs_worker.jobs.requests import LightName
 
 DEFAULT_BUILDER = "drgs_worker.jobs.builders:build_with_drgs"
 BUILDER_VARIABLE = "DRGS_BUILDER"
@@ -34,6 +35,7 @@ class BuildRequest:
     """Preset of the stage `materials`; None: `preset`."""
     binding: str = "particles"
     """particles or mesh."""
+    light: LightName = "auto"
 
 
 Builder = Callable[[BuildRequest, Tell, Callable[[], bool]], Iterator[str]]
@@ -57,7 +59,9 @@ def build_with_drgs(request: BuildRequest, tell: Tell, should_stop: Callable[[],
     """drgs.evaluate.doctor's report, then drgs.reconstruct.build_asset.build_stages, resumed from its checkpoints where there are some."""
     from drgs.reconstruct import build_asset as build
 
-    settings = build.BuildSettings(request.preset, request.binding, request.device, request.seed, resume=True, materials=request.materials)
+    settings = build.BuildSettings(
+        request.preset, request.binding, request.device, request.seed, resume=True, light=request.light, materials=request.materials
+    )
 
     if request.materials is None:  # else the capture was examined by the build whose geometry this one takes
         tell(Progress("read", 0, 0, 0.0, message="checking the capture"))

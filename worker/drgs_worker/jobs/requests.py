@@ -17,6 +17,7 @@ from drgs_worker.store.user_names import UserName
 JobKind = Literal["build", "redecouple", "simulate", "render", "export"]
 PresetName = Literal["draft", "fast", "full"]
 BindingName = Literal["particles", "mesh"]
+LightName = Literal["auto", "object", "camera"]
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.]{0,59}$"
 """Of pictures and variants: they become parts of file names, joined by `-`."""
@@ -81,6 +82,8 @@ class BuildRequest(_Job):
     preset: PresetName = "fast"
     binding: BindingName = "particles"
     """particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face."""
+    light: LightName = "auto"
+    """What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
 
 

@@ -25,6 +25,7 @@ from drgs.maths.brdf import f0_from_base
 from drgs.maths.frames import tangents_from_normal
 from drgs.reconstruct.fit.evidence.metal_evidence import DARK
 from drgs.reconstruct.fit.evidence.seen_vertices import SeenVertices, mirrored_radiance, seen_vertices
+from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight
 from drgs.reconstruct.fit.light.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
@@ -71,15 +72,11 @@ def divisions(mesh: TriangleMesh, cameras: tuple[Camera, ...], settings: DetailS
 
 @torch.no_grad()
 def albedo_detail(
-    tracer: AbstractTracer, targets: list[ViewTarget], open_share: Tensor, tables: Tensor, edges: MeshEdges, rings: int
+    tracer: AbstractTracer, targets: list[ViewTarget], light_of: LightOf, edges: MeshEdges, rings: int
 ) -> Float[Tensor, "vertex 3"]:
-    """Of the tracer's mesh: its albedo with what the photographs show finer than `rings` neighbourhoods.
-
-    Args:
-        open_share: (vertex, 3) of irradiance_share. tables: of filter_environment.
-    """
+    """Of the tracer's mesh: its albedo with what the photographs show finer than `rings` neighbourhoods."""
     albedo = tracer.mesh.albedo
-    explained, weight = _sums_by_side(tracer, targets, open_share, tables)
+    explained, weight = _sums_by_side(tracer, targets, light_of)
     known = weight.sum(0) > 0
     if not bool(known.any()):
         return albedo
@@ -107,7 +104,7 @@ def albedo_detail(
 
 
 def _sums_by_side(
-    tracer: AbstractTracer, targets: list[ViewTarget], open_share: Tensor, tables: Tensor
+    tracer: AbstractTracer, targets: list[ViewTarget], light_of: LightOf
 ) -> tuple[Float[Tensor, "side vertex 3"], Float[Tensor, "side vertex 3"]]:
     """Both sums of the least squares, for photographs from each of SIDES sides of the vertex's normal."""
     mesh = tracer.mesh
@@ -116,7 +113,7 @@ def _sums_by_side(
         seen = seen_vertices(tracer, target)
         if len(seen.index) == 0:
             continue
-        black, slope = _linear_in_albedo(tracer, seen, open_share, tables)
+        black, slope = _linear_in_albedo(tracer, seen, light_of(target))
         normal = mesh.normals[seen.index]
         right, ahead = ((seen.wo * tangent).sum(-1) > 0 for tangent in tangents_from_normal(normal))
         place = (2 * right.long() + ahead.long()) * len(mesh.vertices) + seen.index
@@ -126,15 +123,15 @@ def _sums_by_side(
     return explained, weight
 
 
-def _linear_in_albedo(tracer: AbstractTracer, seen: SeenVertices, open_share: Tensor, tables: Tensor) -> tuple[Tensor, Tensor]:
+def _linear_in_albedo(tracer: AbstractTracer, seen: SeenVertices, light: MeshLight) -> tuple[Tensor, Tensor]:
     """(seen, 3) radiance towards the camera of vertices without albedo, and (seen, 3) what a unit of albedo adds."""
     mesh, index = tracer.mesh, seen.index
-    metallic, transmittance_and_met = mesh.metallic[index], mirrored_radiance(tracer, seen, open_share, tables)
+    metallic, transmittance_and_met = mesh.metallic[index], mirrored_radiance(tracer, seen, light)
 
     def shown(albedo: Tensor) -> Tensor:
         return shade_split_sum(
             albedo * (1 - metallic)[:, None], torch.zeros_like(albedo), f0_from_base(albedo, metallic), mesh.roughness[index],
-            mesh.normals[index], seen.wo, tables, *transmittance_and_met, open_share[index],
+            mesh.normals[index], seen.wo, light.tables, *transmittance_and_met, light.open_share[index], light.light_from_world,
         )  # fmt: skip
 
     black = shown(torch.zeros_like(seen.photo))

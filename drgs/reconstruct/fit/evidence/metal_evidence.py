@@ -10,6 +10,7 @@ Gradients never decide this: a darker light and a diffuse part trade places with
 
 Errors of shape and light spoil the predicted mirror S_v, not the constant E, so they count against metal alone: real paint hardly ever says
 "metal", real metal says "paint" wherever its normals are off. So the benefit of the doubt is metal's, and each place hears its surroundings.
+Where light turns with the camera, what arrives at paint changes from view to view as well and is predicted as badly: then there is no such benefit.
 
 In: the mesh through its tracer, photographs, light. Out: evidence in -1 (no metal) .. 1 (metal) a vertex, near 0 where nothing is known.
 """
@@ -22,6 +23,7 @@ from torch import Tensor
 
 from drgs.maths.constants import F0
 from drgs.reconstruct.fit.evidence.seen_vertices import mirrored_radiance, seen_vertices
+from drgs.reconstruct.fit.light.mesh_light import LightOf
 from drgs.reconstruct.fit.light.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
@@ -49,9 +51,7 @@ DECISIVE = 0.3
 """Agreement of a place and its surroundings, -1..1, at which evidence is 0.76."""
 
 
-def metal_evidence(
-    tracer: AbstractTracer, targets: list[ViewTarget], open_share: Tensor, tables: Tensor, edges: MeshEdges
-) -> Float[Tensor, "vertex"]:
+def metal_evidence(tracer: AbstractTracer, targets: list[ViewTarget], light_of: LightOf, edges: MeshEdges) -> Float[Tensor, "vertex"]:
     """Of the tracer's mesh, whose roughness is taken as known."""
     mesh = tracer.mesh
     count, device = len(mesh.vertices), mesh.vertices.device
@@ -63,11 +63,13 @@ def metal_evidence(
         if len(seen) == 0:
             continue
         normal, roughness = mesh.normals[seen], mesh.roughness[seen]
-        transmittance, met = mirrored_radiance(tracer, here, open_share, tables)
+        light = light_of(target)
+        transmittance, met = mirrored_radiance(tracer, here, light)
 
         white = torch.ones(len(seen), 3, device=device)
-        shaded = partial(shade_split_sum, residual=0 * white, roughness=roughness, normal=normal, wo=here.wo, tables=tables)
-        lit = partial(shaded, transmittance=transmittance, hit_radiance=met, open_share=open_share[seen])
+        shaded = partial(shade_split_sum, residual=0 * white, roughness=roughness, normal=normal, wo=here.wo, tables=light.tables)
+        shaded = partial(shaded, light_from_world=light.light_from_world)
+        lit = partial(shaded, transmittance=transmittance, hit_radiance=met, open_share=light.open_share[seen])
         b = lit(diffuse_albedo=0 * white, f0=0 * white)
         a, e = lit(diffuse_albedo=0 * white, f0=white) - b, lit(diffuse_albedo=white, f0=0 * white) - b
         y = photo - b
@@ -87,7 +89,8 @@ def metal_evidence(
     unexplained = 1 - floor / metal.clamp(min=1e-12)
     relative_error = ((torch.minimum(plain, metal) - floor).clamp(min=0) / 3).sqrt()
     trust = 1 / (1 + (relative_error / LOST) ** 4)
-    better = torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) + DOUBT * trust * unexplained
+    doubt = DOUBT if all(target.light_from_world is None for target in targets) else 0.0
+    better = torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) + doubt * trust * unexplained
     strength = torch.where(views >= FEWEST_VIEWS, trust * better.abs().clamp(max=STRONGEST), torch.zeros_like(better))
     kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER)
     return torch.tanh(kind / DECISIVE)

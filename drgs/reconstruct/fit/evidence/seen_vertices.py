@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.maths.color import linear_from_srgb
-from drgs.reconstruct.fit.light.mesh_light import radiance_along
+from drgs.reconstruct.fit.light.mesh_light import MeshLight, radiance_along
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -56,9 +56,9 @@ def seen_vertices(tracer: AbstractTracer, target: ViewTarget) -> SeenVertices:
     return SeenVertices(index, linear_from_srgb(sampled[0, :, 0].T), wo[index])
 
 
-def mirrored_radiance(tracer: AbstractTracer, seen: SeenVertices, open_share: Tensor, tables: Tensor) -> tuple[Tensor, Tensor]:
+def mirrored_radiance(tracer: AbstractTracer, seen: SeenVertices, light: MeshLight) -> tuple[Tensor, Tensor]:
     """(seen,) 1 where the mirrored view meets nothing, and (seen, 3) radiance of what it meets, 0 elsewhere; see radiance_along."""
     mesh = tracer.mesh
     normal = mesh.normals[seen.index]
     mirrored = 2 * (normal * seen.wo).sum(-1, keepdim=True) * normal - seen.wo
-    return radiance_along(tracer, mesh.vertices[seen.index] + 4 * tracer.lift * normal, mirrored, open_share, tables)
+    return radiance_along(tracer, mesh.vertices[seen.index] + 4 * tracer.lift * normal, mirrored, light)

@@ -29,6 +29,7 @@ from drgs.maths.constants import F0
 from drgs.maths.frames import tangents_from_normal
 from drgs.reconstruct.fit.evidence.metal_evidence import DARK, NOISE
 from drgs.reconstruct.fit.evidence.seen_vertices import SeenVertices, mirrored_radiance, seen_vertices
+from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight
 from drgs.reconstruct.fit.light.split_sum import LEVELS, shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.intersect.tracer import AbstractTracer
@@ -47,13 +48,11 @@ STEP = 0.02
 
 
 @torch.no_grad()
-def vertex_certainty(
-    tracer: AbstractTracer, targets: list[ViewTarget], open_share: Tensor, tables: Tensor, evidence: Float[Tensor, "vertex"]
-) -> Certainty:
+def vertex_certainty(tracer: AbstractTracer, targets: list[ViewTarget], light_of: LightOf, evidence: Float[Tensor, "vertex"]) -> Certainty:
     """Of the tracer's mesh, as it was fitted.
 
     Args:
-        open_share: (vertex, 3) of irradiance_share. tables: of filter_environment. evidence: of metal_evidence.
+        evidence: of metal_evidence.
     """
     mesh = tracer.mesh
     count, device = len(mesh.vertices), mesh.vertices.device
@@ -62,7 +61,7 @@ def vertex_certainty(
         seen = seen_vertices(tracer, target)
         if len(seen.index) == 0:
             continue
-        shown, slopes = _shading(tracer, seen, open_share, tables)
+        shown, slopes = _shading(tracer, seen, light_of(target))
         weight = 1 / (seen.photo + DARK)
         slopes = slopes * weight[..., None]
         squares.index_add_(0, seen.index, torch.einsum("nci,ncj->nij", slopes, slopes))
@@ -80,20 +79,21 @@ def vertex_certainty(
     return Certainty(*(values.clamp(0, 1).to(torch.float16) for values in (shape, albedo, roughness, metallic * evidence.abs())))
 
 
-def _shading(tracer: AbstractTracer, seen: SeenVertices, open_share: Tensor, tables: Tensor) -> tuple[Tensor, Tensor]:
+def _shading(tracer: AbstractTracer, seen: SeenVertices, light: MeshLight) -> tuple[Tensor, Tensor]:
     """(seen, 3) radiance that is predicted towards the camera, and (seen, 3, 5) its slopes in albedo, roughness, metallic and two tilts."""
     mesh, index = tracer.mesh, seen.index
     normal, albedo, metallic = mesh.normals[index], mesh.albedo[index], mesh.metallic[index]
-    transmittance, met = mirrored_radiance(tracer, seen, open_share, tables)
+    transmittance, met = mirrored_radiance(tracer, seen, light)
     none, white = torch.zeros_like(albedo), torch.ones_like(albedo)
     shade = partial(
         shade_split_sum,
         residual=none,
         wo=seen.wo,
-        tables=tables,
+        tables=light.tables,
         transmittance=transmittance,
         hit_radiance=met,
-        open_share=open_share[index],
+        open_share=light.open_share[index],
+        light_from_world=light.light_from_world,
     )
     roughness = mesh.roughness[index].clamp(LEVELS[0][0] + STEP, LEVELS[-1][0] - STEP)
     plain = partial(shade, roughness=mesh.roughness[index], normal=normal)

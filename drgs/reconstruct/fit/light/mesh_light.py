@@ -6,13 +6,17 @@ passes a gradient on: what was reflected twice is taken as known. One ray a poin
 """
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.frames import tangents_from_normal
 from drgs.reconstruct.fit.light.split_sum import shade_split_sum
+from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.integrate.environment_table import build_environment_table
 from drgs.render.integrate.sample_rays import sample_rays
 from drgs.render.intersect.trace_rays import trace_rays
@@ -31,6 +35,22 @@ CLEAR_OF_FACE = 1e-3
 """Least cosine of a mirrored ray to its face; rays below it count as free."""
 
 
+@dataclass(frozen=True, eq=False)
+class MeshLight:
+    """What light there is around a mesh when it is photographed."""
+
+    tables: Float[Tensor, "texel 3"]
+    """Of filter_environment."""
+    open_share: Float[Tensor, "vertex 3"]
+    """Of the open sky's irradiance that arrives: irradiance_share, or arriving_share where the light turns with the camera."""
+    light_from_world: Float[Tensor, "3 3"] | None = None
+    """Rotation of directions in the world to those of the tables; None: the same."""
+
+
+LightOf = Callable[[ViewTarget], MeshLight]
+"""Of each photograph; the same for all where the light stands still."""
+
+
 def at_corners(values: Tensor, corners: Tensor, weights: Tensor) -> Tensor:
     """(point, ...) of vertex values (vertex, ...) at corners (point, 3) by weights (point, 3)."""
     # index_select, whose gradient is one index_add: that of values[corners] takes five times as long on a CPU.
@@ -43,8 +63,8 @@ def corner_weights(barycentric: Tensor) -> Tensor:
     return torch.cat([1 - barycentric.sum(-1, keepdim=True), barycentric], -1)
 
 
-def hit_radiance(mesh: TriangleMesh, corners: Tensor, weights: Tensor, towards: Tensor, open_share: Tensor, tables: Tensor) -> Tensor:
-    """(point, 3) radiance that places on the mesh send in the directions `towards` (point, 3), by split sum and open_share (vertex, 3)."""
+def hit_radiance(mesh: TriangleMesh, corners: Tensor, weights: Tensor, towards: Tensor, light: MeshLight) -> Tensor:
+    """(point, 3) radiance that places on the mesh send in the directions `towards` (point, 3), by split sum."""
     normal = torch.nn.functional.normalize(at_corners(mesh.normals, corners, weights), dim=-1)
     albedo, metallic = at_corners(mesh.albedo, corners, weights), at_corners(mesh.metallic, corners, weights)
     return shade_split_sum(
@@ -54,21 +74,20 @@ def hit_radiance(mesh: TriangleMesh, corners: Tensor, weights: Tensor, towards: 
         at_corners(mesh.roughness, corners, weights),
         normal,
         towards,
-        tables,
-        open_share=at_corners(open_share, corners, weights),
+        light.tables,
+        open_share=at_corners(light.open_share, corners, weights),
+        light_from_world=light.light_from_world,
     ).clamp(min=0)
 
 
-def radiance_along(
-    tracer: AbstractTracer, origins: Tensor, directions: Tensor, open_share: Tensor, tables: Tensor
-) -> tuple[Tensor, Tensor]:
+def radiance_along(tracer: AbstractTracer, origins: Tensor, directions: Tensor, light: MeshLight) -> tuple[Tensor, Tensor]:
     """(ray,) 1 where nothing is met, and (ray, 3) radiance of what is, 0 elsewhere."""
     hits = trace_rays(origins, directions, tracer)
     radiance = torch.zeros_like(directions)
     met = hits.hit.nonzero().squeeze(1)
     if len(met):
         corners = tracer.mesh.faces[hits.face[met].long()].long()
-        radiance[met] = hit_radiance(tracer.mesh, corners, corner_weights(hits.barycentric[met]), -directions[met], open_share, tables)
+        radiance[met] = hit_radiance(tracer.mesh, corners, corner_weights(hits.barycentric[met]), -directions[met], light)
     return (~hits.hit).float(), radiance
 
 
@@ -79,8 +98,7 @@ def mirrored_light(
     normal: Tensor,
     roughness: Tensor,
     wo: Tensor,
-    open_share: Tensor,
-    tables: Tensor,
+    light: MeshLight,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Of each point (point, 3): whether a ray mirrored at a half vector drawn from its lobe escapes (point,), and what it meets (point, 3)."""
@@ -94,20 +112,18 @@ def mirrored_light(
     transmittance, met = torch.ones_like(roughness), torch.zeros_like(normal)
     above = ((mirrored * face_normal).sum(-1) > CLEAR_OF_FACE).nonzero().squeeze(1)
     origin = position[above] + tracer.lift * face_normal[above]
-    transmittance[above], met[above] = radiance_along(tracer, origin, mirrored[above], open_share, tables)
+    transmittance[above], met[above] = radiance_along(tracer, origin, mirrored[above], light)
     return transmittance, met
 
 
-def irradiance_share(
-    tracer: AbstractTracer, environment: Environment, tables: Tensor, open_share: Tensor, rays: int, generator: torch.Generator
-) -> Tensor:
+def irradiance_share(tracer: AbstractTracer, environment: Environment, light: MeshLight, rays: int, generator: torch.Generator) -> Tensor:
     """(vertex, 3) share of an open sky's irradiance that arrives, by `rays` directions a vertex.
 
     Half of them by the cosine, half by the sky's light, so that no vertex misses a lamp or counts one twice (Veach 1995); a ratio of two
     sums over the same directions, so that the sky's part is exact where nothing is met, or everything.
 
     Args:
-        open_share: (vertex, 3) as known so far: light that was reflected once more with each call.
+        light: that of the environment, with the shares known so far: what was reflected comes once more with each call.
     """
     mesh, table = tracer.mesh, build_environment_table(environment)
     by_light = rays // 2
@@ -125,7 +141,7 @@ def irradiance_share(
         origins = sampled.origin_world[:, None].expand_as(sampled.direction_world).reshape(-1, 3)
         cosine = (sampled.direction_world * normal[:, None]).sum(-1)
         weight = (sampled.weight * cosine).clamp(min=0)[..., None]
-        transmittance, met = radiance_along(tracer, origins, direction, open_share, tables)
+        transmittance, met = radiance_along(tracer, origins, direction, light)
         sky = environment_radiance(environment, direction).view(count, rays, 3) * weight
         arriving = sky * transmittance.view(count, rays, 1) + met.view(count, rays, 3) * weight
         shares.append(arriving.sum(1) / sky.sum(1).clamp(min=1e-6))

@@ -82,6 +82,12 @@ def filter_environment(radiance: Float[Tensor, "128 256 3"]) -> Float[Tensor, "t
     return torch.cat(tables)
 
 
+def level_table(tables: Float[Tensor, "texel 3"], level: int) -> Float[Tensor, "rows columns 3"]:
+    """The table of one of LEVELS, of what filter_environment gave."""
+    rows, start = LEVELS[level][1], _OFFSETS[level]
+    return tables[start : start + 2 * rows * rows].view(rows, 2 * rows, 3)
+
+
 @cache
 def brdf_table(size: int = 32, samples: int = 1024) -> Float[Tensor, "2 {size} {size}"]:
     """(2, roughness, n.v): F1 and F2 with reflectance = F0 F1 + F2, by GGX-distributed half vectors (stratified), texel centres."""
@@ -242,6 +248,7 @@ def shade_split_sum(
     transmittance: Float[Tensor, "point"] | None = None,
     hit_radiance: Float[Tensor, "point 3"] | None = None,
     open_share: Float[Tensor, "point 3"] | None = None,
+    light_from_world: Float[Tensor, "3 3"] | None = None,
 ) -> Float[Tensor, "point 3"]:
     """(point, 3) linear radiance towards wo; differentiable in all but wo. May be negative where the residual is.
 
@@ -250,7 +257,10 @@ def shade_split_sum(
         normal, wo: (point, 3) unit, world. tables: of filter_environment.
         transmittance: 1 where a mirrored ray sees the environment; hit_radiance: what it meets elsewhere, 0 where it does not. None: nothing is met.
         open_share: of the open sky's irradiance that arrives; None: all of it.
+        light_from_world: rotation of directions in the world to those of the tables; None: the same.
     """
+    if light_from_world is not None:
+        normal, wo = normal @ light_from_world.T, wo @ light_from_world.T
     factor_table = brdf_table(_TABLE_SIZE).permute(1, 2, 0).reshape(-1, 2).to(f0.device)
     if transmittance is None:
         transmittance = torch.ones_like(roughness)

@@ -16,14 +16,14 @@ In: the state of fit_surface. Out: the same, further.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import at_corners, corner_weights, radiance_along
+from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, radiance_along
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import display_image
 from drgs.reconstruct.fit.surface.fit_surface import SOLID, SurfaceRates, prior_terms
@@ -94,23 +94,12 @@ def crossed_halves(first: Tensor, second: Tensor, photo: Tensor) -> Tensor:
     return value + (crossed - crossed.detach()).mean()
 
 
-@dataclass(frozen=True, eq=False)
-class IncidentLight:
-    """What rays from the surface meet: the mesh, shaded by split sum, and the sky."""
-
-    tracer: AbstractTracer
-    open_share: Tensor
-    """(vertex, 3) of irradiance_share."""
-    tables: Tensor
-    """Of filter_environment."""
-
-
-def traced_light(light: IncidentLight, points: ShadingPoints, face_normal: Tensor, rays: Rays) -> tuple[Tensor, Tensor]:
+def traced_light(tracer: AbstractTracer, light: MeshLight, points: ShadingPoints, face_normal: Tensor, rays: Rays) -> tuple[Tensor, Tensor]:
     """(point, sample) transmittance and (point, sample, 3) hit radiance, without gradient; rays below the face count as blocked."""
     usable = (rays.weight > 0) & ((rays.direction_world * face_normal[:, None]).sum(-1) > 0)
     transmittance, met = torch.zeros_like(rays.weight), torch.zeros_like(rays.direction_world)
-    origins = (points.position_world + light.tracer.lift * face_normal)[:, None].expand_as(rays.direction_world)[usable]
-    transmittance[usable], met[usable] = radiance_along(light.tracer, origins, rays.direction_world[usable], light.open_share, light.tables)
+    origins = (points.position_world + tracer.lift * face_normal)[:, None].expand_as(rays.direction_world)[usable]
+    transmittance[usable], met[usable] = radiance_along(tracer, origins, rays.direction_world[usable], light)
     return transmittance, met
 
 
@@ -141,7 +130,7 @@ class _Steps:
         points, face_normal = self._points(target, self.solid[view], normals, materials)
         if len(points.pixel):
             photo = target.saturation.reshape(-1, 3)[points.pixel.long()]
-            first, second = (self._shown(points, face_normal, environment, photo, target.ceiling, 2 * iteration + half) for half in (0, 1))
+            first, second = (self._shown(points, face_normal, environment, photo, target, 2 * iteration + half) for half in (0, 1))
             terms["traced"] = crossed_halves(first, second, photo)
             mean = 0.5 * (first + second).detach()
             squared_error = float((mean.clamp(0, 1) - photo).square().mean())
@@ -179,13 +168,29 @@ class _Steps:
         )
         return points, self.surface.tracer.face_normals[face]
 
-    def _shown(self, points: ShadingPoints, face_normal: Tensor, environment: Tensor, photo: Tensor, ceiling: float, draw: int) -> Tensor:
+    def _shown(
+        self, points: ShadingPoints, face_normal: Tensor, environment: Tensor, photo: Tensor, target: ViewTarget, draw: int
+    ) -> Tensor:
         """(point, 3) colour in display space by one set of rays; gradients reach materials, normals and the light."""
+        turned = in_light(points, target.light_from_world)
         with torch.no_grad():
             table = build_environment_table(Environment(environment.detach()))
-            rays = sample_rays(points, table, self.settings.samples, self.settings.seed * 1_000_003 + draw)
+            rays = sample_rays(turned, table, self.settings.samples, self.settings.seed * 1_000_003 + draw)
             tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
-            light = IncidentLight(tracer, self.state.parameters["open_share"], filter_environment(environment.detach()))
-            transmittance, met = traced_light(light, points, face_normal, rays)
-        radiance = integrate_samples(points, rays, transmittance, met, environment)
-        return display_image(radiance, torch.ones_like(points.roughness), photo, ceiling)
+            light = self.surface.light_of(filter_environment(environment.detach()))(target)
+            transmittance, met = traced_light(tracer, light, points, face_normal, in_world(rays, target.light_from_world))
+        radiance = integrate_samples(turned, rays, transmittance, met, environment)
+        return display_image(radiance, torch.ones_like(points.roughness), photo, target.ceiling)
+
+
+def in_light(points: ShadingPoints, light_from_world: Tensor | None) -> ShadingPoints:
+    """The same points with directions as the light's table has them: shading asks of normal and view nothing but their angles to each other
+    and to the light. Positions stay."""
+    if light_from_world is None:
+        return points
+    return replace(points, normal_world=points.normal_world @ light_from_world.T, wo_world=points.wo_world @ light_from_world.T)
+
+
+def in_world(rays: Rays, light_from_world: Tensor | None) -> Rays:
+    """The same rays with directions in the world, of ones that were sampled in_light."""
+    return rays if light_from_world is None else replace(rays, direction_world=rays.direction_world @ light_from_world)

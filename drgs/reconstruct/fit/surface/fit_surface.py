@@ -22,7 +22,7 @@ from torch import Tensor
 from drgs.maths.brdf import f0_from_base
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import at_corners, corner_weights, mirrored_light
+from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, mirrored_light
 from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.fit.losses import display_image, rough_light, white_light
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
@@ -197,17 +197,18 @@ class _Steps:
         normal = torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1)
         albedo, roughness, metallic = (at_corners(materials[name], corners, weights) for name in ("albedo", "roughness", "metallic"))
         tables = filter_environment(environment)
-        share = self.state.parameters["open_share"]
+        light = self.surface.light_of(tables)(target)
+        share, turn = light.open_share, light.light_from_world
         with torch.no_grad():
             tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
             position = at_corners(tracer.mesh.vertices, corners, weights)
             transmittance, met = mirrored_light(
-                tracer, position, tracer.face_normals[face], normal.detach(), roughness.detach(), wo, share, tables.detach(),
-                self.state.generator,
+                tracer, position, tracer.face_normals[face], normal.detach(), roughness.detach(), wo,
+                MeshLight(tables.detach(), share, turn), self.state.generator,
             )  # fmt: skip
         radiance = shade_split_sum(
             albedo * (1 - metallic)[:, None], torch.zeros_like(albedo), f0_from_base(albedo, metallic), roughness, normal, wo, tables,
-            transmittance, met, at_corners(share, corners, weights),
+            transmittance, met, at_corners(share, corners, weights), turn,
         )  # fmt: skip
         photo = target.saturation.reshape(-1, 3)[pixels]
         return pixels, display_image(radiance, torch.ones_like(roughness), photo, target.ceiling)

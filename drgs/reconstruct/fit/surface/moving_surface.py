@@ -12,8 +12,9 @@ from torch import Tensor
 from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import irradiance_share
+from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, irradiance_share
 from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outlines, outline_residuals
@@ -47,6 +48,8 @@ class MovingSurface:
         self._outlines: list[MaskOutline | None] = mask_outlines(views) if views.has_masks else [None] * len(self._cameras)
         self.edges = mesh_edges(faces)
         self.tracer = self._tracer()
+        self._turned = views.light_from_world is not None
+        self._sky = seen_sky(self.tracer) if self._turned else None
 
     def _tracer(self) -> AbstractTracer:
         tracer = build_tracer(mesh_from_surface_fit(self._state, self.faces))
@@ -67,16 +70,29 @@ class MovingSurface:
         back = (1 - settings.to_surface) * normals + settings.to_surface * own
         parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))
         self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
+        if self._turned:
+            self._sky = seen_sky(self.tracer)
+            return
         radiance = environment_table(parameters)
-        tables, share = filter_environment(radiance), parameters["open_share"]
-        share.copy_(irradiance_share(self.tracer, Environment(radiance), tables, share, settings.share_rays, self._state.generator))
+        light = MeshLight(filter_environment(radiance), parameters["open_share"])
+        share = irradiance_share(self.tracer, Environment(radiance), light, settings.share_rays, self._state.generator)
+        parameters["open_share"].copy_(share)
+
+    def light_of(self, tables: Tensor) -> LightOf:
+        """What light arrives at the surface in each photograph.
+
+        Args:
+            tables: of filter_environment.
+        """
+        parameters = self._state.parameters
+        return light_of_views(tables, parameters["open_share"], torch.sigmoid(parameters["albedo_logits"].detach()), self._sky)
 
     @torch.no_grad()
     def look_for_metal(self, targets: list[ViewTarget]) -> None:
         """What the photographs say now of which places are metal."""
         parameters = self._state.parameters
         tables = filter_environment(environment_table(parameters))
-        parameters["metal"].copy_(metal_evidence(self.tracer, targets, parameters["open_share"], tables, self.edges))
+        parameters["metal"].copy_(metal_evidence(self.tracer, targets, self.light_of(tables), self.edges))
 
 
 def mesh_from_surface_fit(state: FitState, faces: Tensor) -> TriangleMesh:

@@ -122,9 +122,13 @@ def _start_pass(fit: SurfaceFit, values: dict[str, Tensor], settings: PassSettin
 
 
 def carve_and_start_next_pass(fit: SurfaceFit, targets: list[ViewTarget], settings: PassSettings, radius: float) -> None:
-    """The steps between two passes. A surface that carving and solves have undone is not meshed anew: the pass starts on the mesh before them."""
+    """The steps between two passes. A surface that carving and solves have undone is not meshed anew: the pass starts on the mesh before them.
+
+    Args:
+        targets: to look for hollows in; empty: none are looked for.
+    """
     before = {name: value.detach().clone() for name, value in fit.state.parameters.items()}
-    if fit.index + 1 in settings.carve_after:
+    if targets:
         carve_hollows(fit, targets, settings.carve, radius)
     try:
         start_next_pass(fit, settings, radius)
@@ -158,5 +162,7 @@ def fit_surface_in_passes(
             return False
         if fit.index + 1 >= settings.passes:
             return True
-        targets = view_targets(views, 1.0, fit.faces.device) if fit.index + 1 in settings.carve_after else []
+        # Under light that turns with the camera paint does not look alike from all sides, so nothing says where it lies.
+        carves = fit.index + 1 in settings.carve_after and views.light_from_world is None
+        targets = view_targets(views, 1.0, fit.faces.device) if carves else []
         carve_and_start_next_pass(fit, targets, settings, radius)

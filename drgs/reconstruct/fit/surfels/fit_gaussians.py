@@ -130,7 +130,9 @@ class _Steps:
         target = self._drawn_target(iteration)
         environment = environment_table(parameters)
         tables = filter_environment(environment)
-        maps = render_stage_one(parameters, tables, target.camera, near_plane(self.radius), self._sh_degree(progress))
+        maps = render_stage_one(
+            parameters, tables, target.camera, near_plane(self.radius), self._sh_degree(progress), target.light_from_world
+        )
         image = displayed(maps, target, parameters.get("background"))
         terms = stage_one_terms(maps, image, target, environment, self.settings, self.views.has_masks, normal_share(progress))
         return StepLoss(terms, target.camera, squared_error(image, target))
@@ -176,13 +178,15 @@ class _Steps:
 
 def drawn_object(
     parameters: dict[str, Tensor], radius: float, sh_degree: int
-) -> Callable[[Camera], tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]]:
-    """What a camera sees of the surfels: linear radiance where they cover all, and coverage."""
+) -> Callable[[ViewTarget], tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]]:
+    """What a view's camera sees of the surfels: linear radiance where they cover all, and coverage."""
     tables = filter_environment(environment_table(parameters)).detach()
 
     @torch.no_grad()
-    def drawn(camera: Camera) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
-        maps = render_stage_one(parameters, tables, camera.to(tables.device), near_plane(radius), sh_degree)
+    def drawn(target: ViewTarget) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
+        camera, turn = target.camera.to(tables.device), target.light_from_world
+        turn = None if turn is None else turn.to(tables.device)
+        maps = render_stage_one(parameters, tables, camera, near_plane(radius), sh_degree, turn)
         return maps.radiance_linear, maps.coverage
 
     return drawn

@@ -138,7 +138,9 @@ def fit_mesh_surfels(
         target = targets[drawn_view(iteration, len(targets), settings.seed + 1)]
         environment = environment_table(parameters)
         tables = filter_environment(environment)
-        maps = render_stage_one(surfels_on_faces(state), tables, target.camera, near_plane(radius), weights.sh_degree)
+        maps = render_stage_one(
+            surfels_on_faces(state), tables, target.camera, near_plane(radius), weights.sh_degree, target.light_from_world
+        )
         image = displayed(maps, target, None)
         terms = stage_one_terms(maps, image, target, environment, weights, views.has_masks)
         return StepLoss(terms, target.camera, squared_error(image, target))

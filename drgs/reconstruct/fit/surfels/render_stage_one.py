@@ -33,7 +33,12 @@ class StageOneMaps:
 
 
 def render_stage_one(
-    parameters: dict[str, Tensor], tables: Float[Tensor, "texel 3"], camera: Camera, near: float, sh_degree: int
+    parameters: dict[str, Tensor],
+    tables: Float[Tensor, "texel 3"],
+    camera: Camera,
+    near: float,
+    sh_degree: int,
+    light_from_world: Float[Tensor, "3 3"] | None = None,
 ) -> StageOneMaps:
     """Blend, normalise by coverage, shade once a pixel; differentiable."""
     rotation = rotation_from_quat_wxyz(parameters["quats"])
@@ -56,7 +61,9 @@ def render_stage_one(
     _, directions = pixel_rays_world(camera)
     wo = -directions.reshape(-1, 3)[pixels]
     normal = face_camera(values[:, :3], wo)
-    radiance = shade_split_sum(values[:, 3:6], values[:, 10:13], values[:, 6:9], values[:, 9], normal, wo, tables)
+    radiance = shade_split_sum(
+        values[:, 3:6], values[:, 10:13], values[:, 6:9], values[:, 9], normal, wo, tables, light_from_world=light_from_world
+    )
     size = (camera.height, camera.width)
 
     def image(packed: Float[Tensor, "pixel channel"]) -> Float[Tensor, "height width channel"]:

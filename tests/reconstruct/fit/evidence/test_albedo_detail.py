@@ -11,7 +11,7 @@ from drgs.reconstruct.geometry.average_around import averaging_matrix
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.mesh import TriangleMesh
-from tests.reconstruct.fit.evidence.test_metal_evidence import light, pictures
+from tests.reconstruct.fit.evidence.test_metal_evidence import light, open_light, pictures
 from tests.render.closed_form_scenes import sphere_mesh
 
 RINGS = 8
@@ -33,9 +33,7 @@ def striped(metallic: float) -> tuple[TriangleMesh, TriangleMesh]:
 def test_stripes_come_back_and_what_is_wrong_everywhere_stays(metallic: float) -> None:
     mesh, blurred = striped(metallic)
     tables = filter_environment(light())
-    found = albedo_detail(
-        build_tracer(blurred), pictures(mesh, tables), torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces), RINGS
-    )
+    found = albedo_detail(build_tracer(blurred), pictures(mesh, tables), open_light(mesh, tables), mesh_edges(mesh.faces), RINGS)
     seen = mesh.vertices[:, 2].abs() < 0.5
     wanted = 0.75 * mesh.albedo[seen, 0]
     before, after = ((albedo[seen, 0] - wanted).square().mean().sqrt() for albedo in (blurred.albedo, found))
@@ -48,9 +46,9 @@ def test_what_photographs_from_both_sides_contradict_is_not_painted() -> None:
     mesh, blurred = striped(0.0)
     tables = filter_environment(light())
     deep = dataclasses.replace(blurred, vertices=0.85 * blurred.vertices)
-    shown, ones = pictures(mesh, tables), torch.ones_like(mesh.vertices)
+    shown = pictures(mesh, tables)
     right, wrong = (
-        albedo_detail(build_tracer(fitted), shown, ones, tables, mesh_edges(mesh.faces), RINGS) / fitted.albedo - 1
+        albedo_detail(build_tracer(fitted), shown, open_light(mesh, tables), mesh_edges(mesh.faces), RINGS) / fitted.albedo - 1
         for fitted in (blurred, deep)
     )
     seen = mesh.vertices[:, 2].abs() < 0.5
@@ -60,7 +58,7 @@ def test_what_photographs_from_both_sides_contradict_is_not_painted() -> None:
 def test_what_no_photograph_shows_keeps_its_albedo() -> None:
     mesh, blurred = striped(0.0)
     tables = filter_environment(light())
-    found = albedo_detail(build_tracer(blurred), [], torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces), RINGS)
+    found = albedo_detail(build_tracer(blurred), [], open_light(mesh, tables), mesh_edges(mesh.faces), RINGS)
     assert torch.equal(found, blurred.albedo)
 
 

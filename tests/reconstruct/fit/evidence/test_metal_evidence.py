@@ -8,8 +8,9 @@ import torch
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.color import srgb_from_linear
 from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
-from drgs.reconstruct.fit.light.mesh_light import at_corners, corner_weights
+from drgs.reconstruct.fit.light.mesh_light import LightOf, at_corners, corner_weights
 from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
+from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
@@ -30,9 +31,20 @@ def light() -> torch.Tensor:
     return radiance
 
 
-def pictures(mesh: TriangleMesh, tables: torch.Tensor) -> list[ViewTarget]:
+def open_light(mesh: TriangleMesh, tables: torch.Tensor) -> LightOf:
+    """Light that nothing keeps from arriving."""
+    return light_of_views(tables, torch.ones_like(mesh.vertices), mesh.albedo, None)
+
+
+def pictures(mesh: TriangleMesh, tables: torch.Tensor, turned: bool = False) -> list[ViewTarget]:
+    """Of the sphere, all around.
+
+    Args:
+        turned: the light stands still with the camera.
+    """
     tracer, targets = build_tracer(mesh), []
     for camera in views_of_a_unit_sphere()[0]:
+        turn = camera.camera_from_world[:3, :3] if turned else None
         origin, directions = pixel_rays_world(camera)
         flat = directions.reshape(-1, 3)
         hits = trace_rays(origin.expand_as(flat), flat, tracer)
@@ -42,13 +54,13 @@ def pictures(mesh: TriangleMesh, tables: torch.Tensor) -> list[ViewTarget]:
         albedo, metallic = at_corners(mesh.albedo, corners, weights), at_corners(mesh.metallic, corners, weights)
         radiance = shade_split_sum(
             albedo * (1 - metallic)[:, None], 0 * albedo, f0_from_base(albedo, metallic), at_corners(mesh.roughness, corners, weights),
-            normal, -flat[hit], tables,
+            normal, -flat[hit], tables, light_from_world=turn,
         )  # fmt: skip
         photo, mask = torch.zeros(len(flat), 3), torch.zeros(len(flat))
         photo[hit], mask[hit] = srgb_from_linear(radiance).clamp(0, 1), 1.0
         size = (camera.height, camera.width)
         photo, mask = photo.view(*size, 3), mask.view(size)
-        targets.append(ViewTarget(camera, photo, photo, mask, slice(0, size[0]), slice(0, size[1])))
+        targets.append(ViewTarget(camera, photo, photo, mask, slice(0, size[0]), slice(0, size[1]), light_from_world=turn))
     return targets
 
 
@@ -58,7 +70,7 @@ def test_each_is_known_for_what_it_is_whatever_was_thought_before(metallic: floa
     tables = filter_environment(light())
     targets = pictures(mesh, tables)
     guessed = dataclasses.replace(mesh, metallic=torch.full((642,), 0.5), albedo=torch.full((642, 3), 0.3))
-    evidence = metal_evidence(build_tracer(guessed), targets, torch.ones(642, 3), tables, mesh_edges(mesh.faces))
+    evidence = metal_evidence(build_tracer(guessed), targets, open_light(mesh, tables), mesh_edges(mesh.faces))
     seen = evidence != 0  # the twelve views go around the equator
     assert float(seen.float().mean()) > 0.3
     assert float(((2 * metallic - 1) * evidence > 0.5)[seen].float().mean()) > 0.95
@@ -68,7 +80,7 @@ def test_a_sphere_half_of_metal_is_divided_where_it_is():
     mesh = sphere_mesh(subdivisions=4, albedo=0.6, roughness=0.3)
     mesh = dataclasses.replace(mesh, metallic=(mesh.vertices[:, 2] > 0).float())
     tables = filter_environment(light())
-    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces))
+    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), open_light(mesh, tables), mesh_edges(mesh.faces))
     away = (mesh.vertices[:, 2].abs() > 0.3) & (evidence != 0)
     assert int(away.sum()) > 200
     right = (evidence > 0) == (mesh.vertices[:, 2] > 0)
@@ -78,9 +90,7 @@ def test_a_sphere_half_of_metal_is_divided_where_it_is():
 def test_what_no_view_shows_is_left_open():
     mesh = sphere_mesh(subdivisions=3)
     tables = filter_environment(light())
-    evidence = metal_evidence(
-        build_tracer(mesh), pictures(mesh, tables)[:1], torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces)
-    )
+    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables)[:1], open_light(mesh, tables), mesh_edges(mesh.faces))
     assert float(evidence.abs().max()) == 0.0
 
 
@@ -91,7 +101,7 @@ def test_wrong_normals_do_not_turn_one_into_the_other(metallic: float):
     targets = pictures(mesh, tables)
     tilt = 0.15 * torch.sin(9 * mesh.vertices.roll(1, 1))
     tilted = dataclasses.replace(mesh, normals=torch.nn.functional.normalize(mesh.normals + tilt, dim=-1))
-    evidence = metal_evidence(build_tracer(tilted), targets, torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces))
+    evidence = metal_evidence(build_tracer(tilted), targets, open_light(mesh, tables), mesh_edges(mesh.faces))
     around = mesh.vertices[:, 2].abs() < 0.6
     assert float(((2 * metallic - 1) * evidence > 0)[around].float().mean()) > 0.98
 
@@ -99,5 +109,19 @@ def test_wrong_normals_do_not_turn_one_into_the_other(metallic: float):
 def test_paint_that_looks_the_same_from_everywhere_is_not_called_metal_for_want_of_proof():
     mesh = sphere_mesh(subdivisions=3, albedo=0.6, roughness=1.0)
     tables = filter_environment(torch.ones(128, 256, 3))
-    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), torch.ones_like(mesh.vertices), tables, mesh_edges(mesh.faces))
+    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), open_light(mesh, tables), mesh_edges(mesh.faces))
     assert float(evidence.max()) < 0.3
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_under_light_that_turns_with_the_camera_each_is_known_as_well(metallic: float):
+    mesh = dataclasses.replace(sphere_mesh(subdivisions=4, albedo=0.6, roughness=0.25), metallic=torch.full((2562,), metallic))
+    tables = filter_environment(light())
+    targets = pictures(mesh, tables, turned=True)
+    tilt = 0.05 * torch.sin(9 * mesh.vertices.roll(1, 1))
+    tilted = dataclasses.replace(mesh, normals=torch.nn.functional.normalize(mesh.normals + tilt, dim=-1))
+    tracer = build_tracer(tilted)
+    light_of = light_of_views(tables, torch.ones_like(mesh.vertices), mesh.albedo, seen_sky(tracer))
+    evidence = metal_evidence(tracer, targets, light_of, mesh_edges(mesh.faces))
+    around = mesh.vertices[:, 2].abs() < 0.6
+    assert float(((2 * metallic - 1) * evidence > 0)[around].float().mean()) > 0.95

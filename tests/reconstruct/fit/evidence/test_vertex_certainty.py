@@ -14,7 +14,7 @@ from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.certainty import Certainty
 from drgs.scene.mesh import TriangleMesh
-from tests.reconstruct.fit.evidence.test_metal_evidence import light, pictures
+from tests.reconstruct.fit.evidence.test_metal_evidence import light, open_light, pictures
 from tests.render.closed_form_scenes import sphere_mesh
 
 
@@ -24,9 +24,9 @@ def ball(metallic: float, roughness: float = 0.25) -> TriangleMesh:
 
 
 def certainty_of(mesh: TriangleMesh, targets: list[ViewTarget], tables: Tensor) -> Certainty:
-    tracer, share = build_tracer(mesh), torch.ones_like(mesh.vertices)
-    evidence = metal_evidence(tracer, targets, share, tables, mesh_edges(mesh.faces))
-    return vertex_certainty(tracer, targets, share, tables, evidence)
+    tracer, light_of = build_tracer(mesh), open_light(mesh, tables)
+    evidence = metal_evidence(tracer, targets, light_of, mesh_edges(mesh.faces))
+    return vertex_certainty(tracer, targets, light_of, evidence)
 
 
 @pytest.mark.parametrize(("metallic", "known"), [(1.0, ("shape", "roughness", "metallic")), (0.0, ("albedo", "metallic"))])

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from drgs.reconstruct.fit.light.mesh_light import SHARE_LIFT, irradiance_share
+from drgs.reconstruct.fit.light.mesh_light import SHARE_LIFT, MeshLight, irradiance_share
 from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, filter_environment, texel_directions, texel_solid_angles
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -48,7 +48,7 @@ def summed_share(tracer: AbstractTracer, environment: Environment, vertex: int) 
 def shares(tracer: AbstractTracer, environment: Environment, rays: int) -> torch.Tensor:
     open_share = torch.zeros_like(tracer.mesh.vertices)
     tables = filter_environment(environment.radiance)
-    return irradiance_share(tracer, environment, tables, open_share, rays, torch.Generator().manual_seed(1))
+    return irradiance_share(tracer, environment, MeshLight(tables, open_share), rays, torch.Generator().manual_seed(1))
 
 
 @pytest.mark.parametrize("sky", ["even", "lamp"])

@@ -7,9 +7,9 @@ import torch
 
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
+from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface.fit_mesh_materials import (
-    IncidentLight,
     MeshMaterialSettings,
     crossed_halves,
     fit_mesh_materials,
@@ -31,8 +31,8 @@ from tests.render.closed_form_scenes import sphere_mesh
 def test_on_a_convex_surface_rays_above_it_see_the_sky_and_others_bring_nothing():
     mesh = sphere_mesh(subdivisions=3)
     points, rays = rays_of_convex(mesh)
-    light = IncidentLight(build_tracer(mesh), torch.ones_like(mesh.vertices), filter_environment(torch.ones(128, 256, 3)))
-    assert_only_the_sky_is_seen(points, rays, *traced_light(light, points, points.normal_world, rays))
+    light = MeshLight(filter_environment(torch.ones(128, 256, 3)), torch.ones_like(mesh.vertices))
+    assert_only_the_sky_is_seen(points, rays, *traced_light(build_tracer(mesh), light, points, points.normal_world, rays))
 
 
 def test_the_gradient_of_crossed_halves_does_not_lean_towards_low_variance():

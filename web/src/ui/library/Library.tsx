@@ -15,7 +15,7 @@ import { Icon } from '../icons';
 import { libraryOpen } from '../layout';
 import { Jobs } from './Jobs';
 
-const build = signal<BuildChoice>({ preset: 'fast', binding: 'particles' });
+const build = signal<BuildChoice>({ preset: 'fast', binding: 'particles', light: 'auto' });
 /** Share of the upload under way; null while there is none. */
 const uploading = signal<{ name: string; share: number } | null>(null);
 
@@ -70,6 +70,16 @@ function NewBuild() {
             { value: 'mesh', text: 'On the mesh', title: 'Rebuilt on its faces, one a face: they follow every deformation exactly, highlights are a little softer' },
           ]}
           onChange={(binding) => (build.value = { ...build.value, binding })}
+        />
+        <Choice
+          label="Lamps stood still"
+          value={build.value.light}
+          options={[
+            { value: 'auto', text: 'Find out', title: 'By what is around the object in the pictures, and by how its brightness changes' },
+            { value: 'object', text: 'With the object', title: 'The camera went around it' },
+            { value: 'camera', text: 'With the camera', title: 'The object stood on a turntable' },
+          ]}
+          onChange={(light) => (build.value = { ...build.value, light })}
         />
       </details>
       <div class="buttons">

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from drgs.reconstruct.progress import POSED, STAGE_SHARES
 from drgs_worker.jobs.builders import BuildRequest
+from drgs_worker.jobs.requests import LightName
 from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
 from drgs_worker.store.artifacts import fetch_capture, refresh_job
@@ -26,6 +27,7 @@ class BuildRun(AbstractJobRun):
         self._job = job
         self._stages: Iterator[str] | None = None
         self._binding: str = job.parameters.get("binding", "particles")
+        self._light: LightName = job.parameters.get("light", "auto")
         self.steps: tuple[str, ...] = (*STAGE_SHARES[self._binding], "register")
 
     def run(self, step: str) -> None:
@@ -49,7 +51,8 @@ class BuildRun(AbstractJobRun):
         job = self._job
         assert job.dataset is not None
         given = job.parameters
-        return BuildRequest(job.dataset, job.folder / "asset", given["preset"], given["seed"], job.device, binding=self._binding)
+        out = job.folder / "asset"
+        return BuildRequest(job.dataset, out, given["preset"], given["seed"], job.device, binding=self._binding, light=self._light)
 
     def _register(self) -> None:
         """Does nothing that was already done."""
@@ -102,4 +105,5 @@ class RedecoupleRun(BuildRun):
         job, given = self._job, self._job.parameters
         assert job.dataset is not None
         out = job.folder / "asset"
-        return BuildRequest(job.dataset, out, given["built_preset"], given["built_seed"], job.device, given["preset"], self._binding)
+        preset, seed = given["built_preset"], given["built_seed"]
+        return BuildRequest(job.dataset, out, preset, seed, job.device, given["preset"], self._binding, self._light)

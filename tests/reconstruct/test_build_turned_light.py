@@ -1,0 +1,110 @@
+"""A ball on a turntable becomes an asset whose light stands still with the camera: found out or said, kept, resumed, rendered."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from drgs.evaluate.evaluate_asset import own_light_from_world
+from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, build_asset
+from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.surface.surface_passes import PassSettings
+from drgs.render.records import RenderSettings
+from drgs.render.render_cameras import render_cameras
+from drgs.scene.asset import Asset, load_asset, save_asset
+from drgs.scene.edits import EnvironmentEdit
+from drgs.scene.posed_scene import PosedScene
+from tests.reconstruct.capture.test_turning_light import write_turntable
+from tests.reconstruct.test_build_asset import TINY, asset_tensors
+
+SETTINGS = BuildSettings(preset="tiny", device="cpu")
+LONGER = replace(
+    TINY,
+    fit=replace(TINY.fit, iterations=200),
+    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=100), TINY.surface.mesh),
+    materials=MeshMaterialSettings(iterations=100, points_a_step=256, samples=TINY.materials.samples),
+)
+
+
+@pytest.fixture(autouse=True)
+def _presets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setitem(PRESETS, "longer", LONGER)
+
+
+@pytest.fixture(scope="module")
+def turntable(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_turntable(tmp_path_factory.mktemp("turntable"), lamp_on_camera=True, same_around=True)
+
+
+def test_light_that_turns_is_found_out_kept_and_goes_on_where_it_stopped(turntable: Path, tmp_path: Path) -> None:
+    through = build_asset(turntable, tmp_path / "a", SETTINGS)
+    assert through.light_frame == "camera" and through.provenance["light"]["frame"] == "camera"
+    assert "what is around the object stays the same" in through.provenance["light"]["why"]
+    assert load_asset(tmp_path / "a").light_frame == "camera"
+    told: list[str] = []
+    said = replace(SETTINGS, light="camera")
+    with pytest.raises(BuildStopped):
+        build_asset(turntable, tmp_path / "b", said, lambda p: told.append(p.stage), lambda: told.count("surface") > 3)
+    resumed = build_asset(turntable, tmp_path / "b", replace(said, resume=True))
+    for name, value in asset_tensors(through).items():
+        assert torch.equal(asset_tensors(resumed)[name], value), name
+    with pytest.raises(ValueError, match="of another build"):
+        build_asset(turntable, tmp_path / "b", replace(SETTINGS, light="object", resume=True))
+
+
+def test_what_was_built_without_a_turn_does_not_go_on_with_one(turntable: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    with pytest.raises(BuildStopped):
+        build_asset(turntable, tmp_path / "a", replace(SETTINGS, light="object"), lambda p: told.append(p.stage), lambda: "fit" in told)
+    with pytest.raises(ValueError, match="of another build"):
+        build_asset(turntable, tmp_path / "a", replace(SETTINGS, light="camera", resume=True))
+
+
+def error_of_renders(asset: Asset, folder: Path, turntable: Path) -> float:
+    """Root mean square difference from the photographs, inside the ball, of display values 0..1 after one factor: so short a fit is too bright."""
+    scene = PosedScene(None, asset.mesh, asset.environment, preferred="mesh")
+    cameras = asset.cameras[:6]
+    render_cameras(scene, cameras, folder, RenderSettings(samples_per_pixel=32), light_from_world=own_light_from_world(asset, []))
+    pairs = []
+    for camera in cameras:
+        shown = np.asarray(Image.open(folder / f"{camera.name}.png"), float) / 255
+        photo = np.asarray(Image.open(turntable / f"{camera.name}.png"), float)[..., :3] / 255
+        inside = (shown[..., 3] > 0.99) & (np.asarray(Image.open(turntable / f"{camera.name}_mask.png")) > 250)
+        pairs.append(np.stack([shown[..., :3][inside], photo[inside]]))
+    shown, photo = np.concatenate(pairs, 1)
+    return float(np.sqrt(np.mean((photo - shown * (shown * photo).sum() / (shown * shown).sum()) ** 2)))
+
+
+@pytest.mark.slow
+def test_with_the_right_frame_pictures_are_explained_and_with_the_wrong_one_not(turntable: Path, tmp_path: Path) -> None:
+    right, wrong = (
+        build_asset(turntable, tmp_path / light, BuildSettings(preset="longer", device="cpu", light=light))
+        for light in ("camera", "object")
+    )
+    errors = [error_of_renders(asset, tmp_path / f"{asset.light_frame}_renders", turntable) for asset in (right, wrong)]
+    assert errors[0] < 0.05 and errors[0] < 0.7 * errors[1], errors
+
+
+def test_another_light_stands_still_with_the_object(turntable: Path, tmp_path: Path) -> None:
+    asset = build_asset(turntable, tmp_path / "a", SETTINGS)
+    camera = asset.cameras[3]
+    turn = own_light_from_world(asset, [EnvironmentEdit(op="environment", rotation=30.0)])(camera)
+    assert turn is not None and not torch.allclose(turn, torch.eye(3), atol=0.1)
+    assert own_light_from_world(asset, [EnvironmentEdit(op="environment", file="sky.exr")])(camera) is None
+    assert own_light_from_world(replace(asset, light_frame="object"), [])(camera) is None
+
+
+def test_an_asset_without_cameras_cannot_have_light_that_stands_still_with_them(turntable: Path, tmp_path: Path) -> None:
+    asset = build_asset(turntable, tmp_path / "a", SETTINGS)
+    with pytest.raises(ValueError, match="it has no cameras"):
+        save_asset(replace(asset, cameras=()), tmp_path / "none")
+
+
+def test_an_unknown_frame_is_refused(turntable: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="light 'sun' is unknown; expected one of auto, object, camera"):
+        build_asset(turntable, tmp_path / "a", BuildSettings(preset="tiny", light="sun"))  # type: ignore[arg-type]
