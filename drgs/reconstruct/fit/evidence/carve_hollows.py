@@ -3,7 +3,8 @@
 The mesh begins on the visual hull, which fills what lies between parts of an object; shading cannot empty it, for a bump of the right paint
 explains most pictures. But paint looks alike from all sides: at its true depth the views that would see it agree. So each vertex is looked at
 in steps along its inward normal. A view sees a place behind the surface if its ray enters the mesh near the vertex and does not leave it
-before. The step where colours differ least is the vertex's wish, if they differ much less there than on the surface. Wishes are averaged with what
+before, and of those only the ones that look most steeply count: into a narrow hollow the others would see its walls, which the mesh does not have yet.
+The step where colours differ least is the vertex's wish, if they differ much less there than on the surface. Wishes are averaged with what
 the surroundings want, by a sparse linear solve, in which vertices that have no wish hold their place.
 
 Mirrors agree nowhere, so metal and smooth surfaces hold their place: their shape is told by what they mirror (fit_surface). Source: the idea is
@@ -61,6 +62,10 @@ class CarveSettings:
     agreeing: float = 0.5
     """Share of a neighbourhood that must have wishes, too."""
     fewest_views: int = 5
+    steepest: float = 0.4
+    """Share of the views that count, those nearest to the inward direction ..."""
+    fewest_steep: int = 6
+    """... but so many at least."""
     direction_rings: int = 10
     """Neighbourhoods over which normals are averaged for the direction."""
     cost_rings: int = 4
@@ -98,7 +103,8 @@ def carved_depths(
         return inward, torch.zeros_like(mesh.roughness)
     costs = []
     for step in range(settings.steps + 1):
-        difference, views = view_differences(tracer, targets, matt, inward[matt], step * settings.step * radius, radius)
+        depth = step * settings.step * radius
+        difference, views = view_differences(tracer, targets, matt, inward[matt], depth, radius, settings.steepest, settings.fewest_steep)
         known = views >= settings.fewest_views
         sums = torch.zeros(len(mesh.vertices), 2, device=matt.device)
         sums[matt[known]] = torch.stack([difference * views, views], -1)[known]
@@ -125,14 +131,25 @@ def carved_depths(
 
 
 def view_differences(
-    tracer: AbstractTracer, targets: list[ViewTarget], vertices: Tensor, inward: Tensor, depth: float, radius: float
+    tracer: AbstractTracer,
+    targets: list[ViewTarget],
+    vertices: Tensor,
+    inward: Tensor,
+    depth: float,
+    radius: float,
+    steepest: float = 1.0,
+    fewest_steep: int = 0,
 ) -> tuple[Tensor, Tensor]:
     """(n,) mean difference from the median colour among views that would see the places `depth` behind the vertices (n,), and how many those are.
 
     The third that differs most is left out: highlights.
+
+    Args:
+        steepest: share of the views that are asked, those that look most nearly along `inward` (n, 3), but `fewest_steep` at least.
     """
     place = tracer.mesh.vertices[vertices] + depth * inward
     shown = torch.full((len(targets), len(vertices), 3), torch.nan, device=place.device)
+    along = torch.full(shown.shape[:2], -1.0, device=place.device)
     for index, target in enumerate(targets):
         camera = target.camera
         offset = place - camera.center_world
@@ -142,14 +159,18 @@ def view_differences(
         homogeneous = at @ camera.intrinsics.T
         pixel = homogeneous[:, :2] / homogeneous[:, 2:]
         size = torch.tensor([camera.width, camera.height], device=place.device)
-        seen = ((direction * inward).sum(1) > FACING) & (at[:, 2] > 0) & (pixel > 1).all(1) & (pixel < size - 1).all(1)
+        cosine = (direction * inward).sum(1)
+        seen = (cosine > FACING) & (at[:, 2] > 0) & (pixel > 1).all(1) & (pixel < size - 1).all(1)
         seen = seen.nonzero().squeeze(1)
         seen = seen[_would_be_seen(tracer, camera.center_world, direction[seen], distance[seen], vertices[seen], depth, radius)]
         grid = (2 * pixel[seen] / size - 1)[None, None]
         picture = torch.cat([target.saturation, target.mask[..., None]], -1).permute(2, 0, 1)[None]
         sampled = torch.nn.functional.grid_sample(picture, grid, mode="bilinear", align_corners=False)[0, :, 0].T
         inside = sampled[:, 3] > INSIDE
-        shown[index, seen[inside]] = sampled[inside, :3]
+        shown[index, seen[inside]], along[index, seen[inside]] = sampled[inside, :3], cosine[seen[inside]]
+    asked = (steepest * (along > 0).sum(0)).ceil().clamp(min=fewest_steep)
+    rank = along.argsort(0, descending=True).argsort(0)
+    shown[rank >= asked] = torch.nan
     difference = (shown - shown.nanmedian(0).values).abs().mean(-1)
     count = (~torch.isnan(difference)).sum(0)
     ordered = difference.nan_to_num(nan=torch.inf).sort(0).values
