@@ -3,9 +3,11 @@
 Each vertex moves along its own normal by s, which minimises
 
     sum_edges w_e ((x_i - x_j) . n_e / |x_i - x_j|)^2  +  w_outline sum_outlines w_o l_o d_o(x)^2  +  anchor sum_vertices (s / mean edge)^2
-    +  even sum_edges ((s_i - s_j) / |x_i - x_j|)^2
+    +  even sum_edges ((s_i - s_j) / |x_i - x_j|)^2  +  home sum_vertices w_h ((s - h) / mean edge)^2
 
-with n_e the mean of the wanted normals at the edge's ends and d_o the outlines' distances in pixels, by a sparse linear solve in float64.
+with n_e the mean of the wanted normals at the edge's ends, d_o the outlines' distances in pixels and h how far behind or before the vertex its home
+lies, by a sparse linear solve in float64. Homes matter where nothing else says how deep a place is: a floor within a rim may sink as a whole without
+turning any normal, and does so solve by solve if each starts from where the one before ended.
 Weights are robust (Cauchy's), so that creases, where no normal fits an edge, and wrong outlines do not pull their surroundings along.
 Source: Nehab et al. 2005 (positions from normals), with outlines in place of measured depths (docs/sources.md: nehab2005).
 """
@@ -35,6 +37,8 @@ class IntegrationSettings:
     """Of a pixel of outline, squared, against an edge across its normal by a radian."""
     anchor: float = 1e-3
     """Of a mean edge's length moved."""
+    home: float = 1e-3
+    """Of a mean edge's length away from home."""
     even: float = 0.02
     """Of a difference between neighbours' moves, as an edge's tilt: keeps slivers, which hardly know their normal, with their surroundings."""
     crease_angle: float = 0.2
@@ -46,13 +50,30 @@ class IntegrationSettings:
     """Mean edges at a vertex that it may move in one solve: what wants to go farther is badly determined."""
 
 
+@dataclass(frozen=True, eq=False)
+class Homes:
+    """Where the vertices of a surface that moves in many solves began."""
+
+    homeward: Tensor
+    """(vertex, 3) from each vertex to its home."""
+    weight: Tensor
+    """(vertex,) 0..1: how much each is held."""
+
+
 def integrate_normals(
-    vertices: Tensor, faces: Tensor, wanted_normals: Tensor, edges: MeshEdges, outlines: OutlineResiduals, settings: IntegrationSettings
+    vertices: Tensor,
+    faces: Tensor,
+    wanted_normals: Tensor,
+    edges: MeshEdges,
+    outlines: OutlineResiduals,
+    settings: IntegrationSettings,
+    homes: Homes | None = None,
 ) -> Tensor:
     """(vertex, 3) positions after one solve.
 
     Args:
         vertices: (vertex, 3). faces: (face, 3). wanted_normals: (vertex, 3) unit. outlines: of these vertices.
+        homes: None: there are none.
     """
     direction = vertex_normals(vertices, faces)
     start, end = edges.vertices.unbind(1)
@@ -73,7 +94,11 @@ def integrate_normals(
     jacobian = csr_matrix((values, (rows, columns)), shape=(edge_count + outline_count, count))
     residual = _numpy(torch.cat([tilt, outlines.distance]).double())
     outline_length = settings.outline_weight * _numpy(outlines.length.double())
-    anchor = settings.anchor / float(length.mean()) ** 2 * identity(count)
+    edge2 = float(length.mean()) ** 2
+    anchor, pull = settings.anchor / edge2 * identity(count), np.zeros(count)
+    if homes is not None:
+        hold = settings.home / edge2 * _numpy(homes.weight.double())
+        anchor, pull = anchor + diags(hold), hold * _numpy((homes.homeward * direction).sum(1).double())
     inverse = _numpy((1 / length).double())
     differences = csr_matrix(
         (np.concatenate([inverse, -inverse]), (np.tile(np.arange(edge_count), 2), _numpy(torch.cat([start, end])))),
@@ -91,7 +116,7 @@ def integrate_normals(
         )
         normal_matrix = (jacobian.T @ diags(weight) @ jacobian + fixed).tocsc()
         factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        moved = factors.solve(-(jacobian.T @ (weight * residual)))
+        moved = factors.solve(pull - jacobian.T @ (weight * residual))
     reach = settings.longest_move * _mean_of_edges(length, edges, count)
     step = torch.maximum(torch.minimum(torch.from_numpy(moved).to(vertices), reach), -reach)
     return vertices + unfolded(vertices, direction, step, faces, edges)[:, None] * direction

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, integrate_normals
+from drgs.reconstruct.geometry.integrate_normals import Homes, IntegrationSettings, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outline, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
@@ -61,6 +61,23 @@ def test_the_anchor_holds_what_nothing_pulls(anchor: float):
     shrunk = dataclasses.replace(true, vertices=0.97 * true.vertices)
     moved = (solved(shrunk, true.normals, IntegrationSettings(anchor=anchor), rounds=1) - shrunk.vertices).norm(dim=1)
     assert (float(moved.mean()) > 0.015) == (anchor < 1)
+
+
+def test_what_nothing_holds_goes_home():
+    """The same normals everywhere: a sheet may lie at any depth, and lies where it began."""
+    true = sphere_mesh(subdivisions=3)
+    edges = mesh_edges(true.faces)
+    none = outline_residuals(edges, build_tracer(true), (), [])
+    radii = []
+    for homeward in (None, -0.03 * true.vertices):
+        vertices = true.vertices
+        for _ in range(6):
+            homes = None if homeward is None else Homes(homeward, torch.ones(len(vertices)))
+            moved = integrate_normals(vertices, true.faces, true.normals, edges, none, IntegrationSettings(home=1e-2), homes)
+            homeward = None if homeward is None else homeward + vertices - moved
+            vertices = moved
+        radii.append(float(vertices.norm(dim=1).mean()))
+    assert abs(radii[0] - 1) < 2e-3 and abs(radii[1] - 0.97) < 5e-3, radii
 
 
 def test_a_mesh_of_any_size_is_moved_in_proportion():

@@ -103,8 +103,8 @@ def carved_depths(
         return inward, torch.zeros_like(mesh.roughness)
     costs = []
     for step in range(settings.steps + 1):
-        depth = step * settings.step * radius
-        difference, views = view_differences(tracer, targets, matt, inward[matt], depth, radius, settings.steepest, settings.fewest_steep)
+        behind = step * settings.step * radius
+        difference, views = view_differences(tracer, targets, matt, inward[matt], behind, radius, settings.steepest, settings.fewest_steep)
         known = views >= settings.fewest_views
         sums = torch.zeros(len(mesh.vertices), 2, device=matt.device)
         sums[matt[known]] = torch.stack([difference * views, views], -1)[known]

@@ -26,7 +26,7 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, radiance_along
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import display_image
-from drgs.reconstruct.fit.surface.fit_surface import SOLID, SurfaceRates, prior_terms
+from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SOLID, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
@@ -63,7 +63,7 @@ class MeshMaterialSettings:
 
 def start_mesh_materials(surface: FitState, settings: MeshMaterialSettings, radius: float) -> FitState:
     """The surface as it was fitted, with this stage's rates."""
-    values = leaves(surface.parameters, frozen=("vertices", "open_share", "metal"))
+    values = leaves(surface.parameters, frozen=NOT_FITTED)
     return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 1))
 
 

@@ -36,6 +36,8 @@ from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 
+NOT_FITTED = ("vertices", "homeward", "open_share", "metal")
+"""Parameters that no gradient moves."""
 SOLID = 0.995
 """Least coverage of a pixel that is compared: others mix in the background."""
 GRAZING = 0.05
@@ -53,6 +55,8 @@ class SurfaceRates:
     environment: float = 0.02
     vertices: float = 0.0
     """Moved by the solve alone."""
+    homeward: float = 0.0
+    """From each vertex to where the surface began, or was carved to."""
     open_share: float = 0.0
     """Traced, not fitted."""
     metal: float = 0.0
@@ -105,10 +109,11 @@ def start_surface(
         "roughness_logits": logits_of_shares(average_surfels(gaussians.roughness, *weights)),
         "metallic_logits": logits_of_shares(average_surfels(gaussians.metallic, *weights)),
         "vertices": mesh.vertices,
+        "homeward": torch.zeros_like(mesh.vertices),
         "open_share": torch.ones_like(mesh.vertices),
         "metal": torch.zeros_like(mesh.roughness),
     } | light_parameters(stage_one)
-    values = leaves(parameters, frozen=("vertices", "open_share", "metal"))
+    values = leaves(parameters, frozen=NOT_FITTED)
     return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 2))
 
 

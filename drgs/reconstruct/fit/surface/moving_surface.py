@@ -16,7 +16,7 @@ from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, irradiance
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.view_targets import ViewTarget
-from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, integrate_normals
+from drgs.reconstruct.geometry.integrate_normals import Homes, IntegrationSettings, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outlines, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
@@ -63,8 +63,12 @@ class MovingSurface:
         normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
         for _ in range(settings.solves):
             residuals = outline_residuals(self.edges, self.tracer, self._cameras, self._outlines)
-            moved = integrate_normals(parameters["vertices"], self.faces, normals, self.edges, residuals, settings.integration)
-            parameters["vertices"].copy_(moved)
+            vertices, homeward = parameters["vertices"], parameters["homeward"]
+            # Of metal mirrors say where it lies.
+            homes = Homes(homeward, (-parameters["metal"]).clamp(0, 1))
+            moved = integrate_normals(vertices, self.faces, normals, self.edges, residuals, settings.integration, homes)
+            homeward += vertices - moved
+            vertices.copy_(moved)
             self.tracer = self._tracer()
         own = vertex_normals(parameters["vertices"], self.faces)
         back = (1 - settings.to_surface) * normals + settings.to_surface * own

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from drgs.reconstruct.fit.evidence.carve_hollows import CarveSettings, carved_depths
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
-from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, fit_surface
+from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings, fit_surface
 from drgs.reconstruct.fit.surface.moving_surface import mesh_from_surface_fit
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
@@ -38,10 +38,9 @@ class PassSettings:
     """Of one pass; weights that change over a fit change over all passes."""
     mesh: MeshSettings = PASS_MESH
     carve: CarveSettings = field(default_factory=CarveSettings)
-    carve_after: tuple[int, ...] = (1, 2)
-    """Passes, counted from 1, after which hollows are looked for, about a fifth and two fifths of the way: earlier, normals and materials are not what
-    carving asks (still_life, `full`: after the first two of 24 passes the mesh ends 0.64 % off, after the second and fourth of 10 0.49 %); later, too
-    few passes are left to smooth what was carved."""
+    carve_after: tuple[int, ...] = (3,)
+    """Passes, counted from 1, after which hollows are looked for: once, two fifths of the way. Each time right places sink as well, by chance; earlier,
+    normals and materials are not what carving asks, and later too few passes are left to smooth what was carved (figures in docs/decisions/0003)."""
 
 
 @dataclass(eq=False)
@@ -88,8 +87,11 @@ def carve_hollows(fit: SurfaceFit, targets: list[ViewTarget], settings: CarveSet
     """Move the surface to where the photographs agree; what moved gets the moved surface's normals."""
     parameters, mesh = fit.state.parameters, fit.mesh
     inward, depth = carved_depths(build_tracer(mesh), parameters["metal"], targets, mesh_edges(fit.faces), radius, settings)
-    parameters["vertices"] += depth[:, None] * inward
+    step = depth[:, None] * inward
     moved = (depth > settings.step * radius)[:, None]
+    parameters["vertices"] += step
+    # What was carved is at home there; what was only carried along is not.
+    parameters["homeward"].copy_(torch.where(moved, torch.zeros_like(step), parameters["homeward"] - step))
     parameters["normals"].copy_(torch.where(moved, vertex_normals(parameters["vertices"], fit.faces), parameters["normals"]))
 
 
@@ -115,7 +117,7 @@ def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> N
 
 def _start_pass(fit: SurfaceFit, values: dict[str, Tensor], settings: PassSettings, radius: float) -> None:
     """The pass after the one under way, from `values` of the fit's vertices."""
-    values = leaves(values, frozen=("vertices", "open_share", "metal"))
+    values = leaves(values, frozen=NOT_FITTED)
     fit.index += 1
     own = settings_of_pass(settings, fit.index)
     fit.state = FitState(values, make_optimizer(values, own.rates, radius), torch.Generator().manual_seed(own.seed + 2))

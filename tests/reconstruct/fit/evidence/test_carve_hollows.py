@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from drgs.reconstruct.fit.evidence import carve_hollows
-from drgs.reconstruct.fit.evidence.carve_hollows import CarveSettings, carved_depths
+from drgs.reconstruct.fit.evidence.carve_hollows import CarveSettings, carved_depths, view_differences
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
@@ -56,6 +56,24 @@ def test_what_may_be_a_mirror_stays(targets: list[ViewTarget], materials: dict[s
     assert float(depth.max()) == 0
 
 
+def test_only_the_views_that_look_most_steeply_are_asked(targets: list[ViewTarget]):
+    mesh, _ = bumped()
+    tracer, some = build_tracer(mesh), torch.arange(0, len(mesh.vertices), 7)
+    inward = -mesh.normals[some]
+    place = mesh.vertices[some] + 0.1 * SPHERE_RADIUS * inward
+    where = (tracer, targets, some, inward, 0.1 * SPHERE_RADIUS, SPHERE_RADIUS)
+    (_, every), (_, steep) = view_differences(*where), view_differences(*where, steepest=0.4, fewest_steep=3)
+    assert torch.equal(steep, torch.minimum(every, (0.4 * every).ceil().clamp(min=3)))
+    # One picture is green: only the places that it looks at steeply can tell.
+    green = dataclasses.replace(targets[5], saturation=torch.tensor([0.0, 1.0, 0.0]).expand_as(targets[5].saturation).contiguous())
+    with_green = (tracer, [*targets[:5], green, *targets[6:]], *where[2:])
+    by_steep, by_every = (view_differences(*with_green, *asked)[0] != view_differences(*where, *asked)[0] for asked in ((0.4, 3), (1.0, 0)))
+    towards = torch.nn.functional.normalize(place - green.camera.center_world, dim=1)
+    cosine = (towards * inward).sum(1)
+    assert 10 < int(by_steep.sum()) < int(by_every.sum())
+    assert float(cosine[by_steep].mean()) > float(cosine[by_every].mean()) + 0.05
+
+
 def test_where_the_surface_is_right_nothing_moves(targets: list[ViewTarget]):
     sphere = dataclasses.replace(placed_sphere(subdivisions=4), roughness=torch.full((2562,), 0.6))
     _, depth = carved(sphere, -1.0, targets)
@@ -65,7 +83,7 @@ def test_where_the_surface_is_right_nothing_moves(targets: list[ViewTarget]):
 def test_what_wants_to_go_through_leaves_a_wall(targets: list[ViewTarget], monkeypatch: pytest.MonkeyPatch):
     """Whatever the photographs say, here: the deeper the better."""
 
-    def deeper_is_better(tracer, targets, vertices, inward, depth, radius):
+    def deeper_is_better(tracer, targets, vertices, inward, depth, radius, steepest, fewest_steep):
         return torch.full((len(vertices),), max(0.0, 0.3 - depth)), torch.full((len(vertices),), 12.0)
 
     monkeypatch.setattr(carve_hollows, "view_differences", deeper_is_better)
