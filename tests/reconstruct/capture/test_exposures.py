@@ -14,8 +14,7 @@ from drgs.reconstruct.capture.exposures import gains_of_files, spread, with_gain
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.fit.losses import display_image
-from drgs.reconstruct.fit.view_targets import view_targets
-from drgs.scene.camera import Camera
+from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.scene.views import Views
 from tests.reconstruct import tiny_capture as tiny
 
@@ -53,9 +52,9 @@ def test_exposures_are_found_by_points_and_even_pictures_are_left_alone(even: Vi
     assert abs(float(np.log2(found.gains).mean())) < 1e-9
 
 
-def true_picture(even: Views, camera: Camera) -> tuple[Tensor, Tensor]:
+def true_picture(even: Views, seen: ViewTarget) -> tuple[Tensor, Tensor]:
     """What a perfect fit would draw."""
-    target = next(target for target in view_targets(even, 0.5, CPU) if target.camera.name == camera.name)
+    target = next(target for target in view_targets(even, 0.5, CPU) if target.camera.name == seen.camera.name)
     return linear_from_srgb(target.saturation), target.mask
 
 
@@ -64,18 +63,18 @@ def test_a_fit_tells_exposures_to_a_hundredth_of_a_stop(even: Views) -> None:
     varied = exposed(even, stops)
     rough = with_gains(varied, stops + 0.2 * np.sin(np.arange(len(stops))))
     for views in (varied, rough):
-        found = with_gains_of_fit(views, lambda camera: true_picture(even, camera))
+        found = with_gains_of_fit(views, lambda target: true_picture(even, target))
         assert found.gains is not None
         assert float(np.abs(np.log2(found.gains) - stops).max()) < 0.02
-    assert with_gains_of_fit(even, lambda camera: true_picture(even, camera)) is even
+    assert with_gains_of_fit(even, lambda target: true_picture(even, target)) is even
 
 
 def test_what_cannot_be_compared_has_the_mean_exposure(even: Views) -> None:
     varied = exposed(even, some_stops(len(even.cameras)))
 
-    def nothing(camera: Camera) -> tuple[Tensor, Tensor]:
-        radiance, mask = true_picture(even, camera)
-        return radiance, mask * (camera.name != even.cameras[3].name)
+    def nothing(target: ViewTarget) -> tuple[Tensor, Tensor]:
+        radiance, mask = true_picture(even, target)
+        return radiance, mask * (target.camera.name != even.cameras[3].name)
 
     found = with_gains_of_fit(varied, nothing)
     assert found.gains is not None and found.gains[3] == 1.0
