@@ -72,12 +72,12 @@ function NewBuild() {
           onChange={(binding) => (build.value = { ...build.value, binding })}
         />
         <Choice
-          label="Lamps stood still"
+          label="Lamps stood still with"
           value={build.value.light}
           options={[
-            { value: 'auto', text: 'Find out', title: 'By what is around the object in the pictures, and by how its brightness changes' },
-            { value: 'object', text: 'With the object', title: 'The camera went around it' },
-            { value: 'camera', text: 'With the camera', title: 'The object stood on a turntable' },
+            { value: 'auto', text: 'Auto', title: 'By what is around the object in the pictures, and by how its brightness changes' },
+            { value: 'object', text: 'The object', title: 'The camera went around it' },
+            { value: 'camera', text: 'The camera', title: 'The object stood on a turntable' },
           ]}
           onChange={(light) => (build.value = { ...build.value, light })}
         />
