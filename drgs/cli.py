@@ -188,9 +188,9 @@ def build(
         try:
             asset = build_asset(dataset, out, settings, progress=report, should_stop=interrupt.is_set)
         except BuildStopped:
-            bound = "" if binding == BindingKind.particles else f" --binding {binding.value}"
-            bound += "" if light == LightKind.auto else f" --light {light.value}"
-            print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value}{bound} --resume", file=sys.stderr)
+            chosen = "" if binding == BindingKind.particles else f" --binding {binding.value}"
+            chosen += "" if light == LightKind.auto else f" --light {light.value}"
+            print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value}{chosen} --resume", file=sys.stderr)
             raise typer.Exit(130) from None
     if json_progress:
         print(json.dumps({"stage": "done", "fraction": 1.0, "asset": str(out), "provenance": asset.provenance}), flush=True)
@@ -232,10 +232,10 @@ def render(
     """Render an asset from the cameras of a file: <name>.png (RGBA, straight alpha, sRGB), and maps with --aov."""
     from drgs.cli_progress import frame_progress
     from drgs.deform.pose_scene import pose_scene
-    from drgs.evaluate.evaluate_asset import own_light_from_world
     from drgs.reconstruct.capture.load_views import load_cameras
     from drgs.render.records import RenderSettings
     from drgs.render.render_cameras import render_cameras
+    from drgs.scene.asset import light_from_world
     from drgs.scene.edits import EnvironmentEdit, load_edits
 
     changes = load_edits(edits) if edits else []
@@ -255,7 +255,7 @@ def render(
         seed=seed,
     )
     with frame_progress("Rendering", len(views)) as advance:
-        frames = render_cameras(scene, views, out, settings, aov, advance, own_light_from_world(opened, changes))
+        frames = render_cameras(scene, views, out, settings, aov, advance, light_from_world(opened, changes))
     if as_json:
         print(json.dumps({"out": str(out), "frames": frames}))
     elif explain:

@@ -8,10 +8,7 @@ import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-
-from torch import Tensor
 
 from drgs.convert.export_asset import export_asset
 from drgs.deform.pose_scene import pose_scene
@@ -22,7 +19,7 @@ from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
 from drgs.scene.asset import Asset, light_from_world
 from drgs.scene.camera import Camera
-from drgs.scene.edits import Edit, EnvironmentEdit, parse_edits
+from drgs.scene.edits import Edit, parse_edits
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ def _render_all(
         """The cameras that have a truth picture in the capture's folder of the same name, under the light of the photographs unless edits give another."""
         wanted = [camera for camera in cameras if (capture / folder / f"{camera.name}.png").exists()]
         scene = pose_scene(asset, edits, capture)
-        turns = own_light_from_world(asset, edits)
+        turns = light_from_world(asset, edits)
         render_cameras(scene, wanted, renders / folder, render_settings, aov, lambda name: done(f"{folder}/{name}"), turns)
 
     render(Path("test"), [], aov=True)
@@ -82,12 +79,6 @@ def _render_all(
         # Under the training light, which the asset has recovered, the file's true one would be a hint.
         light = [] if truth.name == facts["train_env"] else _light(capture, truth.name)
         render(truth.relative_to(capture), [*bent, *light])
-
-
-def own_light_from_world(asset: Asset, edits: list[Edit]) -> Callable[[Camera], Tensor | None]:
-    """How the asset's own light turns with cameras; another light stands still with the object."""
-    other = any(isinstance(edit, EnvironmentEdit) and edit.file is not None for edit in edits)
-    return (lambda camera: None) if other else partial(light_from_world, asset)
 
 
 def _light(capture: Path, name: str) -> list[Edit]:

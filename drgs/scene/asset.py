@@ -1,6 +1,7 @@
 """An asset: the relightable object at rest, and what it was made from; a folder or zip on disk (design: Asset)."""
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal, get_args
@@ -20,7 +21,7 @@ from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, opengl_from_camera
 from drgs.scene.certainty import Certainty
-from drgs.scene.edits import LARGEST, SMALLEST
+from drgs.scene.edits import LARGEST, SMALLEST, Edit, EnvironmentEdit
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
@@ -167,12 +168,15 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     return asset
 
 
-def light_from_world(asset: Asset, camera: Camera) -> Float[Tensor, "3 3"] | None:
-    """Rotation of directions in the world to those of the asset's environment when this camera takes a picture; None: the same."""
-    if asset.light_frame == "object":
-        return None
-    first, own = (view.camera_from_world[:3, :3].double().cpu() for view in (asset.cameras[0], camera))
-    return (first.T @ own).float()
+def light_from_world(asset: Asset, edits: Sequence[Edit]) -> Callable[[Camera], Float[Tensor, "3 3"] | None]:
+    """Of a camera that takes a picture after these edits, the rotation of directions in the world to those of the environment; None: the same.
+
+    Only the asset's own light may turn with cameras: any other stands still with the object.
+    """
+    if asset.light_frame == "object" or any(isinstance(edit, EnvironmentEdit) and edit.file is not None for edit in edits):
+        return lambda camera: None
+    first = asset.cameras[0].camera_from_world[:3, :3].double().cpu()
+    return lambda camera: (first.T @ camera.camera_from_world[:3, :3].double().cpu()).float()
 
 
 def load_photographs(path: Path | str) -> bytes | None:

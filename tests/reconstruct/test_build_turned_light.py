@@ -8,14 +8,13 @@ import pytest
 import torch
 from PIL import Image
 
-from drgs.evaluate.evaluate_asset import own_light_from_world
 from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, build_asset
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.surface_passes import PassSettings
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
-from drgs.scene.asset import Asset, load_asset, save_asset
+from drgs.scene.asset import Asset, light_from_world, load_asset, save_asset
 from drgs.scene.edits import EnvironmentEdit
 from drgs.scene.posed_scene import PosedScene
 from tests.reconstruct.capture.test_turning_light import write_turntable
@@ -69,7 +68,7 @@ def error_of_renders(asset: Asset, folder: Path, turntable: Path) -> float:
     """Root mean square difference from the photographs, inside the ball, of display values 0..1 after one factor: so short a fit is too bright."""
     scene = PosedScene(None, asset.mesh, asset.environment, preferred="mesh")
     cameras = asset.cameras[:6]
-    render_cameras(scene, cameras, folder, RenderSettings(samples_per_pixel=32), light_from_world=own_light_from_world(asset, []))
+    render_cameras(scene, cameras, folder, RenderSettings(samples_per_pixel=32), light_from_world=light_from_world(asset, []))
     pairs = []
     for camera in cameras:
         shown = np.asarray(Image.open(folder / f"{camera.name}.png"), float) / 255
@@ -93,10 +92,10 @@ def test_with_the_right_frame_pictures_are_explained_and_with_the_wrong_one_not(
 def test_another_light_stands_still_with_the_object(turntable: Path, tmp_path: Path) -> None:
     asset = build_asset(turntable, tmp_path / "a", SETTINGS)
     camera = asset.cameras[3]
-    turn = own_light_from_world(asset, [EnvironmentEdit(op="environment", rotation=30.0)])(camera)
+    turn = light_from_world(asset, [EnvironmentEdit(op="environment", rotation=30.0)])(camera)
     assert turn is not None and not torch.allclose(turn, torch.eye(3), atol=0.1)
-    assert own_light_from_world(asset, [EnvironmentEdit(op="environment", file="sky.exr")])(camera) is None
-    assert own_light_from_world(replace(asset, light_frame="object"), [])(camera) is None
+    assert light_from_world(asset, [EnvironmentEdit(op="environment", file="sky.exr")])(camera) is None
+    assert light_from_world(replace(asset, light_frame="object"), [])(camera) is None
 
 
 def test_an_asset_without_cameras_cannot_have_light_that_stands_still_with_them(turntable: Path, tmp_path: Path) -> None:

@@ -18,9 +18,11 @@ from numpy import ndarray
 from PIL import Image
 from scipy.ndimage import binary_erosion
 
+from drgs.exchange.pictures import as_eight_bits
 from drgs.maths.color import linear_from_srgb, luminance
 from drgs.reconstruct.capture.initial_points import InitialPoints, project_points
 from drgs.reconstruct.capture.load_views.capture import Capture
+from drgs.reconstruct.capture.load_views.read_pictures import mask_channel
 from drgs.scene.asset import LightFrame
 from drgs.scene.views import Views
 
@@ -106,10 +108,13 @@ def _surroundings_differ(capture: Capture) -> float | None:
     shown = []
     for photograph in capture.photographs:
         assert photograph.mask is not None
-        with Image.open(photograph.image) as picture, Image.open(photograph.mask) as mask:
-            if "A" in picture.getbands():
+        with Image.open(photograph.image) as image:
+            picture = as_eight_bits(image)
+            if "A" in picture.getbands() or "transparency" in picture.info:
                 return None
-            grey, cover = (np.asarray(image.convert("L").resize((SIDE, SIDE), Image.Resampling.BOX)) for image in (picture, mask))
+            picture = picture.convert("L")
+        mask = Image.fromarray(mask_channel(photograph.mask))
+        grey, cover = (np.asarray(image.resize((SIDE, SIDE), Image.Resampling.BOX)) for image in (picture, mask))
         around = binary_erosion(cover == 0, iterations=CLEAR, border_value=1)
         shown.append(np.where(around, grey / 255, np.nan))
     values = np.stack(shown)

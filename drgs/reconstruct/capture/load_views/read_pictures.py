@@ -84,7 +84,7 @@ def _decode(photograph: Photograph) -> tuple[UInt8[ndarray, "height width 3"], U
     alpha = pixels[..., 3] if has_alpha else np.full(pixels.shape[:2], 255, np.uint8)
     if photograph.mask is None:
         return color, alpha, has_alpha, exposure
-    mask = _mask_of_depth(photograph.mask) if photograph.mask_is_depth else _mask_channel(photograph.mask)
+    mask = _mask_of_depth(photograph.mask) if photograph.mask_is_depth else mask_channel(photograph.mask)
     if mask.shape != alpha.shape:
         raise ValueError(
             f"{photograph.mask}: the mask is {mask.shape[1]}x{mask.shape[0]}, but its image {photograph.image.name} is {alpha.shape[1]}x{alpha.shape[0]}."
@@ -114,7 +114,7 @@ def _mask_of_depth(path: Path) -> UInt8[ndarray, "height width"]:
     return np.where(depth < NERO_BACKGROUND_DEPTH, 255, 0).astype(np.uint8)
 
 
-def _mask_channel(path: Path) -> UInt8[ndarray, "height width"]:
+def mask_channel(path: Path) -> UInt8[ndarray, "height width"]:
     """(h, w) 0..255. A mask's alpha channel is used when its colour says nothing (cut-outs saved as masks)."""
     with _opened(path) as image:
         picture = as_eight_bits(image)

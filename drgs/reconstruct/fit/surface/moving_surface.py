@@ -48,8 +48,7 @@ class MovingSurface:
         self._outlines: list[MaskOutline | None] = mask_outlines(views) if views.has_masks else [None] * len(self._cameras)
         self.edges = mesh_edges(faces)
         self.tracer = self._tracer()
-        self._turned = views.light_from_world is not None
-        self._sky = seen_sky(self.tracer) if self._turned else None
+        self._sky = None if views.light_from_world is None else seen_sky(self.tracer)
 
     def _tracer(self) -> AbstractTracer:
         tracer = build_tracer(mesh_from_surface_fit(self._state, self.faces))
@@ -74,7 +73,7 @@ class MovingSurface:
         back = (1 - settings.to_surface) * normals + settings.to_surface * own
         parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))
         self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
-        if self._turned:
+        if self._sky is not None:
             self._sky = seen_sky(self.tracer)
             return
         radiance = environment_table(parameters)
