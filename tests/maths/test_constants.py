@@ -56,6 +56,7 @@ OTHERS = {
     ("drgs/deform/mpm/records.py", 1e30): "the yield stress of matter that never yields [Pa]",
     ("drgs/exchange/gltf_accessors.py", 1e30): "a bound on the numbers of a file",
     ("drgs/reconstruct/capture/find_hollows.py", 0.99): "the coverage of a pixel that the object fills",
+    ("drgs/reconstruct/fit/surface/try_depths.py", 0.055): "a depth that is tried",
     ("drgs/reconstruct/capture/radiance_grid.py", 0.99): "a decay rate of Adam",
     ("drgs/reconstruct/fit/surfel_parameters.py", 0.04): "a learning rate",
     ("drgs/reconstruct/geometry/extract_mesh/fuse_depth.py", 1e30): "an inverse depth beyond all others",

@@ -26,8 +26,9 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, radiance_along
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import display_image
-from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SOLID, SurfaceRates, prior_terms
+from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.shade_surface import SOLID
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.render.integrate.environment_table import build_environment_table

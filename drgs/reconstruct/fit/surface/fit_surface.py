@@ -19,29 +19,22 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from drgs.maths.brdf import f0_from_base
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, mirrored_light
-from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
-from drgs.reconstruct.fit.losses import display_image, rough_light, white_light
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.losses import rough_light, white_light
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, not_grazing, seen_places, shade_places
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
-from drgs.render.intersect.trace_rays import trace_rays
-from drgs.scene.camera import pixel_rays_world
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 
 NOT_FITTED = ("vertices", "homeward", "open_share", "metal")
 """Parameters that no gradient moves."""
-SOLID = 0.995
-"""Least coverage of a pixel that is compared: others mix in the background."""
-GRAZING = 0.05
-"""Least cosine between normal and view: below, interpolated normals say little."""
 
 
 @dataclass(frozen=True)
@@ -186,37 +179,14 @@ class _Steps:
 
     def _shown(self, target: ViewTarget, environment: Tensor, normals: Tensor, materials: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Flat indices of the pixels that mask and mesh fill, and their shaded colours (pixel, 3) in display space."""
-        with torch.no_grad():
-            origin, directions = pixel_rays_world(target.camera)
-            solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
-            if len(solid) > self.settings.pixels_a_step:
-                drawn = torch.randperm(len(solid), generator=self.state.generator)[: self.settings.pixels_a_step]
-                solid = solid[drawn.sort().values.to(solid.device)]
-            direction = directions.reshape(-1, 3)[solid]
-            hits = trace_rays(origin.expand_as(direction), direction, self.surface.tracer)
-            hit = hits.hit.nonzero().squeeze(1)
-            pixels, wo, face = solid[hit], -direction[hit], hits.face[hit].long()
-            corners, weights = self.faces[face].long(), corner_weights(hits.barycentric[hit])
-            facing = (torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1) * wo).sum(-1) > GRAZING
-            pixels, wo, face, corners, weights = (x[facing] for x in (pixels, wo, face, corners, weights))
-        normal = torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1)
-        albedo, roughness, metallic = (at_corners(materials[name], corners, weights) for name in ("albedo", "roughness", "metallic"))
-        tables = filter_environment(environment)
-        light = self.surface.light_of(tables)(target)
-        share, turn = light.open_share, light.light_from_world
-        with torch.no_grad():
-            tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
-            position = at_corners(tracer.mesh.vertices, corners, weights)
-            transmittance, met = mirrored_light(
-                tracer, position, tracer.face_normals[face], normal.detach(), roughness.detach(), wo,
-                MeshLight(tables.detach(), share, turn), self.state.generator,
-            )  # fmt: skip
-        radiance = shade_split_sum(
-            albedo * (1 - metallic)[:, None], torch.zeros_like(albedo), f0_from_base(albedo, metallic), roughness, normal, wo, tables,
-            transmittance, met, at_corners(share, corners, weights), turn,
-        )  # fmt: skip
-        photo = target.saturation.reshape(-1, 3)[pixels]
-        return pixels, display_image(radiance, torch.ones_like(roughness), photo, target.ceiling)
+        solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
+        if len(solid) > self.settings.pixels_a_step:
+            drawn = torch.randperm(len(solid), generator=self.state.generator)[: self.settings.pixels_a_step]
+            solid = solid[drawn.sort().values.to(solid.device)]
+        seen = not_grazing(seen_places(target, solid, self.surface.tracer), normals)
+        tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
+        light = self.surface.light_of(filter_environment(environment))(target)
+        return seen.pixels, shade_places(seen, target, tracer, normals, materials, light, self.state.generator)
 
 
 def prior_terms(

@@ -5,6 +5,7 @@ nearer to theirs, the share of an open sky's irradiance that arrives at each, an
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -45,10 +46,14 @@ class MovingSurface:
     def __init__(self, views: Views, faces: Tensor, state: FitState) -> None:
         self._state, self.faces = state, faces
         self._cameras = tuple(camera.to(faces.device) for camera in views.cameras)
-        self._outlines: list[MaskOutline | None] = mask_outlines(views) if views.has_masks else [None] * len(self._cameras)
+        self._views = views
         self.edges = mesh_edges(faces)
         self.tracer = self._tracer()
         self._sky = None if views.light_from_world is None else seen_sky(self.tracer)
+
+    @cached_property
+    def _outlines(self) -> list[MaskOutline | None]:
+        return mask_outlines(self._views) if self._views.has_masks else [None] * len(self._cameras)
 
     def _tracer(self) -> AbstractTracer:
         tracer = build_tracer(mesh_from_surface_fit(self._state, self.faces))
@@ -72,13 +77,23 @@ class MovingSurface:
         own = vertex_normals(parameters["vertices"], self.faces)
         back = (1 - settings.to_surface) * normals + settings.to_surface * own
         parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))
+        self.relight(settings.share_rays)
+
+    @torch.no_grad()
+    def relight(self, share_rays: int) -> None:
+        """Light that the surface, as it is now, blocks and sends back.
+
+        Args:
+            share_rays: a vertex, for the irradiance that arrives there.
+        """
+        parameters = self._state.parameters
         self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
         if self._sky is not None:
             self._sky = seen_sky(self.tracer)
             return
         radiance = environment_table(parameters)
         light = MeshLight(filter_environment(radiance), parameters["open_share"])
-        share = irradiance_share(self.tracer, Environment(radiance), light, settings.share_rays, self._state.generator)
+        share = irradiance_share(self.tracer, Environment(radiance), light, share_rays, self._state.generator)
         parameters["open_share"].copy_(share)
 
     def light_of(self, tables: Tensor) -> LightOf:

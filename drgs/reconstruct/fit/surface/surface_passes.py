@@ -7,6 +7,7 @@ mean distance of the mesh 1.53 -> 1.15 % of the radius (docs/decisions/0003-fitt
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from jaxtyping import Int
@@ -16,6 +17,7 @@ from drgs.reconstruct.fit.evidence.carve_hollows import CarveSettings, carved_de
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings, fit_surface
 from drgs.reconstruct.fit.surface.moving_surface import mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.try_depths import TrialSettings, try_depths
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
@@ -38,6 +40,9 @@ class PassSettings:
     """Of one pass; weights that change over a fit change over all passes."""
     mesh: MeshSettings = PASS_MESH
     carve: CarveSettings = field(default_factory=CarveSettings)
+    trials: TrialSettings = field(default_factory=TrialSettings)
+    try_after: tuple[int, ...] = ()
+    """Passes, counted from 1, after which the surface is tried at other depths."""
     carve_after: tuple[int, ...] = (3,)
     """Passes, counted from 1, after which hollows are looked for: once, two fifths of the way. Each time right places sink as well, by chance; earlier,
     normals and materials are not what carving asks, and later too few passes are left to smooth what was carved (figures in docs/decisions/0003)."""
@@ -93,6 +98,31 @@ def carve_hollows(fit: SurfaceFit, targets: list[ViewTarget], settings: CarveSet
     # What was carved is at home there; what was only carried along is not.
     parameters["homeward"].copy_(torch.where(moved, torch.zeros_like(step), parameters["homeward"] - step))
     parameters["normals"].copy_(torch.where(moved, vertex_normals(parameters["vertices"], fit.faces), parameters["normals"]))
+
+
+def move_to_tried_depths(
+    fit: SurfaceFit,
+    views: Views,
+    settings: PassSettings,
+    radius: float,
+    report: Callable[[FitReport], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> bool:
+    """Move the surface to where trials explain the photographs better; False: should_stop() said so, and nothing moved."""
+    parameters = fit.state.parameters
+    before = {name: value.detach().clone() for name, value in parameters.items()}
+    seed = settings.surface.seed + 7919 * (fit.index + 1)
+    found = try_depths(views, before, fit.faces, settings.trials, radius, seed, report, should_stop)
+    if found is None:
+        return False
+    step = found.parameters["vertices"] - before["vertices"]
+    # What moved is at home where it is now.
+    moved = (found.depth.abs() > settings.trials.still * radius)[:, None]
+    found.parameters["homeward"] = torch.where(moved, torch.zeros_like(step), before["homeward"] - step)
+    with torch.no_grad():
+        for name, value in found.parameters.items():
+            parameters[name].copy_(value)
+    return True
 
 
 def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> None:
@@ -152,19 +182,26 @@ def fit_surface_in_passes(
     Args:
         fit: start_surface on the mesh as it was extracted, or what an earlier call left. report: is told of the steps of all passes.
     """
-    steps = settings.surface.iterations
+    steps, trial_steps = settings.surface.iterations, settings.trials.iterations
+    total = settings.passes * steps + len(settings.try_after) * trial_steps
+
+    def tell(done: int, r: FitReport) -> None:
+        if report is not None:
+            report(replace(r, iteration=done + r.iteration, iterations=total))
+
     while True:
-
-        def tell(r: FitReport) -> None:
-            if report is not None:
-                report(replace(r, iteration=fit.index * steps + r.iteration, iterations=settings.passes * steps))
-
-        fit_surface(views, fit.mesh, fit.state, settings_of_pass(settings, fit.index), tell, should_stop)
+        number = fit.index + 1
+        done = fit.index * steps + sum(after < number for after in settings.try_after) * trial_steps
+        fit_surface(views, fit.mesh, fit.state, settings_of_pass(settings, fit.index), partial(tell, done), should_stop)
         if fit.state.iteration < steps:
             return False
-        if fit.index + 1 >= settings.passes:
+        if number >= settings.passes:
             return True
+        if number in settings.try_after and not move_to_tried_depths(
+            fit, views, settings, radius, partial(tell, done + steps), should_stop
+        ):
+            return False
         # Under light that turns with the camera paint does not look alike from all sides, so nothing says where it lies.
-        carves = fit.index + 1 in settings.carve_after and views.light_from_world is None
+        carves = number in settings.carve_after and views.light_from_world is None
         targets = view_targets(views, 1.0, fit.faces.device) if carves else []
         carve_and_start_next_pass(fit, targets, settings, radius)

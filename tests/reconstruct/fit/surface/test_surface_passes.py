@@ -5,10 +5,18 @@ from itertools import pairwise
 import pytest
 import torch
 
+from drgs.reconstruct.fit.fit_loop import FitReport
 from drgs.reconstruct.fit.surface import surface_passes
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, start_surface
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings
-from drgs.reconstruct.fit.surface.surface_passes import PassSettings, SurfaceFit, fit_surface_in_passes, settings_of_pass
+from drgs.reconstruct.fit.surface.surface_passes import (
+    PassSettings,
+    SurfaceFit,
+    carve_and_start_next_pass,
+    fit_surface_in_passes,
+    settings_of_pass,
+)
+from drgs.reconstruct.fit.surface.try_depths import TriedDepths
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.remesh import NothingEnclosed
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
@@ -49,6 +57,47 @@ def test_a_sphere_that_is_too_small_is_as_large_as_its_photographs_after_two_pas
     assert fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, lambda r: told.append(r.iteration))
     assert abs(float((fit.mesh.vertices - CENTER).norm(dim=1).mean()) / SPHERE_RADIUS - 1) < 0.01
     assert not torch.equal(fit.faces, start.faces) and told == list(range(3, 13))
+
+
+def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    settings = PassSettings(
+        2,
+        SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)),
+        MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
+        carve_after=(),
+        try_after=(1,),
+    )
+    asked: list[int] = []
+    homes: list[torch.Tensor] = []
+
+    def sunk(views, parameters, faces, trials, radius, seed, report, should_stop):
+        asked.append(seed)
+        if len(asked) == 1:
+            return None
+        depth = torch.zeros(len(parameters["vertices"]))
+        depth[0] = 0.02 * radius
+        moved = parameters["vertices"] + depth[:, None] * torch.tensor([0.0, 0.0, -1.0])
+        report(FitReport(1, trials.iterations, 20.0, len(depth), 0.0))
+        return TriedDepths(parameters | {"vertices": moved}, depth, torch.ones(len(depth), 1), depth > 0)
+
+    def start(fit, targets, settings, radius):
+        homes.append(fit.state.parameters["homeward"].clone())
+        carve_and_start_next_pass(fit, targets, settings, radius)
+
+    monkeypatch.setattr(surface_passes, "try_depths", sunk)
+    monkeypatch.setattr(surface_passes, "carve_and_start_next_pass", start)
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    begun = placed_sphere()
+    fit = SurfaceFit(start_surface(surfels, begun, grey_light(), settings.surface, SPHERE_RADIUS), begun.faces)
+    fit.state.parameters["homeward"].fill_(0.5)
+    views, told = painted_views(tmp_path), []
+    assert not fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS)
+    assert (fit.index, fit.state.iteration) == (0, 2)
+    assert fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, lambda r: told.append((r.iteration, r.iterations)))
+    assert asked[0] == asked[1]
+    total = 4 + settings.trials.iterations
+    assert told == [(3, total), (total - 1, total), (total, total)]
+    assert float(homes[0][0].norm()) == 0 and float(homes[0][1:].norm(dim=1).min()) > 0
 
 
 def test_a_surface_that_cannot_be_meshed_anew_stays_as_it_was_and_the_user_is_told(monkeypatch: pytest.MonkeyPatch):

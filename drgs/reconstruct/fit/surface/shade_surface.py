@@ -1,0 +1,96 @@
+"""Pixels of a photograph on the mesh, and how split sum shades them: what the fits of the surface compare.
+
+In: the tracer of a mesh, normals and materials of its vertices, the filtered light. Out: the places that pixels see, and their colours in
+display space, differentiable in all but the places.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from drgs.maths.brdf import f0_from_base
+from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, mirrored_light
+from drgs.reconstruct.fit.light.split_sum import shade_split_sum
+from drgs.reconstruct.fit.losses import display_image
+from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.camera import pixel_rays_world
+
+SOLID = 0.995
+"""Least coverage of a pixel that is compared: others mix in the background."""
+GRAZING = 0.05
+"""Least cosine between normal and view: below, interpolated normals say little."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPlaces:
+    """Where pixels see the mesh."""
+
+    pixels: Int[Tensor, "place"]
+    """Flat indices."""
+    wo: Float[Tensor, "place 3"]
+    face: Int[Tensor, "place"]
+    corners: Int[Tensor, "place 3"]
+    weights: Float[Tensor, "place 3"]
+    """Of the corners."""
+
+    def __getitem__(self, chosen: Tensor) -> "SeenPlaces":
+        return SeenPlaces(*(values[chosen] for values in vars(self).values()))
+
+    @property
+    def nearest(self) -> Int[Tensor, "place"]:
+        """Vertex at the nearest corner."""
+        return self.corners.gather(1, self.weights.argmax(1, keepdim=True)).squeeze(1)
+
+
+@torch.no_grad()
+def seen_places(target: ViewTarget, pixels: Int[Tensor, "pixel"], tracer: AbstractTracer) -> SeenPlaces:
+    """Those of `pixels` (flat) that see the mesh."""
+    origin, directions = pixel_rays_world(target.camera)
+    direction = directions.reshape(-1, 3)[pixels]
+    hits = trace_rays(origin.expand_as(direction), direction, tracer)
+    hit = hits.hit.nonzero().squeeze(1)
+    face = hits.face[hit].long()
+    return SeenPlaces(pixels[hit], -direction[hit], face, tracer.mesh.faces[face].long(), corner_weights(hits.barycentric[hit]))
+
+
+@torch.no_grad()
+def not_grazing(seen: SeenPlaces, normals: Float[Tensor, "vertex 3"]) -> SeenPlaces:
+    """Those that are seen steeply enough to be compared."""
+    normal = torch.nn.functional.normalize(at_corners(normals, seen.corners, seen.weights), dim=-1)
+    return seen[(normal * seen.wo).sum(-1) > GRAZING]
+
+
+def shade_places(
+    seen: SeenPlaces,
+    target: ViewTarget,
+    tracer: AbstractTracer,
+    normals: Float[Tensor, "vertex 3"],
+    materials: dict[str, Tensor],
+    light: MeshLight,
+    generator: torch.Generator,
+) -> Float[Tensor, "place 3"]:
+    """Colours in display space, by split sum with one traced mirror ray.
+
+    Args:
+        tracer: its mesh has the materials that mirrors see. materials: albedo, roughness and metallic of the vertices. light: its tables may
+            want a gradient.
+    """
+    corners, weights = seen.corners, seen.weights
+    normal = torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1)
+    albedo, roughness, metallic = (at_corners(materials[name], corners, weights) for name in ("albedo", "roughness", "metallic"))
+    with torch.no_grad():
+        known = MeshLight(light.tables.detach(), light.open_share, light.light_from_world)
+        position = at_corners(tracer.mesh.vertices, corners, weights)
+        transmittance, met = mirrored_light(
+            tracer, position, tracer.face_normals[seen.face], normal.detach(), roughness.detach(), seen.wo, known, generator
+        )
+    radiance = shade_split_sum(
+        albedo * (1 - metallic)[:, None], torch.zeros_like(albedo), f0_from_base(albedo, metallic), roughness, normal, seen.wo, light.tables,
+        transmittance, met, at_corners(light.open_share, corners, weights), light.light_from_world,
+    )  # fmt: skip
+    photo = target.saturation.reshape(-1, 3)[seen.pixels]
+    return display_image(radiance, torch.ones_like(roughness), photo, target.ceiling)
