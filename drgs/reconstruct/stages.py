@@ -201,7 +201,7 @@ def surface_stage(
         write_tensors(path, fit_tensors(fit.state) | {"faces": fit.faces, "pass": torch.tensor(fit.index)}, place.identity)
 
     def report(r: FitReport) -> None:
-        message = "; ".join(filter(None, (f"pass {fit.index + 1} of {settings.passes}, {len(fit.faces)} faces", fit.remark)))
+        message = "; ".join(filter(None, (f"pass {fit.index + 1} of {settings.passes}, {len(fit.faces)} faces", fit.doing, fit.remark)))
         place.reporter.report("surface", r.iteration / r.iterations, message, r, lambda: surface_preview(fit, views.cameras), save)
 
     done = fit_surface_in_passes(views, fit, settings, radius, report, place.should_stop)

@@ -58,6 +58,8 @@ class SurfaceFit:
     """Of the state's vertices."""
     index: int = 0
     """Of the pass under way."""
+    doing: str = ""
+    """What is under way besides the pass, in words."""
     remark: str = ""
     """What went otherwise than planned, in a sentence."""
 
@@ -112,7 +114,9 @@ def move_to_tried_depths(
     parameters = fit.state.parameters
     before = {name: value.detach().clone() for name, value in parameters.items()}
     seed = settings.surface.seed + 7919 * (fit.index + 1)
+    fit.doing = "trying depths"
     found = try_depths(views, before, fit.faces, settings.trials, radius, seed, report, should_stop)
+    fit.doing = ""
     if found is None:
         return False
     step = found.parameters["vertices"] - before["vertices"]

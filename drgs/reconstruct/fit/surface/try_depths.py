@@ -74,12 +74,12 @@ class TrialSettings:
     )
     weight_bend: float = 0.0015
     weight_smooth: float = 0.02
-    pixels: int = 24_000
+    pixels: int = 16_000
     """Of each photograph."""
-    share_rays: int = 32
+    share_rays: int = 16
     """A vertex, for the irradiance that arrives there."""
-    rings: int = 3
-    """Neighbourhoods over which errors are averaged."""
+    spread: float = 0.02
+    """Of the radius: how far around errors are averaged, the width of a Gaussian. Less, and plain paint gets pits (still_life's plate, with half of it)."""
     wish: float = 0.95
     """Share of the error that is left at the best depth, at most: else a place wishes to stay."""
     decisive: float = 0.7
@@ -90,8 +90,8 @@ class TrialSettings:
     """The same of places that were found right."""
     hold: float = 0.02
     """Of every place, as a curvature: plain paint in plain light may be anywhere."""
-    together: float = 0.3
-    """Weight of neighbours' moves being equal, against a curvature of 1."""
+    together: float = 0.1
+    """Weight of moves being equal within `spread`, against a curvature of 1."""
     still: float = 0.003
     """Lesser moves are for normals to make ..."""
     moved: float = 0.006
@@ -136,20 +136,23 @@ def try_depths(
     trials = _Trials(views, faces, settings, seed, report, should_stop)
     edges, count = trials.edges, len(parameters["vertices"])
     around = averaging_matrix(edges, count)
-    outward = averaged(around, vertex_normals(parameters["vertices"], faces), 2 * settings.rings)
+    start, end = parameters["vertices"][edges.vertices].unbind(1)
+    # A mean over neighbours is as wide as 0.65 edges along each axis, and squares of widths add.
+    rings = max(1, round((settings.spread * radius / (0.65 * float((start - end).norm(dim=1).mean()))) ** 2))
+    outward = averaged(around, vertex_normals(parameters["vertices"], faces), 2 * rings)
     inward = -torch.nn.functional.normalize(outward, dim=-1)
 
     def smoothed(values: Tensor) -> Tensor:
-        return averaged(around, values.float().view(count, -1), settings.rings).squeeze(1)
+        return averaged(around, values.float().view(count, -1), rings).squeeze(1)
 
-    start = trials.settled(parameters)
+    first = trials.settled(parameters)
     # Once more where it is, so that all that is compared had as many steps.
-    here = trials.settled(start.parameters)
+    here = trials.settled(first.parameters)
     most = REACH * _thickness(here.tracer, inward)
 
     def tried(depth: Tensor, only: Tensor | None = None) -> tuple[dict[str, Tensor], Tensor]:
         """The surface settled there, and the ratio of its errors to those here."""
-        moved = trials.settled(_sunk(start.parameters, depth, inward, faces), here, only)
+        moved = trials.settled(_sunk(first.parameters, depth, inward, faces), here, only)
         there, before = smoothed(moved.errors), smoothed(here.errors)
         known = torch.minimum(there[:, 1], before[:, 1]) > FEWEST
         error, base = (sums[:, 0] / sums[:, 1].clamp(min=1e-9) + NOISE for sums in (there, before))
@@ -163,7 +166,11 @@ def try_depths(
     only = smoothed(smoothed(loose)) > 0
     ratios = torch.stack([tried(reached(share, loose.to(most)), only)[1] for share in settings.depths], 1)
 
-    depth = torch.minimum(_agreed_depth(ratios, loose, settings, lambda *wishes: agree_along_edges(edges, *wishes)) * radius, most)
+    depth = torch.minimum(
+        _agreed_depth(ratios, loose, settings, lambda weight, wish: agree_along_edges(edges, weight, wish, settings.together * rings))
+        * radius,
+        most,
+    )
     after, ratio = tried(depth, only)
     kept = smoothed((ratio < settings.better) & (depth != 0)) > 0.5
     share = smoothed(kept)  # slopes between what goes and what stays
@@ -196,7 +203,7 @@ def preferred_depth(
     return best, torch.where(known, curvature, torch.zeros_like(curvature))
 
 
-def _agreed_depth(ratios: Tensor, loose: Tensor, settings: TrialSettings, agree: Callable[[Tensor, Tensor, float], Tensor]) -> Tensor:
+def _agreed_depth(ratios: Tensor, loose: Tensor, settings: TrialSettings, agree: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """(vertex,) how far each place should sink [of the radius], in agreement with its surroundings."""
     depths, order = torch.tensor((0.0, *settings.depths)).to(ratios).sort()
     with_here = torch.cat([torch.ones_like(ratios[:, :1]), ratios], 1)[:, order]
@@ -206,7 +213,7 @@ def _agreed_depth(ratios: Tensor, loose: Tensor, settings: TrialSettings, agree:
     wishes = loose & (left < settings.wish)
     wish = torch.where(wishes, wish, torch.zeros_like(wish))
     certain = torch.where(loose, curvature.clamp(max=settings.most_curved), torch.full_like(curvature, settings.right))
-    agreed = agree(certain + settings.hold, wish * certain / (certain + settings.hold), settings.together)
+    agreed = agree(certain + settings.hold, wish * certain / (certain + settings.hold))
     firm = ((agreed.abs() - settings.still) / (settings.moved - settings.still)).clamp(0, 1)
     return agreed * firm * firm * (3 - 2 * firm)
 

@@ -22,7 +22,7 @@ SETTINGS = TrialSettings(
     steps=40,
     rates=SurfaceRates(normals=0.005, albedo_logits=0.2, environment=0.0),  # the paint is not known at the start
     share_rays=4,
-    rings=2,
+    spread=0.06,
 )
 
 
