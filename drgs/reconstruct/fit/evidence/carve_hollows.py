@@ -21,6 +21,7 @@ from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.reconstruct.geometry.thickness import thickness
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.mesh import vertex_normals
@@ -121,8 +122,8 @@ def carved_depths(
     alike[matt[wishes]] = torch.stack([torch.ones_like(least), at * settings.step * radius], -1)[wishes]
     share, common = averaged(around, alike, settings.cost_rings)[matt].unbind(-1)
     wishes &= share > settings.agreeing
-    thickness = _thickness(tracer, matt, inward[matt])
-    common = torch.minimum(common / share.clamp(min=1e-9), torch.minimum(THROUGH * thickness, (thickness - LEFT * radius).clamp(min=0)))
+    through = thickness(tracer, matt, inward[matt])
+    common = torch.minimum(common / share.clamp(min=1e-9), torch.minimum(THROUGH * through, (through - LEFT * radius).clamp(min=0)))
     weight, wish = torch.full_like(mesh.roughness, settings.hold), torch.zeros_like(mesh.roughness)
     weight[matt[cost[0] > settings.disagreeing]] = settings.hold_unsure  # also where too few views see them, for then it is endless
     weight[matt[wishes]], wish[matt[wishes]] = 1.0, common[wishes]
@@ -192,9 +193,3 @@ def _would_be_seen(
     stays = ~second.hit | (second.distance + start > distance)
     near = (entry - tracer.mesh.vertices[vertices]).norm(dim=1) < 3 * depth + NEARBY * radius
     return first.hit & (first.distance < distance) & stays & near
-
-
-def _thickness(tracer: AbstractTracer, vertices: Tensor, inward: Tensor) -> Tensor:
-    """(n,) how far it is from the vertices (n,) to the other side of the object [world units]."""
-    hits = trace_rays(tracer.mesh.vertices[vertices] + 8 * tracer.lift * inward, inward, tracer)
-    return torch.where(hits.hit, hits.distance, torch.zeros_like(hits.distance))

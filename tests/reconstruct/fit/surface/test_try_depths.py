@@ -68,6 +68,16 @@ def test_what_is_too_far_out_or_in_moves_to_where_it_belongs_and_the_rest_stays(
     assert float(off(found.parameters["vertices"])[rest].abs().mean()) < 0.1 * PIXEL
 
 
+@pytest.mark.parametrize("loose", [0.0, 1e9])
+def test_no_place_may_be_loose_and_every_place_may(views: Views, loose: float):
+    """Of a view that sees none of the loose places nothing is compared."""
+    mesh = placed_sphere()
+    settings = dataclasses.replace(SETTINGS, loose=loose, steps=2, depths=(-0.04, 0.04))
+    found = try_depths(views, start(mesh), mesh.faces, settings, SPHERE_RADIUS, 3)
+    assert found is not None and bool((found.loose == (loose > 0)).all())
+    assert torch.isfinite(found.parameters["vertices"]).all() and (loose > 0 or not found.depth.any())
+
+
 def test_trials_that_are_told_to_stop_move_nothing(views: Views):
     mesh, _ = with_bump(0.12)
     told: list[int] = []
