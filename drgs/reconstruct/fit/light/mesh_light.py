@@ -31,6 +31,8 @@ BRIGHTEST_SHARE = 3.0
 """More than this times the open sky's irradiance is noise."""
 SHARED_AT_ONCE = 8192
 """Vertices whose rays are traced together."""
+MIRRORS = 2
+"""Times that what a mirrored ray meets mirrors the object again. Few rays meet anything, so it costs little."""
 CLEAR_OF_FACE = 1e-3
 """Least cosine of a mirrored ray to its face; rays below it count as free."""
 
@@ -63,10 +65,22 @@ def corner_weights(barycentric: Tensor) -> Tensor:
     return torch.cat([1 - barycentric.sum(-1, keepdim=True), barycentric], -1)
 
 
-def hit_radiance(mesh: TriangleMesh, corners: Tensor, weights: Tensor, towards: Tensor, light: MeshLight) -> Tensor:
-    """(point, 3) radiance that places on the mesh send in the directions `towards` (point, 3), by split sum."""
+def hit_radiance(
+    mesh: TriangleMesh,
+    corners: Tensor,
+    weights: Tensor,
+    towards: Tensor,
+    light: MeshLight,
+    mirrored: tuple[Tensor, Tensor] | None = None,
+) -> Tensor:
+    """(point, 3) radiance that places on the mesh send in the directions `towards` (point, 3), by split sum.
+
+    Args:
+        mirrored: of mirrored_light; None: all that is mirrored there is the sky.
+    """
     normal = torch.nn.functional.normalize(at_corners(mesh.normals, corners, weights), dim=-1)
     albedo, metallic = at_corners(mesh.albedo, corners, weights), at_corners(mesh.metallic, corners, weights)
+    transmittance, met = (None, None) if mirrored is None else mirrored
     return shade_split_sum(
         albedo * (1 - metallic)[:, None],
         torch.zeros_like(albedo),
@@ -75,19 +89,40 @@ def hit_radiance(mesh: TriangleMesh, corners: Tensor, weights: Tensor, towards: 
         normal,
         towards,
         light.tables,
+        transmittance,
+        met,
         open_share=at_corners(light.open_share, corners, weights),
         light_from_world=light.light_from_world,
     ).clamp(min=0)
 
 
-def radiance_along(tracer: AbstractTracer, origins: Tensor, directions: Tensor, light: MeshLight) -> tuple[Tensor, Tensor]:
-    """(ray,) 1 where nothing is met, and (ray, 3) radiance of what is, 0 elsewhere."""
+def radiance_along(
+    tracer: AbstractTracer,
+    origins: Tensor,
+    directions: Tensor,
+    light: MeshLight,
+    mirrors: int = 0,
+    generator: torch.Generator | None = None,
+) -> tuple[Tensor, Tensor]:
+    """(ray,) 1 where nothing is met, and (ray, 3) radiance of what is, 0 elsewhere.
+
+    Args:
+        mirrors: how often what is met mirrors the object again; after that it mirrors the sky. generator: of their directions.
+    """
     hits = trace_rays(origins, directions, tracer)
     radiance = torch.zeros_like(directions)
     met = hits.hit.nonzero().squeeze(1)
     if len(met):
-        corners = tracer.mesh.faces[hits.face[met].long()].long()
-        radiance[met] = hit_radiance(tracer.mesh, corners, corner_weights(hits.barycentric[met]), -directions[met], light)
+        mesh, towards = tracer.mesh, -directions[met]
+        face = hits.face[met].long()
+        corners, weights = mesh.faces[face].long(), corner_weights(hits.barycentric[met])
+        again = None
+        if mirrors:
+            assert generator is not None
+            position, roughness = (at_corners(values, corners, weights) for values in (mesh.vertices, mesh.roughness))
+            normal = torch.nn.functional.normalize(at_corners(mesh.normals, corners, weights), dim=-1)
+            again = mirrored_light(tracer, position, tracer.face_normals[face], normal, roughness, towards, light, generator, mirrors - 1)
+        radiance[met] = hit_radiance(mesh, corners, weights, towards, light, again)
     return (~hits.hit).float(), radiance
 
 
@@ -100,8 +135,13 @@ def mirrored_light(
     wo: Tensor,
     light: MeshLight,
     generator: torch.Generator,
+    mirrors: int = MIRRORS,
 ) -> tuple[Tensor, Tensor]:
-    """Of each point (point, 3): whether a ray mirrored at a half vector drawn from its lobe escapes (point,), and what it meets (point, 3)."""
+    """Of each point (point, 3): whether a ray mirrored at a half vector drawn from its lobe escapes (point,), and what it meets (point, 3).
+
+    Args:
+        mirrors: of radiance_along.
+    """
     alpha = roughness * roughness
     u = torch.rand(2, len(normal), generator=generator).to(normal.device)
     cosine2 = (1 - u[0]) / (1 + (alpha * alpha - 1) * u[0])
@@ -112,7 +152,7 @@ def mirrored_light(
     transmittance, met = torch.ones_like(roughness), torch.zeros_like(normal)
     above = ((mirrored * face_normal).sum(-1) > CLEAR_OF_FACE).nonzero().squeeze(1)
     origin = position[above] + tracer.lift * face_normal[above]
-    transmittance[above], met[above] = radiance_along(tracer, origin, mirrored[above], light)
+    transmittance[above], met[above] = radiance_along(tracer, origin, mirrored[above], light, mirrors, generator)
     return transmittance, met
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from drgs.reconstruct.fit.light.mesh_light import SHARE_LIFT, MeshLight, irradiance_share
+from drgs.reconstruct.fit.light.mesh_light import SHARE_LIFT, MeshLight, irradiance_share, mirrored_light
 from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, filter_environment, texel_directions, texel_solid_angles
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -66,3 +66,28 @@ def test_where_nothing_is_met_all_arrives() -> None:
     one = sphere_mesh(subdivisions=2)
     found = shares(build_tracer(dataclasses.replace(one, albedo=torch.ones_like(one.albedo))), lamp_sky(), 8)
     torch.testing.assert_close(found, torch.ones_like(found))
+
+
+def facing_mirrors(albedo: float) -> TriangleMesh:
+    """Two large metal squares, face to face, at z = 0 and z = 1."""
+    corners = torch.tensor([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
+    vertices = torch.cat([corners, corners + torch.tensor([0.0, 0, 1])])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]], dtype=torch.int32)
+    up = torch.tensor([0.0, 0, 1]).expand(4, 3)
+    ones = torch.ones(8)
+    return TriangleMesh(vertices, faces, torch.cat([up, -up]), torch.full((8, 3), albedo), 0.1 * ones, ones)
+
+
+@pytest.mark.parametrize("mirrors", [0, 1, 2])
+def test_what_a_mirror_shows_of_another_mirrors_the_object_as_often_as_it_is_said(mirrors: int) -> None:
+    """Under an even sky of 1: each mirror leaves its albedo of what it shows, and after the last one the sky is shown."""
+    albedo, count = 0.8, 256
+    mesh = facing_mirrors(albedo)
+    light = MeshLight(filter_environment(torch.ones(*ENVIRONMENT_SIZE, 3)), torch.zeros_like(mesh.vertices))
+    up = torch.tensor([0.0, 0, 1]).expand(count, 3).contiguous()
+    towards = torch.nn.functional.normalize(torch.tensor([0.1, 0, 1.0]), dim=0).expand(count, 3)
+    transmittance, met = mirrored_light(
+        build_tracer(mesh), torch.zeros(count, 3), up, up, torch.full((count,), 0.1), towards, light, torch.Generator().manual_seed(1), mirrors
+    )
+    assert float(transmittance.max()) == 0
+    assert abs(float(met.mean()) / albedo ** (mirrors + 1) - 1) < 0.02
