@@ -83,9 +83,8 @@ def encode_textured_glb(asset: Asset) -> bytes:
     mesh = asset.mesh
     atlas = unwrap(_array(mesh.vertices), _array(mesh.faces))
     values = torch.cat([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], -1)
-    picture = torch.from_numpy(paint(atlas, _array(values))).clamp(0, 1)
-    surface = torch.cat([torch.ones_like(picture[..., :1]), picture[..., 3:]], -1)
-    images = (_png(srgb_from_linear(picture[..., :3])), _png(surface))
+    picture = paint(atlas, _array(values), _material_texels)
+    images = (_png(picture[..., :3]), _png(picture[..., 3:]))
     normals = torch.nn.functional.normalize(mesh.normals, dim=-1)
     attributes = {"POSITION": _array(mesh.vertices)[atlas.vertex_of], "NORMAL": _array(normals)[atlas.vertex_of], "TEXCOORD_0": atlas.uv}
     material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
@@ -128,9 +127,17 @@ def _surfel_arrays(gaussians: Gaussians | None) -> dict[str, np.ndarray] | None:
     return {key: _array(values) for key, values in tensors.items()}
 
 
-def _png(values: Float[Tensor, "height width channel"]) -> bytes:
+def _material_texels(values: np.ndarray) -> np.ndarray:
+    """(n, 6) uint8 of base colour, roughness and metallic (n, 5): the first texture's three channels and the second's, whose red is occlusion."""
+    values_in = torch.from_numpy(values).clamp(0, 1)
+    surface = torch.cat([torch.ones_like(values_in[:, :1]), values_in[:, 3:]], -1)
+    return _array((torch.cat([srgb_from_linear(values_in[:, :3]), surface], -1) * 255).round().to(torch.uint8))
+
+
+def _png(texels: np.ndarray) -> bytes:
+    """Of (height, width, 3) uint8."""
     stream = io.BytesIO()
-    Image.fromarray((values * 255).round().to(torch.uint8).cpu().numpy()).save(stream, "PNG", compress_level=4)
+    Image.fromarray(np.ascontiguousarray(texels)).save(stream, "PNG", compress_level=4)
     return stream.getvalue()
 
 

@@ -5,6 +5,7 @@ two faces share a square cell, which is instant and as exact, but has a seam at 
 In and out: numpy arrays. Rows of a picture run down, as glTF's texture coordinates do.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,9 +89,18 @@ def _cells(faces: np.ndarray) -> Atlas:
     )
 
 
-def paint(atlas: Atlas, values: np.ndarray) -> np.ndarray:
-    """(height, width, k) float32 picture of values (vertex, k), linear over each face; the rest takes the nearest painted texel."""
-    picture = np.zeros((atlas.height, atlas.width, values.shape[1]), np.float32)
+def _as_they_are(values: np.ndarray) -> np.ndarray:
+    return values
+
+
+def paint(atlas: Atlas, values: np.ndarray, texel: Callable[[np.ndarray], np.ndarray] = _as_they_are) -> np.ndarray:
+    """(height, width, j) picture of values (vertex, k), linear over each face; the rest takes the nearest painted texel.
+
+    Args:
+        texel: from float32 values (n, k) to what is kept of them, (n, j) of any type: a large picture is never there in another form.
+    """
+    kept = texel(np.zeros((0, values.shape[1]), np.float32))
+    picture = np.zeros((atlas.height, atlas.width, kept.shape[1]), kept.dtype)
     painted = np.zeros((atlas.height, atlas.width), bool)
     triangles = atlas.uv[atlas.faces].astype(np.float64) * np.array([atlas.width, atlas.height]) - 0.5  # texel centres at whole numbers
     corner_values = values[atlas.vertex_of[atlas.faces]]
@@ -108,13 +118,16 @@ def paint(atlas: Atlas, values: np.ndarray) -> np.ndarray:
         weights = _barycentric(triangles[face], np.stack([x, y], -1).astype(np.float64))
         inside = (weights >= -_EDGE).all(-1)
         face, x, y, weights = face[inside], x[inside], y[inside], weights[inside]
-        picture[y, x] = (corner_values[face] * weights[..., None]).sum(1)
+        picture[y, x] = texel((corner_values[face] * weights[..., None]).sum(1).astype(np.float32))
         painted[y, x] = True
         start = stop
     if not painted.any():
         return picture
     rows, columns = distance_transform_edt(~painted, return_distances=False, return_indices=True)
-    return picture[rows, columns]
+    for row in range(atlas.height):
+        bare = ~painted[row]
+        picture[row, bare] = picture[rows[row, bare], columns[row, bare]]
+    return picture
 
 
 def _barycentric(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
