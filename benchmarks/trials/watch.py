@@ -35,10 +35,14 @@ class MemoryWatch:
 
     def now(self) -> int:
         """Bytes at this moment."""
-        total = 0
-        for process in self._all():
+        try:
+            own, total = self._process.cmdline(), self._process.memory_info().rss
+        except psutil.Error:
+            return 0
+        for process in self._all()[1:]:
             try:
-                total += process.memory_info().rss
+                # What has just been forked is the server's own memory until it runs its program.
+                total += 0 if process.cmdline() == own else process.memory_info().rss
             except psutil.Error:  # it ended meanwhile
                 continue
         return total

@@ -29,6 +29,7 @@ from drgs_server.api.rest_records import Health, TokenRequest
 from drgs_server.api.security import COOKIE_NAME, Gatekeeper, GateMiddleware
 from drgs_server.live import stream
 from drgs_server.live.admission import Admission
+from drgs_server.live.return_memory import memory_returner
 from drgs_server.live.sessions import SessionRegistry
 from drgs_server.render.interface import AbstractRenderer
 from drgs_server.render.shared_renderer import SharedRenderer
@@ -48,6 +49,8 @@ REMOVAL_SECONDS = 600.0
 """Between two looks for assets whose deletion can no longer be undone, and for what nobody refers to."""
 BACKUP_SECONDS = 3600.0
 """Between two copies of the databases."""
+RETURN_SECONDS = 2.0
+"""Between two times that freed memory is given back."""
 VIEWER = Path(__file__).parent / "static"
 
 
@@ -92,7 +95,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
         if await asyncio.to_thread(context.sessions.any):
             asyncio.get_running_loop().run_in_executor(None, renderer.prepare)
         work = (_requeue_dead_workers_jobs, _remove_unused, _forget_assets_deleted_elsewhere, _back_up_databases)
-        chores = [asyncio.create_task(chore(context)) for chore in work]
+        chores = [asyncio.create_task(chore(context)) for chore in work] + [asyncio.create_task(_return_memory())]
         yield
         for chore in chores:
             chore.cancel()
@@ -153,6 +156,13 @@ async def _forget_assets_deleted_elsewhere(context: ServerContext) -> None:
             await context.sessions.forget_deleted()
         except SQLAlchemyError as error:
             logging.getLogger(__name__).warning("the database does not answer: %s", error)
+
+
+async def _return_memory() -> None:
+    give_back = memory_returner()
+    while True:
+        await asyncio.sleep(RETURN_SECONDS)
+        await asyncio.to_thread(give_back)
 
 
 async def _back_up_databases(context: ServerContext) -> None:

@@ -248,6 +248,7 @@ def test_environments_count_as_loaded_and_leave_memory_with_the_poses_that_they_
         shutil.rmtree(service.context.directory.asset(asset))
         save_asset(import_mesh(tmp_path / "ball.ply"), service.context.directory.asset(asset))
         used = []
+        kept = sum(path.stat().st_size for path in service.context.directory.asset(asset).rglob("*") if path.is_file())
         for k in range(5):
             light = np.full((128, 256, 3), 0.1 * k, np.float32)
             (service.context.directory.environments / f"light{k}.exr").write_bytes(encode_environment(light))
@@ -255,6 +256,6 @@ def test_environments_count_as_loaded_and_leave_memory_with_the_poses_that_they_
             edit = {"op": "environment", "file": f"light{k}.exr"}
             assert service.client.post(f"/api/sessions/{session}/edits", json={"edit": edit}).status_code == 200
             used.append(service.context.sessions.loaded_bytes())
-        assert used[1] - used[0] == 128 * 256 * 3 * 4, "each is counted"
+        assert used[1] - used[0] == 128 * 256 * 3 * 4 + kept, "each is counted, and its pose as much as the asset"
         assert max(used) <= 1 << 20
         assert service.client.get(f"/api/sessions/{session}/frame.png?width=16&height=16&spp=4").status_code == 200

@@ -41,6 +41,8 @@ KEEP_EVERY = 256
 """Changes of such a log after which it is kept anew."""
 POSED_SESSIONS = 64
 """Whose pose stays in memory while nobody looks at them; others are posed again when somebody does."""
+FEW_POSED_SESSIONS = 8
+"""Whose pose stays longer than simulations that nobody asked for last."""
 
 
 class SessionRegistry:
@@ -225,29 +227,37 @@ class SessionRegistry:
         return self._directory.poses / f"{session_id}.safetensors"
 
     def loaded_bytes(self) -> int:
-        """Of assets in memory, of the frames of their simulations, and of the environments that they are shown under."""
+        """Of assets in memory, of the frames of their simulations, of the environments that they are shown under, and of poses: each about as
+        much as its asset (18 MB of a tracer and its faces for an asset of 28 MB)."""
         assets = sum(self._asset_bytes[name] + loaded.simulation_bytes() for name, loaded in self._loaded.items())
-        return assets + self._renderer.environment_bytes()
+        poses = sum(self._asset_bytes.get(session.asset_id, 0) for session in self._posed.values())
+        return assets + poses + self._renderer.environment_bytes()
 
     def _make_room(self, newest: LiveSession) -> None:
-        """Let go of what was used least recently: environments that light nothing and simulations that nobody asked for last, then poses with theirs, then assets. What somebody looks at stays,
-        and so does the session whose pose is new."""
+        """Let go of what was used least recently: all but a few poses, then environments that light nothing and simulations that nobody asked for last, then the other poses with theirs,
+        then assets. What somebody looks at stays, and so does the session whose pose is new."""
         self._posed[newest.id] = newest
         self._posed.move_to_end(newest.id)
+        self._forget_poses(newest, FEW_POSED_SESSIONS)
         if self.loaded_bytes() > self._limits.loaded_bytes:
             self._renderer.forget_environments()
             for loaded in self._loaded.values():
                 loaded.forget_simulations()
-        for session in [session for session in self._posed.values() if not session.viewers and session is not newest]:
-            if len(self._posed) <= POSED_SESSIONS and self.loaded_bytes() <= self._limits.loaded_bytes:
-                break
-            session.posed = None
-            del self._posed[session.id]
+        self._forget_poses(newest, 0)
         for asset_id in list(self._loaded):
             if len(self._loaded) <= self._limits.loaded_assets and self.loaded_bytes() <= self._limits.loaded_bytes:
                 return
             if asset_id != newest.asset_id and not self.uses(asset_id):
                 self._unload(asset_id)
+
+    def _forget_poses(self, newest: LiveSession, kept: int) -> None:
+        """Of sessions that nobody looks at, the oldest first, until there is room or only `kept` are left."""
+        for session in [session for session in self._posed.values() if not session.viewers and session is not newest]:
+            there_is_room = len(self._posed) <= POSED_SESSIONS and self.loaded_bytes() <= self._limits.loaded_bytes
+            if there_is_room or len(self._posed) <= kept:
+                return
+            session.posed = None
+            del self._posed[session.id]
 
     def _unload(self, asset_id: str) -> None:
         self._loaded.pop(asset_id, None)
