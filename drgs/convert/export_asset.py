@@ -2,14 +2,15 @@
 
 ply   2D Gaussians, two scales, `SplatRenderMode: 2dgs` (SuperSplat, splat-transform)
 ply3  the same with a flat third scale, for viewers of 3D Gaussians
-glb   mesh with base colour and metallic-roughness textures (Blender, three.js, Unreal, Unity)
+glb   mesh with base colour and metallic-roughness textures (Blender, three.js, Unreal, Unity), and in a second scene the Gaussians
+      as splats by KHR_gaussian_splatting, flat like those of ply3
+mesh  the same without the Gaussians
 usd   mesh and surfels as a particle field (OpenUSD 26)
 env   the recovered light, lat-long EXR, linear
 Viewers of Gaussians show colours as they stand in the file, so there the linear radiance is turned to sRGB.
 """
 
 import io
-import math
 import os
 import tempfile
 from pathlib import Path
@@ -22,18 +23,16 @@ from torch import Tensor
 
 from drgs.exchange.export_formats import EXPORT_FORMATS, ExportFormat
 from drgs.exchange.exr import encode_environment
-from drgs.exchange.gaussian_ply import encode_gaussian_ply
-from drgs.exchange.glb import GlbMesh, encode_glb
+from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
+from drgs.exchange.glb import GlbMesh, GlbPoints, encode_glb
+from drgs.exchange.gltf_splats import GltfSplats, points_from_splats
 from drgs.exchange.texture_atlas import paint, unwrap
 from drgs.exchange.usd import write_usd
 from drgs.maths.color import srgb_from_linear
 from drgs.maths.frames import rotation_from_quat_wxyz
-from drgs.maths.spherical_harmonics import SH_OFFSET, sh_basis
+from drgs.maths.spherical_harmonics import map_radiance
 from drgs.scene.asset import Asset
 from drgs.scene.gaussians import Gaussians
-
-PROBE_DIRECTIONS = 96
-"""Directions in which a surfel's colour is turned to sRGB before it is fitted again; 16 coefficients need well over 16."""
 
 
 def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> None:
@@ -55,7 +54,8 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> None:
     temporary = Path(name)
     try:
         if format == "usd":
-            write_usd(temporary, _mesh_arrays(asset), _surfel_arrays(asset.gaussians), asset.meters_per_unit)
+            surfels = None if asset.gaussians is None else _surfel_arrays(asset.gaussians)
+            write_usd(temporary, _mesh_arrays(asset), surfels, asset.meters_per_unit)
         else:
             temporary.write_bytes(_file_bytes(asset, format))
         temporary.chmod(0o644)
@@ -67,8 +67,8 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> None:
 def _file_bytes(asset: Asset, format: str) -> bytes:
     if format == "env":
         return encode_environment(_array(asset.environment.radiance))
-    if format == "glb":
-        return encode_textured_glb(asset)
+    if format in ("glb", "mesh"):
+        return encode_textured_glb(asset, with_splats=format == "glb")
     gaussians = asset.gaussians
     assert gaussians is not None
     arrays = {key: _array(values) for key, values in vars(gaussians).items()}
@@ -78,8 +78,12 @@ def _file_bytes(asset: Asset, format: str) -> bytes:
     return encode_gaussian_ply(arrays, normals, third_scale=format == "ply3", comments=(note,))
 
 
-def encode_textured_glb(asset: Asset) -> bytes:
-    """Bytes of a GLB whose textures hold the vertex materials: base colour in sRGB; roughness in green, metallic in blue."""
+def encode_textured_glb(asset: Asset, with_splats: bool = True) -> bytes:
+    """Bytes of a GLB whose textures hold the vertex materials: base colour in sRGB; roughness in green, metallic in blue.
+
+    Args:
+        with_splats: the Gaussians too, where there are some: 260 bytes each.
+    """
     mesh = asset.mesh
     atlas = unwrap(_array(mesh.vertices), _array(mesh.faces))
     values = torch.cat([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], -1)
@@ -88,7 +92,26 @@ def encode_textured_glb(asset: Asset) -> bytes:
     normals = torch.nn.functional.normalize(mesh.normals, dim=-1)
     attributes = {"POSITION": _array(mesh.vertices)[atlas.vertex_of], "NORMAL": _array(normals)[atlas.vertex_of], "TEXCOORD_0": atlas.uv}
     material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
-    return encode_glb(GlbMesh(attributes, atlas.faces, material, images), asset.meters_per_unit)
+    points = _splat_points(asset.gaussians) if with_splats and asset.gaussians is not None and len(asset.gaussians.centers) else None
+    return encode_glb(GlbMesh(attributes, atlas.faces, material, images), asset.meters_per_unit, points)
+
+
+def _splat_points(gaussians: Gaussians) -> GlbPoints:
+    """In world units; the third scale as in ply3."""
+    arrays = _surfel_arrays(gaussians)
+    thickness = np.exp(log_thickness(arrays["centers"], _array(gaussians.log_scales)))
+    materials = {"_ALBEDO": arrays["albedo"], "_ROUGHNESS": arrays["roughness"], "_METALLIC": arrays["metallic"]}
+    return points_from_splats(
+        GltfSplats(
+            arrays["centers"],
+            arrays["quats_wxyz"][:, [1, 2, 3, 0]],
+            np.concatenate([arrays["scales"], thickness[:, None]], -1, dtype=np.float32),
+            arrays["opacities"],
+            _array(display_sh(gaussians.sh)),
+            "srgb_rec709_display",
+            materials,
+        )
+    )
 
 
 def display_sh(sh: Float[Tensor, "surfel 16 3"]) -> Float[Tensor, "surfel 16 3"]:
@@ -96,24 +119,15 @@ def display_sh(sh: Float[Tensor, "surfel 16 3"]) -> Float[Tensor, "surfel 16 3"]
 
     Both sides without the offset of 0.5; colours above 1 are clipped, as a screen would.
     """
-    index = torch.arange(PROBE_DIRECTIONS, dtype=torch.float64) + 0.5
-    height, turn = 1 - 2 * index / PROBE_DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index  # a Fibonacci lattice
-    side = torch.sqrt(1 - height * height)
-    basis = sh_basis(torch.stack([side * torch.cos(turn), side * torch.sin(turn), height], -1))
-    fit = torch.linalg.pinv(basis).to(sh)
-    basis = basis.to(sh)
-    chunks = [basis @ chunk + SH_OFFSET for chunk in sh.split(20_000)]
-    return torch.cat([fit @ (srgb_from_linear(colors.clamp(0, 1)) - SH_OFFSET) for colors in chunks]) if chunks else sh
+    return map_radiance(sh, lambda radiance: srgb_from_linear(radiance.clamp(0, 1)))
 
 
 def _mesh_arrays(asset: Asset) -> dict[str, np.ndarray]:
     return {key: _array(values) for key, values in vars(asset.mesh).items()}
 
 
-def _surfel_arrays(gaussians: Gaussians | None) -> dict[str, np.ndarray] | None:
+def _surfel_arrays(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """Activated: linear scales, opacities, unit quaternions."""
-    if gaussians is None:
-        return None
     tensors = {
         "centers": gaussians.centers,
         "scales": torch.exp(gaussians.log_scales),

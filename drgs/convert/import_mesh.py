@@ -1,9 +1,10 @@
 """A mesh of another program becomes an asset, without training: GLB, OBJ, or PLY with float vertex properties.
 
 PLY: albedo_r/g/b (linear), roughness, metallic, else red/green/blue (8-bit sRGB); GLB: metallic-roughness factors and textures,
-sampled at the vertices, or our own _ALBEDO, _ROUGHNESS, _METALLIC; OBJ: diffuse colour and map of its MTL, in UTF-8 or Latin-1. What a file does not say is
-albedo 0.5, roughness 0.5, metallic 0. Normals come from the file where it has them. GLB is y up by definition and is turned to
-z up; PLY and OBJ coordinates are taken as they are. Textures are read only from inside the GLB or beside the OBJ.
+sampled at the vertices, or our own _ALBEDO, _ROUGHNESS, _METALLIC; OBJ: diffuse colour and map of its MTL, in UTF-8 or Latin-1.
+What a file does not say is albedo 0.5, roughness 0.5, metallic 0. Normals come from the file where it has them. GLB is y up by
+definition and is turned to z up; PLY and OBJ coordinates are taken as they are. Textures are read only from inside the GLB or beside
+the OBJ. Splats of a GLB become Gaussians that are bound to the mesh (import_splats).
 """
 
 import json
@@ -21,15 +22,17 @@ from numpy import ndarray
 from torch import Tensor
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from drgs.convert.import_splats import import_splats
 from drgs.exchange.gltf_accessors import open_gltf
 from drgs.exchange.pictures import as_eight_bits
 from drgs.exchange.ply import parse_ply, triangles_from_faces
 from drgs.maths.color import linear_from_srgb
+from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
 from drgs.scene.asset import Asset
 from drgs.scene.environment import Environment
+from drgs.scene.materials import DEFAULT_ALBEDO, DEFAULT_METALLIC, DEFAULT_ROUGHNESS
 from drgs.scene.mesh import TriangleMesh, refuse_unusable, vertex_normals
 
-DEFAULT_ALBEDO, DEFAULT_ROUGHNESS, DEFAULT_METALLIC = 0.5, 0.5, 0.0
 MAX_BYTES = 2 << 30
 MAX_VERTICES = 20_000_000
 MAX_TEXTURE_PIXELS = 1 << 28
@@ -52,7 +55,7 @@ class _Part:
 
 
 def import_mesh(path: Path | str) -> Asset:
-    """Asset with this mesh, a constant light of 1, and no Gaussians.
+    """Asset with this mesh and a constant light of 1; Gaussians where a GLB holds splats. Cameras see the mesh in any case.
 
     Raises:
         ValueError: one sentence: unknown format, damaged, no triangles, or a value that is not finite or out of range.
@@ -65,9 +68,15 @@ def import_mesh(path: Path | str) -> Asset:
         raise ValueError(f"{path}: does not exist")
     if path.stat().st_size > MAX_BYTES:
         raise ValueError(f"{path}: has {path.stat().st_size} bytes; the limit is {MAX_BYTES}")
-    mesh = _mesh_from_parts(readers[path.suffix.lower()](path), str(path))
-    radiance = torch.ones(ENVIRONMENT_HEIGHT, 2 * ENVIRONMENT_HEIGHT, 3)
-    return Asset(None, mesh, None, Environment(radiance), provenance={"source": {"kind": "import", "file": path.name}})
+    parts = readers[path.suffix.lower()](path)
+    gaussians = import_splats(path) if path.suffix.lower() == ".glb" else None
+    if gaussians is not None and not parts:
+        raise ValueError(f"{path}: holds {len(gaussians.centers)} splats and no triangles; an asset needs a mesh: export one with them")
+    mesh = _mesh_from_parts(parts, str(path))
+    binding = None if gaussians is None else bind_gaussians(gaussians.centers, mesh)
+    environment = Environment(torch.ones(ENVIRONMENT_HEIGHT, 2 * ENVIRONMENT_HEIGHT, 3))
+    provenance = {"source": {"kind": "import", "file": path.name}}
+    return Asset(gaussians, mesh, binding, environment, provenance=provenance, primary=None if gaussians is None else "mesh")
 
 
 def _mesh_from_parts(parts: list[_Part], name: str) -> TriangleMesh:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-ExportFormat = Literal["ply", "ply3", "glb", "usd", "env"]
+ExportFormat = Literal["ply", "ply3", "glb", "mesh", "usd", "env"]
 """What `drgs.export_asset` writes."""
 DownloadFormat = Literal[ExportFormat, "zip"]
 """What the service gives out: these, and the asset itself."""
@@ -28,7 +28,12 @@ class FileKind:
 
 
 FILE_KINDS: dict[DownloadFormat, FileKind] = {
-    "glb": FileKind(".glb", "Mesh (GLB)", "Mesh with metallic-roughness textures: Blender, three.js, Unreal, Unity"),
+    "glb": FileKind(
+        ".glb",
+        "Mesh and Gaussians (GLB)",
+        "Mesh with metallic-roughness textures: Blender, three.js, Unreal, Unity; in a second scene the Gaussians (KHR_gaussian_splatting)",
+    ),
+    "mesh": FileKind(".glb", "Mesh (GLB)", "The same mesh alone, in a smaller file"),
     "ply": FileKind(".ply", "Gaussians (2DGS PLY)", "2D Gaussians with the field names of 2DGS: SuperSplat"),
     "ply3": FileKind(".ply", "Gaussians (3DGS PLY)", "The same as flat ellipsoids, for viewers that want three scales"),
     "usd": FileKind(".usda", "Scene (USD)", "ParticleField surflets for OpenUSD 26", (".usd", ".usdc")),

@@ -13,8 +13,10 @@ import numpy as np
 from drgs.exchange.ply import encode_ply, parse_ply
 
 FLATNESS = 1e-6
-"""scale_2 of a 3DGS file, as a part of the object's extent, and at most THINNEST of the surfel's own smaller scale."""
+"""Third scale in a file of 3D Gaussians, as a part of the object's extent, and at most THINNEST of the surfel's own smaller scale."""
 THINNEST = 1e-3
+FLAT_ENOUGH = 1e-2
+"""Of three scales the third, as a part of the smaller other, up to which a Gaussian is read as a surfel."""
 
 
 def encode_gaussian_ply(
@@ -34,9 +36,7 @@ def encode_gaussian_ply(
     columns["opacity"] = arrays["opacity_logits"]
     columns |= _numbered("scale_", arrays["log_scales"])
     if third_scale:
-        extent = float(np.ptp(arrays["centers"], axis=0).max(initial=0.0)) if len(arrays["centers"]) else 1.0
-        flat = math.log(FLATNESS * max(extent, 1e-12))
-        columns["scale_2"] = np.minimum(flat, arrays["log_scales"].min(1) + math.log(THINNEST))
+        columns["scale_2"] = log_thickness(arrays["centers"], arrays["log_scales"])
     columns |= _numbered("rot_", arrays["quats_wxyz"])
     columns |= _numbered("base_color_", arrays["albedo"])
     columns |= {"metallic": arrays["metallic"], "roughness": arrays["roughness"]}
@@ -45,6 +45,12 @@ def encode_gaussian_ply(
     return encode_ply(
         {"vertex": {key: np.asarray(values, np.float32) for key, values in columns.items()}}, comments=(*mode, said, *comments)
     )
+
+
+def log_thickness(centers: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    """(n,) log of a third scale for surfels with these centers (n, 3) and log_scales (n, 2), where a format has no flat Gaussians."""
+    extent = float(np.ptp(centers, axis=0).max(initial=0.0)) if len(centers) else 1.0
+    return np.minimum(math.log(FLATNESS * max(extent, 1e-12)), log_scales.min(1) + math.log(THINNEST))
 
 
 def decode_gaussian_ply(data: bytes, name: str = "PLY") -> dict[str, np.ndarray]:
@@ -63,7 +69,7 @@ def decode_gaussian_ply(data: bytes, name: str = "PLY") -> dict[str, np.ndarray]
     for column, values in found.items():
         if not np.isfinite(values).all():
             raise ValueError(f"{name}: column '{column}' holds {int((~np.isfinite(values)).sum())} values that are not finite")
-    if "scale_2" in found and (found["scale_2"] > np.minimum(found["scale_0"], found["scale_1"]) + math.log(1e-2)).any():
+    if "scale_2" in found and (found["scale_2"] > np.minimum(found["scale_0"], found["scale_1"]) + math.log(FLAT_ENOUGH)).any():
         raise ValueError(f"{name}: holds 3D Gaussians (scale_2 is not flat); expected 2D Gaussians")
 
     def stack(columns: list[str]) -> np.ndarray:

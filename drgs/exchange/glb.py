@@ -1,7 +1,9 @@
-"""Binary glTF with one triangle mesh: our own files, written and read bit for bit.
+"""Binary glTF with one triangle mesh, and points behind it if there are any: our own files, written and read bit for bit.
 
 In and out: float32 vertex attributes by glTF name (POSITION, NORMAL, TEXCOORD_0, and _NAME for what glTF has no word for) and faces.
 glTF is y up and in metres, we are z up and in world units: a matrix on the node turns and scales, the buffers stay as they are.
+Points get a scene of their own, and the mesh keeps the scene that a file opens with. In one scene, a viewer that does not know the
+points' extension would draw dots over the mesh, and one that knows it the object twice, each copy hiding parts of the other.
 Other programs' files, with their scenes, textures and sparse accessors, are read by convert.import_mesh.
 Source: glTF 2.0 specification, Khronos.
 """
@@ -9,11 +11,14 @@ Source: glTF 2.0 specification, Khronos.
 import json
 import struct
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _UINT = 5126, 5125
+_FLOAT, _UINT, _BYTE = 5126, 5125, 5121
+_POINTS = 0
+"""Mode of a primitive."""
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 MAX_VERTICES = 20_000_000
 
@@ -32,7 +37,19 @@ class GlbMesh:
     """PNG files."""
 
 
-def encode_glb(mesh: GlbMesh, meters_per_unit: float = 1.0) -> bytes:
+@dataclass(frozen=True, eq=False)
+class GlbPoints:
+    """Points in a scene of their own."""
+
+    name: str
+    """Of the scene, the node and the mesh."""
+    attributes: dict[str, np.ndarray]
+    """glTF attribute name -> (point,) or (point, k) float32, or (point, 4) uint8 that stands for 0..1."""
+    extensions: dict[str, dict]
+    """Of the primitive. The file says that it uses them, not that a reader needs them."""
+
+
+def encode_glb(mesh: GlbMesh, meters_per_unit: float = 1.0, points: GlbPoints | None = None) -> bytes:
     """Bytes of a .glb; an array that stands under two names is stored once."""
     views: list[dict] = []
     accessors: list[dict] = []
@@ -47,9 +64,16 @@ def encode_glb(mesh: GlbMesh, meters_per_unit: float = 1.0) -> bytes:
     def add_attribute(name: str, values: np.ndarray) -> int:
         if id(values) not in stored:
             stored[id(values)] = len(accessors)
-            array = np.ascontiguousarray(values, np.float32)
+            fractions = values.dtype == np.uint8
+            array = np.ascontiguousarray(values, np.uint8 if fractions else np.float32)
             shape = _SHAPES[1 if array.ndim == 1 else array.shape[1]]
-            accessor = {"bufferView": add_view(array.tobytes(), target=34962), "componentType": _FLOAT, "count": len(array), "type": shape}
+            accessor: dict[str, Any] = {
+                "bufferView": add_view(array.tobytes(), target=34962),
+                "componentType": _BYTE if fractions else _FLOAT,
+            }
+            accessor |= {"count": len(array), "type": shape}
+            if fractions:
+                accessor["normalized"] = True
             if name == "POSITION":
                 accessor |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
             accessors.append(accessor)
@@ -59,16 +83,24 @@ def encode_glb(mesh: GlbMesh, meters_per_unit: float = 1.0) -> bytes:
     index_view = add_view(np.ascontiguousarray(mesh.faces, "<u4").tobytes(), target=34963)
     accessors.append({"bufferView": index_view, "componentType": _UINT, "count": int(mesh.faces.size), "type": "SCALAR"})
     s = meters_per_unit
-    document = {
+    # Columns of (x, y, z) -> s (x, z, -y): z up to y up, world units to metres.
+    matrix = [s, 0, 0, 0, 0, 0, -s, 0, 0, s, 0, 0, 0, 0, 0, 1]
+    document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "drgs"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        # Columns of (x, y, z) -> s (x, z, -y): z up to y up, world units to metres.
-        "nodes": [{"name": "object", "mesh": 0, "matrix": [s, 0, 0, 0, 0, 0, -s, 0, 0, s, 0, 0, 0, 0, 0, 1]}],
+        "nodes": [{"name": "object", "mesh": 0, "matrix": matrix}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": len(accessors) - 1, "material": 0}]}],
         "materials": [{"name": "object", "pbrMetallicRoughness": mesh.material, "doubleSided": False}],
         "accessors": accessors,
     }
+    if points is not None:
+        named = {key: add_attribute(key, values) for key, values in points.attributes.items()}
+        document["extensionsUsed"] = sorted(points.extensions)
+        document["scenes"] = [{"name": "mesh", "nodes": [0]}, {"name": points.name, "nodes": [1]}]
+        document["nodes"].append({"name": points.name, "mesh": 1, "matrix": matrix})
+        primitive = {"mode": _POINTS, "attributes": named, "extensions": points.extensions}
+        document["meshes"].append({"name": points.name, "primitives": [primitive]})
     if mesh.images:
         document["images"] = [{"bufferView": add_view(image), "mimeType": "image/png"} for image in mesh.images]
         document["samplers"] = [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
@@ -82,7 +114,7 @@ def encode_glb(mesh: GlbMesh, meters_per_unit: float = 1.0) -> bytes:
 
 
 def decode_glb(data: bytes, name: str = "GLB") -> GlbMesh:
-    """The mesh of a file that `encode_glb` wrote (images are not read back).
+    """The mesh of a file that `encode_glb` wrote (neither images nor points are read back).
 
     Raises:
         ValueError: not such a file, or damaged.

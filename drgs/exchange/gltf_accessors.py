@@ -25,9 +25,9 @@ MAX_BYTES = 1 << 30
 """Of a file, and of all its buffers together."""
 MAX_VALUES = 64_000_000
 """Numbers that all accessors of a file may unpack to: without it, a small file could ask for all memory."""
-UNDERSTOOD = ("KHR_mesh_quantization",)
+UNDERSTOOD = ("KHR_mesh_quantization", "KHR_gaussian_splatting")
 HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "MSFT_texture_", "KHR_xmp")
-"""Extensions that a file may require: those above change accessors' types only, these nothing that moves."""
+"""Extensions that a file may require: those above change accessors' types and what points mean, these nothing that moves."""
 
 
 class GltfFile:

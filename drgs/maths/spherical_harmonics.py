@@ -6,12 +6,16 @@ Kerbl et al. 2023 for signs and the +0.5 offset (docs/sources.md). Directions ru
 """
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 SH_OFFSET = 0.5
 """Radiance of a surfel whose coefficients are all zero: files hold radiance minus this."""
+
+PROBE_DIRECTIONS = 96
+"""Directions in which functions are looked at before they are fitted again; 16 coefficients need well over 16."""
 
 # Normalisations sqrt((2l+1)/(4 pi) ...) of the polynomials in `sh_basis`, by degree and |m|.
 K00 = 0.5 / math.sqrt(math.pi)
@@ -56,3 +60,32 @@ def evaluate_sh(sh: Tensor, directions: Tensor, degree: int = 3) -> Tensor:
 def radiance_from_sh(sh: Tensor, directions: Tensor, degree: int = 3) -> Tensor:
     """(N, 3) linear radiance max(0, evaluate_sh + SH_OFFSET) that surfels send against unit `directions` (camera to surfel)."""
     return (evaluate_sh(sh, directions, degree) + SH_OFFSET).clamp(min=0)
+
+
+def map_radiance(sh: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
+    """(N, 16, 3) coefficients of function(radiance) of the radiance that sh (N, 16, 3) stands for, by least squares over directions.
+
+    The offset is part of what `function` gets and gives. Exact where the radiance is the same from everywhere.
+    """
+    basis = sh_basis(_probe_directions())
+    fit = torch.linalg.pinv(basis).to(sh)
+    basis = basis.to(sh)
+    return torch.cat([fit @ (function(basis @ chunk + SH_OFFSET) - SH_OFFSET) for chunk in sh.split(20_000)])
+
+
+def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
+    """(N, 16, 3) coefficients of what sh (N, 16, 3) stands for after a turn: in direction rotation @ d it is what it was in d.
+
+    Exact: a turned polynomial of degree l has degree l, so that the least squares have no remainder.
+    """
+    directions = _probe_directions()
+    turn = torch.linalg.pinv(sh_basis(directions)) @ sh_basis(directions @ rotation.to(directions))
+    return turn.to(sh) @ sh
+
+
+def _probe_directions() -> Tensor:
+    """(PROBE_DIRECTIONS, 3) float64, a Fibonacci lattice."""
+    index = torch.arange(PROBE_DIRECTIONS, dtype=torch.float64) + 0.5
+    height, turn = 1 - 2 * index / PROBE_DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index
+    side = torch.sqrt(1 - height * height)
+    return torch.stack([side * torch.cos(turn), side * torch.sin(turn), height], -1)

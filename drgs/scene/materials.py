@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+DEFAULT_ALBEDO, DEFAULT_ROUGHNESS, DEFAULT_METALLIC = 0.5, 0.5, 0.0
+"""Of points of which a file does not say."""
+
 
 @dataclass(frozen=True, eq=False)
 class Materials:

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from drgs.convert.import_mesh import import_mesh
+from drgs.convert.import_splats import import_splats
 from drgs.exchange.exr import decode_environment
 from drgs.exchange.glb import GlbMesh, decode_glb, encode_glb
 from drgs.exchange.npz import read_npz_frames
 from drgs.exchange.package import read_package
 from drgs.exchange.ply import encode_ply, parse_ply, triangles_from_faces
+from tests.exchange.write_splats import glb_with_splats
 
 CORNERS, FACES = np.eye(4, 3, dtype=np.float32), np.array([[0, 1, 2], [1, 3, 2]], np.int32)
 BINARY_PLY = encode_ply({"vertex": {axis: CORNERS[:, k] for k, axis in enumerate("xyz")}}, FACES)
@@ -63,10 +65,16 @@ def read_mesh(suffix):
     return read
 
 
+def read_splats(data, folder):
+    (folder / "a.glb").write_bytes(data)
+    import_splats(folder / "a.glb")
+
+
 READERS = {
     "ascii ply": (read_ply, ASCII_PLY), "binary ply": (read_ply, BINARY_PLY), "own glb": (lambda data, _: decode_glb(data), GLB),
     "hdr": (lambda data, _: decode_environment(data), HDR), "imported glb": (read_mesh(".glb"), GLB), "imported obj": (read_mesh(".obj"), OBJ),
     "imported ply": (read_mesh(".ply"), BINARY_PLY), "npz": (read_npz, npz()),
+    "splats": (read_splats, glb_with_splats()),
     "zipped asset": (read_asset, packed(asset_json=json.dumps({"schema_version": 1, "files": LISTED}).encode(), mesh_glb=GLB)),
 }  # fmt: skip
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from drgs.maths.spherical_harmonics import SH_OFFSET, evaluate_sh, radiance_from_sh, sh_basis
+from drgs.maths.spherical_harmonics import SH_OFFSET, evaluate_sh, map_radiance, radiance_from_sh, rotate_sh, sh_basis
 
 
 def sphere_quadrature(rings: int = 24, sectors: int = 48) -> tuple[torch.Tensor, torch.Tensor]:
@@ -66,3 +66,24 @@ def test_zero_coefficients_give_the_offset_and_radiance_is_never_negative():
 def test_unknown_degree_is_refused():
     with pytest.raises(ValueError, match="degree 4"):
         sh_basis(torch.zeros(1, 3), 4)
+
+
+def test_turned_harmonics_say_in_turned_directions_what_they_said():
+    generator = torch.Generator().manual_seed(2)
+    sh = torch.randn(6, 16, 3, dtype=torch.float64, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(6, 3, dtype=torch.float64, generator=generator), dim=-1)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=generator))
+    turn = turn * torch.linalg.det(turn)
+    turned = rotate_sh(sh, turn)
+    torch.testing.assert_close(evaluate_sh(turned, directions @ turn.T), evaluate_sh(sh, directions))
+    assert torch.allclose(turned[:, 1:4].square().sum(), sh[:, 1:4].square().sum()), "degrees stay apart"
+
+
+def test_mapped_radiance_is_exact_where_harmonics_hold_it():
+    generator = torch.Generator().manual_seed(3)
+    sh = torch.randn(6, 16, 3, dtype=torch.float64, generator=generator)
+    doubled = map_radiance(sh, lambda radiance: 2 * radiance)
+    directions = torch.nn.functional.normalize(torch.randn(6, 3, dtype=torch.float64, generator=generator), dim=-1)
+    wanted = 2 * (evaluate_sh(sh, directions) + SH_OFFSET)
+    torch.testing.assert_close(evaluate_sh(doubled, directions) + SH_OFFSET, wanted)
+    assert len(map_radiance(sh[:0], torch.sqrt)) == 0
