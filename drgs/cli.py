@@ -356,11 +356,11 @@ def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
     if as_json:
         print(json.dumps(report))
     elif report["ok"]:
-        _print_document({name: value for name, value in report.items() if name not in ("findings", "advice", "summary")}, as_json)
+        _print_document({name: value for name, value in report.items() if name not in ("findings", "advice", "summary", "marks")}, as_json)
         for line in [f"{finding['level']}: {finding['sentence']}" for finding in report["findings"]] + report["advice"]:
             print(line)
     else:
-        raise ValueError(report["findings"][0]["sentence"])
+        raise ValueError(" ".join([report["findings"][0]["sentence"], report["findings"][0]["advice"]]))
     raise typer.Exit(0 if report["ok"] else INPUT_EXIT_CODE)
 
 
@@ -418,7 +418,7 @@ def _sentence(error: ValueError | OSError) -> str:
     if isinstance(error, OSError) and error.strerror:
         what = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
         return f"{what}; free some space and try again" if error.errno == errno.ENOSPC else what
-    return " ".join(str(error).split())
+    return " ".join(f"{error} {getattr(error, 'advice', '')}".split())  # a CaptureFault knows what to do about it
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -20,10 +20,9 @@ from drgs.exchange.photographs import encode_photographs
 from drgs.reconstruct.capture.exposures import with_gains_of_fit, with_gains_of_points
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.find_masks import with_drawn_masks
-from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
-from drgs.reconstruct.capture.load_views import read_capture
+from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
-from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
+from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
 from drgs.reconstruct.fit.densify import DensifySettings
@@ -218,10 +217,8 @@ def build_stages(
     with timed("read"):
         reporter.report("read", 0.0, "reading the capture")
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
-        found = read_capture(capture)
-        views = read_pictures(found, preset.image_side)
+        found, views, points = open_capture(capture, preset.image_side, preset.points, settings.seed)
         photographs = views
-        points = initial_points(views, preset.points, settings.seed)
         views = with_gains_of_points(views, points)
         identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
         place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, should_stop or (lambda: False))

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from drgs.reconstruct.capture.load_views.checks import IMAGE_SUFFIXES, find_masks, is_folder
+from drgs.reconstruct.capture.load_views.checks import HEIC_SUFFIXES, IMAGE_SUFFIXES, find_masks, is_folder
 from drgs.reconstruct.capture.load_views.colmap import find_model
 from drgs.reconstruct.capture.load_views.metashape import find_cameras_file
 
 FEWEST_PHOTOS = 8
 """With fewer, hardly anything is seen from enough sides, whatever their poses."""
-HEIC_SUFFIXES = (".heic", ".heif")
 CAMERA_FILES = ("transforms.json", "transforms_train.json", "*-camera.pkl")
 OTHER_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".tif", ".tiff", ".mp4", ".mov", ".avi", ".mkv")
 """What people have in place of pictures, named in the sentence when nothing else is there."""

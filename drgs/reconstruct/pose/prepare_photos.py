@@ -18,9 +18,10 @@ from numpy import ndarray
 from PIL import Image, ImageOps
 
 from drgs.exchange.pictures import as_eight_bits
-from drgs.reconstruct.capture.load_views.checks import image_size
+from drgs.reconstruct.capture.laplacian_variance import laplacian_variance
+from drgs.reconstruct.capture.load_views.checks import HEIC_SUFFIXES, check_least_side, image_size
 from drgs.reconstruct.pose.backdrop_masks import backdrop_mask
-from drgs.reconstruct.pose.list_photos import HEIC_SUFFIXES, Photo
+from drgs.reconstruct.pose.list_photos import Photo
 from drgs.reconstruct.progress import BuildStopped
 
 DECODE_THREADS = 2
@@ -140,6 +141,7 @@ def _prepare(photo: Photo, work: Path) -> PreparedPhoto | str:
             usable_as_it_is &= "transparency" not in image.info
             is_photographic = image.format != "PNG"
             upright = as_eight_bits(ImageOps.exif_transpose(image))
+        check_least_side(upright.size, photo.path)
         alpha = np.asarray(upright.convert("RGBA"))[..., 3] if "A" in upright.getbands() or "transparency" in upright.info else None
         mask = _mask(photo, alpha, upright.size)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
@@ -177,11 +179,8 @@ def _sharpness(picture: Image.Image, mask: UInt8[ndarray, "height width"] | None
     scale = min(1.0, EXAMINED_SIDE / max(picture.size))
     size = (max(3, round(picture.width * scale)), max(3, round(picture.height * scale)))
     luma = np.asarray(picture.convert("L").resize(size, Image.Resampling.BOX), dtype=np.float32)
-    laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4 * luma[1:-1, 1:-1]
-    if mask is not None:
-        inside = np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX))[1:-1, 1:-1] == 255
-        laplacian = laplacian[inside]
-    return float(laplacian.var()) if laplacian.size else 0.0
+    inside = None if mask is None else np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX)) == 255
+    return laplacian_variance(luma, inside)
 
 
 def _link(source: Path, target: Path) -> None:

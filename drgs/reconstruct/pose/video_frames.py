@@ -1,7 +1,7 @@
 """The frames of a video that are worth posing: of each slot of time the sharpest, but for those in which the camera has not moved.
 
-In: a video file. Out: pictures in a folder, named by their place in the film, upright. Sharpness is the variance of the Laplacian of brightness
-(Pech-Pacheco et al. 2000). The film is decoded twice, since a chosen frame is known only when its slot is over and full frames are large.
+In: a video file. Out: pictures in a folder, named by their place in the film, upright. Sharpness is the
+laplacian_variance of brightness. The film is decoded twice, since a chosen frame is known only when its slot is over and full frames are large.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,6 +16,7 @@ from numpy import ndarray
 from PIL import Image
 
 from drgs.installation import missing_package
+from drgs.reconstruct.capture.laplacian_variance import laplacian_variance
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi")
 FRAMES = 120
@@ -119,9 +120,7 @@ def _looked_at(
             )
         scale = min(1.0, SHARPNESS_WIDTH / frame.width)
         gray = frame.reformat(max(3, round(frame.width * scale)), max(3, round(frame.height * scale)), format="gray").to_ndarray()
-        values = gray.astype(np.float32)
-        laplacian = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:] - 4 * values[1:-1, 1:-1]
-        sharpness.append(float(laplacian.var()))
+        sharpness.append(laplacian_variance(gray.astype(np.float32)))
         thumbnails.append(np.asarray(Image.fromarray(gray).resize(THUMBNAIL, Image.Resampling.BOX), np.float32).ravel())
         advance(1 - 1 / (1 + index / FRAMES))  # how long the film is, files often do not say
     return np.array(sharpness), np.array(thumbnails).reshape(len(sharpness), -1)

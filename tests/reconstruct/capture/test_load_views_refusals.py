@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.scene.lens import Lens
 from tests.reconstruct import tiny_capture as tiny
 
@@ -130,6 +131,15 @@ def test_a_faulty_synthetic_capture_is_refused_in_one_sentence(fault: str, tmp_p
     assert "\n" not in sentence
     for word in words:
         assert word in sentence, sentence
+
+
+def test_a_refusal_keeps_its_advice_on_the_way_between_processes(tmp_path: Path) -> None:
+    folder = tiny.write_nerf_synthetic(tmp_path)
+    (folder / "train" / "r_004.png").write_bytes(b"")
+    with pytest.raises(CaptureFault, match="the file is empty") as refusal:
+        load_views(folder)
+    sent = pickle.loads(pickle.dumps(refusal.value))
+    assert (str(sent), sent.advice, sent.pictures) == (str(refusal.value), refusal.value.advice, ("r_004",)) and "Copy it" in sent.advice
 
 
 def test_folders_that_are_no_capture_are_refused(tmp_path: Path) -> None:

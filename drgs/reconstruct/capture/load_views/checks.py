@@ -1,6 +1,6 @@
 """What makes a capture unusable, each told in one sentence: the file, what was found, what was expected.
 
-Every function returns quietly or raises ValueError.
+Every function returns quietly or raises ValueError; a CaptureFault where what to do about it is known, too.
 """
 
 import math
@@ -16,11 +16,24 @@ from PIL import Image, UnidentifiedImageError
 from drgs.reconstruct.capture.load_views.capture import Photograph, Pinhole
 
 FEWEST_VIEWS = 3
+LEAST_SIDE = 16
+"""Of a picture [pixels]: a smaller one is the icon of something, or an empty place."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG", ".WEBP")
+HEIC_SUFFIXES = (".heic", ".heif")
+"""Read where pillow-heif is installed, of plain photographs."""
 MOST_PIXELS = 100_000_000
 """Larger pictures are taken for damaged files or decompression bombs."""
 LEAST_FOCAL, MOST_FOCAL = 0.1, 100.0
 """Focal length as a share of the longer side: fields of view from 0.6 to 157 degrees."""
+FOREIGN_SIGNS: dict[str, tuple[tuple[int, bytes], ...]] = {
+    "HEIC": ((4, b"ftypheic"), (4, b"ftypheix"), (4, b"ftypmif1")),
+    "a TIFF or RAW file": ((0, b"II*\0"), (0, b"MM\0*")),
+    "GIF": ((0, b"GIF8"),),
+    "a Windows bitmap": ((0, b"BM"),),
+    "a film": ((4, b"ftyp"), (8, b"AVI ")),
+    "a text": ((0, b"<"), (0, b"{")),
+}
+"""What strangers' files begin with, the first that fits: kind, and (place, bytes)."""
 ORTHONORMAL_TOLERANCE = 1e-2
 MOST_DISTANCE = 1e9
 """Of a camera from the origin [world units]: farther ones leave no digits of float32 for the object."""
@@ -29,6 +42,27 @@ NO_PANORAMA = "a panorama cannot be undistorted: cut pinhole pictures out of it 
 MOST_NAME = 1000
 MOST_SHOWN = 60
 """Characters of a wrong value in a sentence."""
+
+
+class CaptureFault(ValueError):
+    """Something is wrong with a capture; its text says what in one sentence.
+
+    Args:
+        advice: what to do about it. pictures: names of those it is about, without suffix; none: the capture as a whole.
+        mark: the same in a word or two, for a small picture's label.
+    """
+
+    def __init__(self, sentence: str, advice: str = "", pictures: Sequence[str] = (), mark: str = "") -> None:
+        super().__init__(sentence)
+        self.advice, self.pictures, self.mark = advice, tuple(pictures), mark
+
+
+COPY_AGAIN = "Copy it from the camera once more, or leave it out, in the camera file too."
+
+
+def damaged(path: Path, why: str) -> CaptureFault:
+    """A picture that cannot be read."""
+    return CaptureFault(f"{path}: {why}", COPY_AGAIN, [path.stem], "cannot be read")
 
 
 def is_file(path: Path) -> bool:
@@ -88,10 +122,36 @@ def image_size(path: Path) -> tuple[int, int]:
         with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
             size = image.size
     except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{path}: not a readable PNG, JPEG or WebP image ({error}).") from error
+        raise damaged(path, f"not a readable PNG, JPEG or WebP image ({_why_unreadable(path, error)}).") from error
     if size[0] * size[1] > MOST_PIXELS:
         raise ValueError(f"{path}: {size[0]}x{size[1]} pixels, expected at most {MOST_PIXELS // 10**6} megapixels.")
     return size
+
+
+def _why_unreadable(path: Path, error: Exception) -> str:
+    """What a file is that Pillow does not take for a picture, where that is easily seen."""
+    try:
+        with path.open("rb") as stream:
+            begin = stream.read(16)
+    except OSError:
+        return str(error)
+    if not begin:
+        return "the file is empty"
+    for kind, signs in FOREIGN_SIGNS.items():
+        if any(begin[at:].startswith(sign) for at, sign in signs):
+            return f"it is {kind} whatever its name says"
+    return str(error)
+
+
+def check_least_side(size: tuple[int, int], path: Path) -> None:
+    """A picture large enough to show something."""
+    if min(size) < LEAST_SIDE:
+        raise CaptureFault(
+            f"{path}: the image is {size[0]}x{size[1]} pixels, expected at least {LEAST_SIDE} a side.",
+            "Put the photograph itself in its place, or leave it out, in the camera file too.",
+            [path.stem],
+            f"{size[0]}x{size[1]} pixels",
+        )
 
 
 def find_image(folder: Path, file_path: str, named_in: Path) -> Path:
@@ -171,6 +231,7 @@ def check_photographs(photographs: Sequence[Photograph], where: Path) -> None:
             raise ValueError(
                 f"{photograph.image}: the image is {size[0]}x{size[1]}, but its camera is for {camera_size[0]}x{camera_size[1]} pixels."
             )
+        check_least_side(size, photograph.image)
     for photograph in photographs:
         check_pinhole(photograph.pinhole, f"{where}: camera of {photograph.image.name}")
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from drgs.exchange.pictures import as_eight_bits
 from drgs.reconstruct.capture.exposures import gains_of_files
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, camera_of, resize_pinhole
+from drgs.reconstruct.capture.load_views.checks import damaged
 from drgs.reconstruct.capture.load_views.linear_light import premultiplied, straight
 from drgs.reconstruct.capture.load_views.undistort import undistort
 from drgs.scene.camera import Camera
@@ -70,7 +71,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
             yield image
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{path}: the image cannot be decoded ({error}).") from error
+        raise damaged(path, f"the image cannot be decoded ({error}).") from error
 
 
 def _decode(photograph: Photograph) -> tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "height width"], bool, float | None]:
@@ -84,7 +85,7 @@ def _decode(photograph: Photograph) -> tuple[UInt8[ndarray, "height width 3"], U
     alpha = pixels[..., 3] if has_alpha else np.full(pixels.shape[:2], 255, np.uint8)
     if photograph.mask is None:
         return color, alpha, has_alpha, exposure
-    mask = _mask_of_depth(photograph.mask) if photograph.mask_is_depth else mask_channel(photograph.mask)
+    mask = mask_of_depth(photograph.mask) if photograph.mask_is_depth else mask_channel(photograph.mask)
     if mask.shape != alpha.shape:
         raise ValueError(
             f"{photograph.mask}: the mask is {mask.shape[1]}x{mask.shape[0]}, but its image {photograph.image.name} is {alpha.shape[1]}x{alpha.shape[0]}."
@@ -104,7 +105,7 @@ def _exposure(image: Image.Image) -> float | None:
     return exposure if np.isfinite(exposure) and exposure > 0 else None
 
 
-def _mask_of_depth(path: Path) -> UInt8[ndarray, "height width"]:
+def mask_of_depth(path: Path) -> UInt8[ndarray, "height width"]:
     """(h, w) 0 or 255 of a NeRO depth picture."""
     with _opened(path) as image:
         mode, values = image.mode, np.asarray(image)

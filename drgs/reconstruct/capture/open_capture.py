@@ -1,0 +1,109 @@
+"""The door of builds and of the doctor: read a capture, and refuse what nothing but a half-built asset could come of.
+
+What a single file can tell is refused by the readers (load_views/checks.py); here is what only cameras, masks and pictures together tell. Limits are angles
+and shares, so that neither the unit of the world nor the size of pictures matters. In: a folder. Out: its cameras, pictures and first points.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
+from drgs.reconstruct.capture.load_views import read_capture
+from drgs.reconstruct.capture.load_views.capture import Capture
+from drgs.reconstruct.capture.load_views.checks import CaptureFault
+from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
+from drgs.reconstruct.capture.mask_agreement import mask_agreement
+from drgs.reconstruct.capture.visual_hull import axes_meeting_point
+from drgs.scene.views import Views
+
+SAME_PLACE = 1e-6
+"""Cameras nearer to each other than this share of their distance from the origin are rounding apart."""
+MOST_AWAY = 1 / 3
+"""Of cameras that look away from what all look at: in captures of an object it is none, with matrices the wrong way round half or all."""
+LEAST_ANGLE = 3.0
+"""[degrees] between the two cameras farthest apart, as seen from the object. An error of half a pixel, 0.05° through a usual lens, is then a
+sixtieth of the distance in depth, which is about the size of an object."""
+LEAST_AGREEMENT = 0.5
+"""Median over the views of `mask_agreement`: below, more of what masks show is unexplained than explained. Seven good captures have 0.99 and more."""
+INVERT = (
+    "Matrices of transforms.json are camera-to-world in OpenGL's axes (x right, y up, looking along -z): invert those that are world-to-camera, and "
+    "change the sign of the second and third column of OpenCV's."
+)
+
+
+def open_capture(folder: Path, max_side: int | None, point_count: int, seed: int) -> tuple[Capture, Views, InitialPoints]:
+    """The capture, its pictures of at most `max_side` pixels a side, and points to begin with.
+
+    Raises:
+        ValueError: one sentence why there is nothing to build from; a CaptureFault where what to do about it is known, too.
+    """
+    capture = read_capture(folder)
+    _check_cameras(capture, folder)
+    views = read_pictures(capture, max_side)
+    _check_pictures(views, folder)
+    points = initial_points(views, point_count, seed)
+    _check_points(views, points, folder)
+    return capture, views, points
+
+
+def camera_angles(views: Views, point: Float[ndarray, "3"]) -> Float[ndarray, "view view"]:
+    """[degrees] between each two cameras as seen from a point."""
+    centers = torch.stack([camera.center_world for camera in views.cameras]).double().numpy()
+    towards = centers - point
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return np.degrees(np.arccos(np.clip(towards @ towards.T, -1, 1)))
+
+
+def _check_cameras(capture: Capture, folder: Path) -> None:
+    poses = np.stack([photograph.camera_from_world for photograph in capture.photographs])
+    centers, axes = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]), poses[:, 2, :3]
+    count = len(poses)
+    if np.ptp(centers, axis=0).max() <= SAME_PLACE * np.abs(centers).max():
+        raise CaptureFault(
+            f"{folder}: all {count} cameras stand at one place, expected them around the object.",
+            f"Check that the camera file has a pose of its own for each picture. {INVERT}",
+        )
+    distance = np.einsum("vi,vi->v", axes_meeting_point(centers, axes) - centers, axes)
+    away = int((distance <= 0).sum())
+    if away > MOST_AWAY * count:
+        raise CaptureFault(
+            f"{folder}: {away} of {count} cameras look away from where their viewing directions meet, expected all to look at the object.",
+            INVERT,
+        )
+
+
+def _check_pictures(views: Views, folder: Path) -> None:
+    count = len(views.cameras)
+    if not any(bool((mask > 127).any()) for mask in views.coverage):
+        raise CaptureFault(
+            f"{folder}: the masks of all {count} pictures are empty, expected white (or opaque) where the object is.",
+            "Invert them, or take masks/ away: then the build looks for the object itself.",
+        )
+    first = views.images_srgb[0]
+    if not views.has_masks and all(torch.equal(first, image) for image in views.images_srgb):
+        raise CaptureFault(
+            f"{folder}: all {count} pictures are the same, expected one of its own from each camera.",
+            "Check what was copied: the object must be seen from all around.",
+        )
+
+
+def _check_points(views: Views, points: InitialPoints, folder: Path) -> None:
+    widest = float(camera_angles(views, points.bounds_center.double().numpy()).max())
+    if widest < LEAST_ANGLE:
+        raise CaptureFault(
+            f"{folder}: all pictures are taken from within {widest:.1f} degrees as seen from the object, expected them from all around it.",
+            "Walk around the object: pictures from one place show no shape.",
+        )
+    if points.hull_vertices is None:
+        return
+    agreement = float(np.median(mask_agreement(views, points.hull_vertices)))
+    if agreement < LEAST_AGREEMENT:
+        raise CaptureFault(
+            f"{folder}: what all masks together allow fills {100 * agreement:.0f} % of the middle one of them, expected more than "
+            f"{100 * LEAST_AGREEMENT:.0f} %.",
+            "The object moved between pictures, or poses, pictures and masks do not belong together.",
+        )
