@@ -348,17 +348,32 @@ def eval_(
 
 
 @app.command()
-def doctor(dataset: DatasetPath, as_json: Json = False) -> None:
+def doctor(
+    dataset: DatasetPath,
+    sheet: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw all pictures small, with masks and what is wrong with them, into this PNG or JPEG."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Check a capture before time is spent on it."""
+    from drgs.evaluate.contact_sheet import SHEET_FORMATS, contact_sheet
     from drgs.evaluate.doctor import doctor as examine
+    from drgs.reconstruct.capture.load_views.checks import is_folder
 
+    if sheet is not None and sheet.suffix.lower() not in SHEET_FORMATS:
+        raise UsageError(f"--sheet is {str(sheet)!r}; expected a file that ends with {' or '.join(SHEET_FORMATS)}")
     report = examine(dataset)
+    if sheet is not None and (report["ok"] or is_folder(dataset)):
+        contact_sheet(dataset, report, sheet)
     if as_json:
         print(json.dumps(report))
     elif report["ok"]:
         _print_document({name: value for name, value in report.items() if name not in ("findings", "advice", "summary", "marks")}, as_json)
         for line in [f"{finding['level']}: {finding['sentence']}" for finding in report["findings"]] + report["advice"]:
             print(line)
+        if sheet is not None:
+            print(f"All pictures: {sheet}")
     else:
         raise ValueError(" ".join([report["findings"][0]["sentence"], report["findings"][0]["advice"]]))
     raise typer.Exit(0 if report["ok"] else INPUT_EXIT_CODE)

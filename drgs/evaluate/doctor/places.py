@@ -61,7 +61,7 @@ def places(views: Views, points: InitialPoints, known: Sequence[str]) -> Section
             Finding(
                 "info",
                 f"Pictures hardly agree on how bright the same places are (rank correlation {median:.2f}): the object mirrors its surroundings, or the poses are off.",
-                "Mirrors need surroundings that stand still and are seen from all around the object; check poses by their outlines.",
+                "Mirrors need surroundings that stand still and are seen from all around the object; check poses by the outlines of drgs doctor --sheet.",
             )
         )
     return {"agreement": round(median, 3), "foreign": foreign}, findings

@@ -105,5 +105,5 @@ def _check_points(views: Views, points: InitialPoints, folder: Path) -> None:
         raise CaptureFault(
             f"{folder}: what all masks together allow fills {100 * agreement:.0f} % of the middle one of them, expected more than "
             f"{100 * LEAST_AGREEMENT:.0f} %.",
-            "The object moved between pictures, or poses, pictures and masks do not belong together.",
+            "The object moved between pictures, or poses, pictures and masks do not belong together: look at them with drgs doctor --sheet.",
         )
