@@ -2,17 +2,22 @@
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.sparse import csr_matrix, diags, identity
 from torch import Tensor
 
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 
 
-def averaging_matrix(edges: MeshEdges, count: int) -> csr_matrix:
-    """(count, count) matrix that takes the mean over each vertex and its neighbours."""
+def averaging_matrix(edges: MeshEdges, count: int, weight: Float[Tensor, "edge"] | None = None) -> csr_matrix:
+    """(count, count) matrix that takes the mean over each vertex and its neighbours.
+
+    Args:
+        weight: of a neighbour at the other end of each edge, against 1 of the vertex itself; None: 1.
+    """
     start, end = edges.vertices.cpu().numpy().T
-    ones = np.ones(2 * len(start))
-    adjacency = csr_matrix((ones, (np.concatenate([start, end]), np.concatenate([end, start]))), shape=(count, count)) + identity(count)
+    weights = np.tile(np.ones(len(start)) if weight is None else weight.cpu().double().numpy(), 2)
+    adjacency = csr_matrix((weights, (np.concatenate([start, end]), np.concatenate([end, start]))), shape=(count, count)) + identity(count)
     return diags(1 / np.asarray(adjacency.sum(1)).ravel()) @ adjacency
 
 

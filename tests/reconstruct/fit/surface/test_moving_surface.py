@@ -1,0 +1,58 @@
+"""Light on a surface that moved."""
+
+from pathlib import Path
+
+import torch
+
+from drgs.reconstruct.fit.fit_loop import FitState
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.mesh_light import MeshLight, irradiance_share
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings
+from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.scene.environment import Environment
+from tests.reconstruct.fit.painted_sphere import grey_light, painted_views
+from tests.render.closed_form_scenes import sphere_mesh
+
+RAYS = 16
+
+
+def two_spheres() -> tuple[FitState, torch.Tensor]:
+    """Grey, of radius 1, near one another."""
+    one = sphere_mesh(subdivisions=3)
+    count = 2 * len(one.vertices)
+    vertices = torch.cat([one.vertices, one.vertices + torch.tensor([2.2, 0.0, 0.0])])
+    values = {
+        "normals": torch.cat([one.normals] * 2),
+        "albedo_logits": logits_of_shares(torch.full((count, 3), 0.5)),
+        "roughness_logits": logits_of_shares(torch.full((count,), 0.9)),
+        "metallic_logits": logits_of_shares(torch.full((count,), 0.01)),
+        "vertices": vertices,
+        "homeward": torch.zeros(count, 3),
+        "open_share": torch.ones(count, 3),
+        "metal": torch.zeros(count),
+    } | light_parameters(grey_light())
+    parameters = leaves(values, frozen=NOT_FITTED)
+    optimizer = make_optimizer(parameters, SurfaceSettings().rates, 1.0)
+    return FitState(parameters, optimizer, torch.Generator().manual_seed(1)), torch.cat([one.faces, one.faces + len(one.vertices)])
+
+
+def test_shares_of_a_few_rays_are_as_good_as_those_of_many(tmp_path: Path) -> None:
+    state, faces = two_spheres()
+    radiance = environment_table(state.parameters).detach()
+    tracer = build_tracer(mesh_from_surface_fit(state, faces))
+    light = MeshLight(filter_environment(radiance), torch.ones_like(state.parameters["vertices"]))
+
+    def shares(rays: int) -> torch.Tensor:
+        return irradiance_share(tracer, Environment(radiance), light, rays, torch.Generator().manual_seed(2))
+
+    right = shares(2048)
+    MovingSurface(painted_views(tmp_path), faces, state).relight(RAYS)
+
+    def error(found: torch.Tensor) -> float:
+        return float((found - right).square().mean().sqrt())
+
+    assert error(state.parameters["open_share"]) < 0.5 * error(shares(RAYS))
+    assert error(state.parameters["open_share"]) < error(shares(4 * RAYS))
