@@ -293,8 +293,8 @@ def export(
     from drgs.convert.export_asset import export_asset
     from drgs.scene.asset import load_asset
 
-    export_asset(load_asset(asset), out, chosen)
-    print(f"Wrote {out}", file=sys.stderr)
+    left_out = export_asset(load_asset(asset), out, chosen)
+    print(f"Wrote {out}: {out.stat().st_size / 1e6:.1f} MB{', ' if left_out else ''}{left_out}", file=sys.stderr)
 
 
 @app.command()

@@ -92,7 +92,7 @@ def test_the_wheel_holds_every_file_of_the_packages_the_viewer_and_what_is_bundl
     listed = subprocess.run(["git", "ls-files", "drgs", "server", "worker"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     ours = [name for name in listed.splitlines() if (ROOT / name).is_file()]
     assert {name.removeprefix("server/").removeprefix("worker/") for name in ours} <= held
-    assert "drgs_server/static/index.html" in held
+    assert {"drgs_server/static/index.html", "drgs/convert/page/page.html"} <= held
     environments = {f"drgs_worker/bundled/environments/{path.name}" for path in (ROOT / "examples" / "environments").glob("*.exr")}
     assert {name for name in held if name.startswith("drgs_worker/bundled/environments/")} == environments
     capture = ROOT / "examples" / "sample_capture"

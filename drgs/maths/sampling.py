@@ -80,6 +80,14 @@ def world_from_local(local: Tensor, normal: Tensor) -> Tensor:
     return local[..., :1] * tangent + local[..., 1:2] * bitangent + local[..., 2:] * normal
 
 
+def sphere_lattice(count: int) -> Tensor:
+    """(count, 3) unit directions, float64, spread evenly: a Fibonacci lattice."""
+    index = torch.arange(count, dtype=torch.float64) + 0.5
+    height, turn = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
+    side = torch.sqrt(1 - height * height)
+    return torch.stack([side * torch.cos(turn), side * torch.sin(turn), height], -1)
+
+
 def sample_cosine(u: Tensor) -> Tensor:
     """(..., 3) local directions of numbers (..., 2), density cos / pi."""
     radius, azimuth = torch.sqrt(u[..., 0]), 2 * math.pi * u[..., 1]

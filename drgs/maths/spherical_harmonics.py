@@ -11,6 +11,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from drgs.maths.sampling import sphere_lattice
+
 SH_OFFSET = 0.5
 """Radiance of a surfel whose coefficients are all zero: files hold radiance minus this."""
 
@@ -67,7 +69,7 @@ def map_radiance(sh: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
 
     The offset is part of what `function` gets and gives. Exact where the radiance is the same from everywhere.
     """
-    basis = sh_basis(_probe_directions())
+    basis = sh_basis(sphere_lattice(PROBE_DIRECTIONS))
     fit = torch.linalg.pinv(basis).to(sh)
     basis = basis.to(sh)
     return torch.cat([fit @ (function(basis @ chunk + SH_OFFSET) - SH_OFFSET) for chunk in sh.split(20_000)])
@@ -78,14 +80,6 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
 
     Exact: a turned polynomial of degree l has degree l, so that the least squares have no remainder.
     """
-    directions = _probe_directions()
+    directions = sphere_lattice(PROBE_DIRECTIONS)
     turn = torch.linalg.pinv(sh_basis(directions)) @ sh_basis(directions @ rotation.to(directions))
     return turn.to(sh) @ sh
-
-
-def _probe_directions() -> Tensor:
-    """(PROBE_DIRECTIONS, 3) float64, a Fibonacci lattice."""
-    index = torch.arange(PROBE_DIRECTIONS, dtype=torch.float64) + 0.5
-    height, turn = 1 - 2 * index / PROBE_DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index
-    side = torch.sqrt(1 - height * height)
-    return torch.stack([side * torch.cos(turn), side * torch.sin(turn), height], -1)

@@ -92,7 +92,7 @@ def test_what_cannot_be_exported_is_refused_with_a_sentence_and_leaves_nothing(t
         export_asset(asset, tmp_path / "a.txt", "usd")
     with pytest.raises(ValueError, match="needs Gaussians"):
         export_asset(replace(asset, gaussians=None), tmp_path / "a.ply", "ply")
-    with pytest.raises(ValueError, match="format 'fbx' is unknown; expected glb, mesh, ply, ply3, usd, env"):
+    with pytest.raises(ValueError, match="format 'fbx' is unknown; expected glb, mesh, html, ply, ply3, usd, env"):
         export_asset(asset, tmp_path / "a.fbx", "fbx")  # pyright: ignore
     with pytest.raises(ValueError, match="is a folder"):
         export_asset(asset, tmp_path, "glb")

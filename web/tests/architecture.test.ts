@@ -1,7 +1,7 @@
 import { expect, it } from 'vitest';
 
 /** Each may import those before it. */
-const LAYERS = ['session', 'edit', 'capture', 'stage', 'ui'];
+const LAYERS = ['session', 'edit', 'capture', 'stage', 'ui', 'page'];
 
 const SOURCES: Record<string, string> = Object.fromEntries(
   Object.entries(import.meta.glob('../src/**/*.{ts,tsx}', { query: '?raw', import: 'default', eager: true })).map(([path, text]) => [path.replace('../src/', ''), text as string]),

@@ -13,12 +13,13 @@ export const SRGB_GAMMA = 2.4;
 export const MIDDLE_GREY = 0.18;
 export const STILL_BOUNCES = 4;
 
-export type DownloadFormat = "glb" | "mesh" | "ply" | "ply3" | "usd" | "env" | "zip";
+export type DownloadFormat = "glb" | "mesh" | "html" | "ply" | "ply3" | "usd" | "env" | "zip";
 
 /** In the order in which they are offered. */
 export const FILE_KINDS: { format: DownloadFormat; suffix: string; title: string; description: string }[] = [
   { format: "glb", suffix: ".glb", title: "Mesh and Gaussians (GLB)", description: "Mesh with metallic-roughness textures: Blender, three.js, Unreal, Unity; in a second scene the Gaussians (KHR_gaussian_splatting)" },
   { format: "mesh", suffix: ".glb", title: "Mesh (GLB)", description: "The same mesh alone, in a smaller file" },
+  { format: "html", suffix: ".html", title: "Page (HTML)", description: "One file that any browser opens, without a server: the object to turn, relight and recolour" },
   { format: "ply", suffix: ".ply", title: "Gaussians (2DGS PLY)", description: "2D Gaussians with the field names of 2DGS: SuperSplat" },
   { format: "ply3", suffix: ".ply", title: "Gaussians (3DGS PLY)", description: "The same as flat ellipsoids, for viewers that want three scales" },
   { format: "usd", suffix: ".usda", title: "Scene (USD)", description: "ParticleField surflets for OpenUSD 26" },

@@ -12,14 +12,19 @@ const QUICK_FRAME_MS = 17.5;
 const FRAMES_BEFORE_STEP = 4;
 
 export class DynamicResolution {
-  private step = 0;
   /** Running mean of the time between two moving pictures. */
   private frameMs = AIMED_FRAME_MS;
   private framesMeasured = 0;
 
-  /** Share of the screen's own sharpness. */
+  /** Goes up and down a list of sharpnesses, from one of its places. */
+  constructor(
+    private readonly scales: readonly number[] = SCALES,
+    private step = 0,
+  ) {}
+
+  /** Share of the screen's own sharpness, or what else the list is of. */
   get scale(): number {
-    return SCALES[this.step]!;
+    return this.scales[this.step]!;
   }
 
   /** Take in the time since the last moving picture; true where the scale changed. */
@@ -38,7 +43,7 @@ export class DynamicResolution {
   /** The first step whose pictures should come in time: time goes with the number of pixels. */
   private fitting(): number {
     const wanted = this.scale * Math.sqrt(AIMED_FRAME_MS / this.frameMs);
-    const step = SCALES.findIndex((scale) => scale <= wanted * 1.05);
-    return step < 0 ? SCALES.length - 1 : step;
+    const step = this.scales.findIndex((scale) => scale <= wanted * 1.05);
+    return step < 0 ? this.scales.length - 1 : step;
   }
 }

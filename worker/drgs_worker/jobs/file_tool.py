@@ -4,7 +4,7 @@ The server calls it (`run_file_tool`), so that a decoder that crashes or swallow
 Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full. Commands:
     asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
     environment SOURCE OUT      EXR or Radiance HDR -> EXR
-    export ASSET OUT FORMAT [EDITS ENVIRONMENTS N]      asset folder, with the edits put into it -> glb, mesh, ply, ply3, usd, env, or zip (the asset itself)
+    export ASSET OUT FORMAT [EDITS ENVIRONMENTS N]      asset folder, with the edits put into it -> a format of drgs/exchange/export_formats.py, or zip (the asset itself)
     version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
 """
 

@@ -1,0 +1,60 @@
+"""A mesh with fewer faces for a page: shape by quadric edge collapse, materials and normals as means of what they stand for.
+
+In and out: a TriangleMesh. Corners at one place are joined first, so that faces which share none can shrink too.
+"""
+
+import fast_simplification
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import cKDTree
+
+from drgs.scene.mesh import TriangleMesh
+
+AGGRESSIVENESS = 5
+"""Of fast_simplification: smaller keeps shape better, and takes longer."""
+
+
+def shrink_mesh(mesh: TriangleMesh, most_faces: int) -> TriangleMesh:
+    """The mesh with about `most_faces` faces or fewer; the mesh itself where it has no more."""
+    if len(mesh.faces) <= most_faces:
+        return mesh
+    points = mesh.vertices.double().numpy()
+    low, extent = points.min(0), max(float(np.ptp(points, axis=0).max()), 1e-12)
+    joined, place_of = np.unique(points, axis=0, return_inverse=True)
+    corners = place_of.reshape(-1)[mesh.faces.numpy()]
+    # In a box of length 1: the library takes small areas for none.
+    simple, faces = fast_simplification.simplify(
+        ((joined - low) / extent).astype(np.float32), corners.astype(np.int32), target_count=most_faces, agg=AGGRESSIVENESS
+    )
+    used, faces = np.unique(faces[_has_three_corners(faces)], return_inverse=True)
+    vertices = simple[used].astype(np.float64) * extent + low
+    values = torch.cat([mesh.normals, mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], -1)
+    means = torch.from_numpy(_means_around(vertices, points, values.double().numpy())).float()
+    return TriangleMesh(
+        torch.from_numpy(vertices).float(),
+        torch.from_numpy(faces.reshape(-1, 3)).int(),
+        torch.nn.functional.normalize(means[:, :3], dim=-1),
+        means[:, 3:6].contiguous(),
+        means[:, 6].contiguous(),
+        means[:, 7].contiguous(),
+    )
+
+
+def _has_three_corners(faces: ndarray) -> ndarray:
+    return (faces != np.roll(faces, 1, axis=1)).all(1)
+
+
+def _means_around(
+    vertices: Float[ndarray, "vertex 3"], points: Float[ndarray, "point 3"], values: Float[ndarray, "point channel"]
+) -> Float[ndarray, "vertex channel"]:
+    """Of each vertex the mean of the points that are nearest to it; the value of the nearest point where it is nearest to none."""
+    _, owner = cKDTree(vertices).query(points)
+    count = np.bincount(owner, minlength=len(vertices))
+    sums = np.stack([np.bincount(owner, weights=channel, minlength=len(vertices)) for channel in values.T], -1)
+    lonely = count == 0
+    means = sums / np.maximum(count, 1)[:, None]
+    if lonely.any():
+        means[lonely] = values[cKDTree(points).query(vertices[lonely])[1]]
+    return means

@@ -1,0 +1,122 @@
+/** What a page holds, as the graphics card takes it: drgs/convert/page/encode_page.py wrote it. */
+
+import type { Vec3 } from '../session/view';
+import type { LatLong } from './light';
+import { cornersFromSteps, type Table, type Unpacked } from './unpack_arrays';
+
+export interface PageLight {
+  name: string;
+  /** Filtered for the roughness levels, sharpest first. */
+  tables: LatLong[];
+  /** Nine coefficients of red, green and blue. */
+  harmonics: Vec3[];
+}
+
+export interface PageMesh {
+  /** A corner of its box, z up [world units]. */
+  low: Vec3;
+  placeStep: number;
+  normalSteps: number;
+  transferLow: number;
+  transferStep: number;
+  /** Every edge has two faces: nobody sees its inside. */
+  closed: boolean;
+  corners: Uint32Array<ArrayBuffer>;
+  /** VERTEX_BYTES each. */
+  vertices: ArrayBuffer;
+}
+
+export interface PageObject {
+  title: string;
+  photographs: number;
+  faces: { kept: number; all: number };
+  /** Box of the object, z up [world units]. */
+  low: Vec3;
+  high: Vec3;
+  /** Finest first; one or two. */
+  meshes: PageMesh[];
+  roughnessLevels: number[];
+  lights: PageLight[];
+  /** Two factors of the BRDF a texel, `factorsSide` texels a side: n·v across, roughness down. */
+  factors: Uint8Array;
+  factorsSide: number;
+}
+
+/** A vertex: place (3), normal (2) and transfer (9) in 16 bits each; roots of albedo (3), roughness and metallic in 8; three bytes of room. */
+export const VERTEX_BYTES = 36;
+
+interface Header {
+  title: string;
+  photographs: number;
+  faces: { kept: number; all: number };
+  meshes: { low: Vec3; high: Vec3; place_step: number; normal_steps: number; transfer_low: number; transfer_step: number; closed: boolean }[];
+  roughness_levels: number[];
+  lights: { name: string; harmonics: Vec3[] }[];
+  factors_side: number;
+}
+
+export function readObject({ about, arrays }: Unpacked): PageObject {
+  const header = about as unknown as Header;
+  const named = (name: string) => {
+    const found = arrays[name];
+    if (!found) throw new Error(`the object lacks ${name}`);
+    return found;
+  };
+  const tables = (light: number): LatLong[] =>
+    header.roughness_levels.map((_, level) => {
+      const { values, rows: texels } = named(`light${light}.${level}`);
+      return { rows: Math.round(Math.sqrt(texels / 2)), radiance: fromRgbe(values as Uint8Array) };
+    });
+  const meshes = header.meshes.map(({ low, place_step, normal_steps, transfer_low, transfer_step, closed }, k): PageMesh => {
+    const of = (name: string) => named(`mesh${k}.${name}`);
+    return {
+      low,
+      placeStep: place_step,
+      normalSteps: normal_steps,
+      transferLow: transfer_low,
+      transferStep: transfer_step,
+      closed,
+      corners: cornersFromSteps(of('steps').values),
+      vertices: joinVertices(['places', 'normals', 'transfer'].map(of), ['albedo_roots', 'surface'].map(of)),
+    };
+  });
+  return {
+    title: header.title,
+    photographs: header.photographs,
+    faces: header.faces,
+    low: header.meshes[0]!.low,
+    high: header.meshes[0]!.high,
+    meshes,
+    roughnessLevels: header.roughness_levels,
+    lights: header.lights.map(({ name, harmonics }, k) => ({ name, harmonics, tables: tables(k) })),
+    factors: named('factors').values as Uint8Array,
+    factorsSide: header.factors_side,
+  };
+}
+
+/** All that belongs to a vertex side by side. */
+function joinVertices(words: Table[], bytes: Table[]): ArrayBuffer {
+  const count = words[0]!.rows;
+  const joined = new ArrayBuffer(VERTEX_BYTES * count);
+  const put = (tables: Table[], into: Uint8Array | Uint16Array, start: number) => {
+    const stride = VERTEX_BYTES / into.BYTES_PER_ELEMENT;
+    let at = start;
+    for (const { values, columns } of tables) {
+      for (let row = 0; row < count; row++) for (let k = 0; k < columns; k++) into[row * stride + at + k] = values[row * columns + k]!;
+      at += columns;
+    }
+    return at * into.BYTES_PER_ELEMENT;
+  };
+  put(bytes, new Uint8Array(joined), put(words, new Uint16Array(joined), 0));
+  return joined;
+}
+
+/** Red, green, blue of each texel; half a step is added, since Python rounds down. */
+function fromRgbe(texels: Uint8Array): Float32Array {
+  const radiance = new Float32Array((texels.length / 4) * 3);
+  for (let i = 0, to = 0; i < texels.length; i += 4) {
+    const unit = 2 ** (texels[i + 3]! - 128 - 8);
+    for (let k = 0; k < 3; k++) radiance[to++] = (texels[i + k]! + 0.5) * unit;
+  }
+  return radiance;
+}
