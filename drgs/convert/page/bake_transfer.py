@@ -6,7 +6,7 @@ Source: Sloan, Kautz and Snyder 2002 (docs/sources.md: sloan2002), for diffuse s
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from drgs.maths.color import luminance
@@ -26,30 +26,31 @@ LIFTS = 10.0
 def bake_transfer(mesh: TriangleMesh) -> Float[Tensor, "vertex 9"]:
     """Trace the mesh against itself from all its vertices; coefficients in the basis of drgs/maths/spherical_harmonics.py."""
     directions = sphere_lattice(DIRECTIONS).to(mesh.vertices)
-    cosine = (directions @ mesh.normals.T).clamp(min=0)
-    weight = cosine / cosine.sum(0).clamp(min=1e-6)
-    met = _faces_met(mesh, directions, cosine > 0)
-    direct = (weight * (met < 0)).T @ sh_basis(directions, DEGREE)
-    ways = [(rows := (faces >= 0).nonzero().squeeze(1), faces[rows].long(), weight[k, rows, None]) for k, faces in enumerate(met)]
+    basis = sh_basis(directions, DEGREE)
+    tracer = build_tracer(mesh)
+    origins = mesh.vertices + LIFTS * tracer.lift * mesh.normals
+    whole = sum((_cosines(mesh, direction) for direction in directions), torch.full((len(origins),), 1e-6))
+    direct = torch.zeros(len(origins), basis.shape[1])
+    met: list[
+        tuple[Tensor, Tensor, Tensor]
+    ] = []  # of each direction: vertices that see the object itself, the faces that they see, and its weight
+    for direction, values in zip(directions, basis, strict=True):
+        share = _cosines(mesh, direction) / whole
+        rows = (share > 0).nonzero().squeeze(1)
+        face = trace_rays(origins[rows], direction.expand(len(rows), 3), tracer).face
+        open_rows, met_rows = rows[face < 0], rows[face >= 0]
+        direct[open_rows] += share[open_rows, None] * values
+        met.append((met_rows.int(), face[face >= 0], share[met_rows, None]))
     faces = mesh.faces.long()
     reflectance = luminance(mesh.albedo)[faces].mean(1, keepdim=True)
     total = direct
     for _ in range(BOUNCES):
         sent = reflectance * total[faces].mean(1)
         total = direct.clone()
-        for rows, seen, share in ways:
+        for rows, seen, share in met:
             total[rows] += share * sent[seen]
     return total
 
 
-def _faces_met(
-    mesh: TriangleMesh, directions: Float[Tensor, "direction 3"], facing: Bool[Tensor, "direction vertex"]
-) -> Int[Tensor, "direction vertex"]:
-    """First face on each vertex' way in each direction; -1 where there is none, and where `facing` is false."""
-    tracer = build_tracer(mesh)
-    origins = mesh.vertices + LIFTS * tracer.lift * mesh.normals
-    met = torch.full(facing.shape, -1, dtype=torch.int32)
-    for k, direction in enumerate(directions):
-        rows = facing[k].nonzero().squeeze(1)
-        met[k, rows] = trace_rays(origins[rows], direction.expand(len(rows), 3), tracer).face
-    return met
+def _cosines(mesh: TriangleMesh, direction: Float[Tensor, "3"]) -> Float[Tensor, "vertex"]:
+    return (mesh.normals @ direction).clamp(min=0)
