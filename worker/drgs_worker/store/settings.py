@@ -60,7 +60,7 @@ class Limits(BaseModel):
     """How long a deleted asset can be brought back."""
     loaded_assets: Positive = 16
     """In memory; the least recently used one that nobody looks at goes first."""
-    loaded_bytes: Positive = 1 << 30
+    loaded_bytes: Positive = 768 << 20
     """Of asset folders whose contents are in memory, which is about what they need there, and of the poses, simulations and environments there."""
     heavy_bytes: Positive = 1 << 30
     """Of memory, by estimate, that finished pictures and the processes that read and write files may take at once; others wait."""
