@@ -31,9 +31,8 @@ def bake_transfer(mesh: TriangleMesh) -> Float[Tensor, "vertex 9"]:
     origins = mesh.vertices + LIFTS * tracer.lift * mesh.normals
     whole = sum((_cosines(mesh, direction) for direction in directions), torch.full((len(origins),), 1e-6))
     direct = torch.zeros(len(origins), basis.shape[1])
-    met: list[
-        tuple[Tensor, Tensor, Tensor]
-    ] = []  # of each direction: vertices that see the object itself, the faces that they see, and its weight
+    # Of each direction: vertices that see the object itself, the faces that they see, and its weight.
+    met: list[tuple[Tensor, Tensor, Tensor]] = []
     for direction, values in zip(directions, basis, strict=True):
         share = _cosines(mesh, direction) / whole
         rows = (share > 0).nonzero().squeeze(1)
