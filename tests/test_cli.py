@@ -158,7 +158,7 @@ def test_export_takes_the_format_from_the_ending(ball: Path, name: str, start: b
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
-@pytest.mark.parametrize("name", ["a.glb", "a.usda", "a.usdc"])
+@pytest.mark.parametrize("name", ["a.glb", "a.usda", "a.usdc", "a.usdz"])
 def test_a_file_that_cannot_be_written_whole_is_one_sentence_and_leaves_nothing(ball: Path, name: str, tmp_path: Path):
     import resource
 

@@ -6,7 +6,8 @@ glb   mesh with base colour and metallic-roughness textures (Blender, three.js, 
       as splats by KHR_gaussian_splatting, flat like those of ply3
 mesh  the same without the Gaussians
 html  a page: mesh, lights and the program that draws them in a browser, in one file (page/)
-usd   mesh and surfels as a particle field (OpenUSD 26)
+usdz  the textured mesh for viewers of augmented reality, upright and in metres
+usd   mesh with the same textures, the Gaussians as splats, flat like those of ply3, and the light (OpenUSD 26)
 env   the recovered light, lat-long EXR, linear
 Viewers of Gaussians show colours as they stand in the file, so there the linear radiance is turned to sRGB.
 """
@@ -28,13 +29,14 @@ from drgs.exchange.exr import encode_environment
 from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
 from drgs.exchange.glb import GlbMesh, GlbPoints, encode_glb
 from drgs.exchange.gltf_splats import GltfSplats, points_from_splats
-from drgs.exchange.texture_atlas import paint, unwrap
-from drgs.exchange.usd import write_usd
+from drgs.exchange.texture_atlas import Atlas, paint, unwrap
+from drgs.exchange.usd import BASE_COLOR, SURFACE, UsdScene, write_ar_usdz, write_usd
 from drgs.maths.color import srgb_from_linear
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import map_radiance
 from drgs.scene.asset import Asset
 from drgs.scene.gaussians import Gaussians
+from drgs.scene.mesh import TriangleMesh
 
 
 def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> str:
@@ -45,6 +47,7 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> str:
 
     Raises:
         ValueError: unknown format, Gaussians asked of an asset that has none, usd-core is missing, or no page can be made of it.
+        OSError: the file cannot be written.
     """
     out = Path(out)
     if format not in EXPORT_FORMATS:
@@ -60,8 +63,9 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> str:
     left_out = ""
     try:
         if format == "usd":
-            surfels = None if asset.gaussians is None else _surfel_arrays(asset.gaussians)
-            write_usd(temporary, _mesh_arrays(asset), surfels, asset.meters_per_unit)
+            write_usd(temporary, _usd_scene(asset), beside=out)
+        elif format == "usdz":
+            write_ar_usdz(temporary, _usd_scene(asset))
         elif format == "html":
             page = encode_page(asset)
             left_out = "" if page.faces == len(asset.mesh.faces) else f"{page.faces} of the mesh's {len(asset.mesh.faces)} faces"
@@ -96,10 +100,7 @@ def encode_textured_glb(asset: Asset, with_splats: bool = True) -> bytes:
         with_splats: the Gaussians too, where there are some: 260 bytes each.
     """
     mesh = asset.mesh
-    atlas = unwrap(_array(mesh.vertices), _array(mesh.faces))
-    values = torch.cat([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], -1)
-    picture = paint(atlas, _array(values), _material_texels)
-    images = (_png(picture[..., :3]), _png(picture[..., 3:]))
+    atlas, images = _painted(mesh)
     normals = torch.nn.functional.normalize(mesh.normals, dim=-1)
     attributes = {"POSITION": _array(mesh.vertices)[atlas.vertex_of], "NORMAL": _array(normals)[atlas.vertex_of], "TEXCOORD_0": atlas.uv}
     material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
@@ -107,18 +108,40 @@ def encode_textured_glb(asset: Asset, with_splats: bool = True) -> bytes:
     return encode_glb(GlbMesh(attributes, atlas.faces, material, images), asset.meters_per_unit, points)
 
 
+def _painted(mesh: TriangleMesh) -> tuple[Atlas, tuple[bytes, bytes]]:
+    """PNG files of base colour in sRGB, and of roughness in green and metallic in blue."""
+    atlas = unwrap(_array(mesh.vertices), _array(mesh.faces))
+    values = torch.cat([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], -1)
+    picture = paint(atlas, _array(values), _material_texels)
+    return atlas, (_png(picture[..., :3]), _png(picture[..., 3:]))
+
+
+def _usd_scene(asset: Asset) -> UsdScene:
+    atlas, (base_color, surface) = _painted(asset.mesh)
+    mesh = {key: _array(values) for key, values in vars(asset.mesh).items()}
+    mesh["normals"] = _array(torch.nn.functional.normalize(asset.mesh.normals, dim=-1))
+    return UsdScene(
+        mesh,
+        atlas.uv,
+        atlas.faces,
+        {BASE_COLOR: base_color, SURFACE: surface},
+        _splat_arrays(asset.gaussians) if asset.gaussians is not None and len(asset.gaussians.centers) else None,
+        encode_environment(_array(asset.environment.radiance)),
+        asset.meters_per_unit,
+    )
+
+
 def _splat_points(gaussians: Gaussians) -> GlbPoints:
-    """In world units; the third scale as in ply3."""
-    arrays = _surfel_arrays(gaussians)
-    thickness = np.exp(log_thickness(arrays["centers"], _array(gaussians.log_scales)))
+    """In world units."""
+    arrays = _splat_arrays(gaussians)
     materials = {"_ALBEDO": arrays["albedo"], "_ROUGHNESS": arrays["roughness"], "_METALLIC": arrays["metallic"]}
     return points_from_splats(
         GltfSplats(
             arrays["centers"],
             arrays["quats_wxyz"][:, [1, 2, 3, 0]],
-            np.concatenate([arrays["scales"], thickness[:, None]], -1, dtype=np.float32),
+            arrays["scales"],
             arrays["opacities"],
-            _array(display_sh(gaussians.sh)),
+            arrays["sh"],
             "srgb_rec709_display",
             materials,
         )
@@ -133,23 +156,20 @@ def display_sh(sh: Float[Tensor, "surfel 16 3"]) -> Float[Tensor, "surfel 16 3"]
     return map_radiance(sh, lambda radiance: srgb_from_linear(radiance.clamp(0, 1)))
 
 
-def _mesh_arrays(asset: Asset) -> dict[str, np.ndarray]:
-    return {key: _array(values) for key, values in vars(asset.mesh).items()}
-
-
-def _surfel_arrays(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Activated: linear scales, opacities, unit quaternions."""
+def _splat_arrays(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Activated: unit quaternions, opacities, and three linear scales, the third as in ply3; harmonics of sRGB colours."""
+    thickness = np.exp(log_thickness(_array(gaussians.centers), _array(gaussians.log_scales)))
+    scales = np.concatenate([_array(torch.exp(gaussians.log_scales)), thickness[:, None]], -1, dtype=np.float32)
     tensors = {
         "centers": gaussians.centers,
-        "scales": torch.exp(gaussians.log_scales),
         "quats_wxyz": torch.nn.functional.normalize(gaussians.quats_wxyz, dim=-1),
         "opacities": torch.sigmoid(gaussians.opacity_logits),
-        "sh": gaussians.sh,
+        "sh": display_sh(gaussians.sh),
         "albedo": gaussians.albedo,
         "roughness": gaussians.roughness,
         "metallic": gaussians.metallic,
     }
-    return {key: _array(values) for key, values in tensors.items()}
+    return {"scales": scales} | {key: _array(values) for key, values in tensors.items()}
 
 
 def _material_texels(values: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-ExportFormat = Literal["ply", "ply3", "glb", "mesh", "usd", "env", "html"]
+ExportFormat = Literal["ply", "ply3", "glb", "mesh", "usdz", "usd", "env", "html"]
 """What `drgs.export_asset` writes."""
 DownloadFormat = Literal[ExportFormat, "zip"]
 """What the service gives out: these, and the asset itself."""
@@ -39,7 +39,17 @@ FILE_KINDS: dict[DownloadFormat, FileKind] = {
     ),
     "ply": FileKind(".ply", "Gaussians (2DGS PLY)", "2D Gaussians with the field names of 2DGS: SuperSplat"),
     "ply3": FileKind(".ply", "Gaussians (3DGS PLY)", "The same as flat ellipsoids, for viewers that want three scales"),
-    "usd": FileKind(".usda", "Scene (USD)", "ParticleField surflets for OpenUSD 26", (".usd", ".usdc")),
+    "usdz": FileKind(
+        ".usdz",
+        "Object for AR (USDZ)",
+        "Mesh with textures, upright and in metres: AR Quick Look on iPhone and iPad, and what else reads USD",
+    ),
+    "usd": FileKind(
+        ".usdz",
+        "Scene (USD)",
+        "Mesh with textures, Gaussians as splats of OpenUSD 26 and the light as a dome, in one package; a .usda has its pictures beside it",
+        (".usda", ".usd", ".usdc"),
+    ),
     "env": FileKind(
         ".exr", "Light (EXR)", "The environment: with edits the chosen one, turned and dimmed; else the one recovered with the object"
     ),

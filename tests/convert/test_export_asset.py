@@ -88,11 +88,15 @@ def test_what_cannot_be_exported_is_refused_with_a_sentence_and_leaves_nothing(t
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(ValueError, match="needs the package usd-core"):
         export_asset(asset, tmp_path / "old.usd", "usd")
+    with pytest.raises(ValueError, match="needs the package usd-core"):
+        export_asset(asset, tmp_path / "a.usdz", "usdz")
     with pytest.raises(ValueError, match="expected a name ending in"):
         export_asset(asset, tmp_path / "a.txt", "usd")
+    with pytest.raises(ValueError, match=r"expected a name ending in \.usdz"):
+        export_asset(asset, tmp_path / "a.usda", "usdz")
     with pytest.raises(ValueError, match="needs Gaussians"):
         export_asset(replace(asset, gaussians=None), tmp_path / "a.ply", "ply")
-    with pytest.raises(ValueError, match="format 'fbx' is unknown; expected glb, mesh, html, ply, ply3, usd, env"):
+    with pytest.raises(ValueError, match="format 'fbx' is unknown; expected glb, mesh, html, ply, ply3, usdz, usd, env"):
         export_asset(asset, tmp_path / "a.fbx", "fbx")  # pyright: ignore
     with pytest.raises(ValueError, match="is a folder"):
         export_asset(asset, tmp_path, "glb")

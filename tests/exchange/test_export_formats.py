@@ -15,7 +15,16 @@ def test_the_table_holds_every_format_once():
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("a.glb", "glb"), ("a.html", "html"), ("a.PLY", "ply"), ("a.usda", "usd"), ("a.usdc", "usd"), ("a.usd", "usd"), ("light.exr", "env")],
+    [
+        ("a.glb", "glb"),
+        ("a.html", "html"),
+        ("a.PLY", "ply"),
+        ("a.usdz", "usdz"),
+        ("a.usda", "usd"),
+        ("a.usdc", "usd"),
+        ("a.usd", "usd"),
+        ("light.exr", "env"),
+    ],
 )
 def test_a_suffix_stands_for_a_format(name: str, expected: str):
     assert export_format_of(Path(name)) == expected
@@ -23,5 +32,5 @@ def test_a_suffix_stands_for_a_format(name: str, expected: str):
 
 @pytest.mark.parametrize("name", ["a", "a.fbx", "a.zip", "glb"])
 def test_a_suffix_that_stands_for_no_format_is_refused(name: str):
-    with pytest.raises(ValueError, match=r"expected \.glb, \.html, \.ply, \.usda, \.exr, or give --format"):
+    with pytest.raises(ValueError, match=r"expected \.glb, \.html, \.ply, \.usdz, \.exr, or give --format"):
         export_format_of(Path(name))

@@ -1,11 +1,13 @@
-"""An exported GLB looks in three.js as the object looks here: same place, same materials, under the same light."""
+"""An exported GLB, and a USDZ, look in three.js as the object looks here: same place, same materials, under the same light."""
 
 import base64
 import io
 import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Route
 
@@ -24,14 +26,24 @@ PAGE = """<!doctype html><canvas width="SIDE" height="SIDE"></canvas>
 <script type="module">
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+import { USDLoader } from 'three/addons/loaders/USDLoader.js';
 import { EXRLoader } from 'three/addons/loaders/EXRLoader.js';
 const renderer = new THREE.WebGLRenderer({ canvas: document.querySelector('canvas'), alpha: true, preserveDrawingBuffer: true });
 const scene = new THREE.Scene();
 const sky = await new EXRLoader().setDataType(THREE.FloatType).loadAsync('/light.exr');
 sky.mapping = THREE.EquirectangularReflectionMapping;
 scene.environment = new THREE.PMREMGenerator(renderer).fromEquirectangular(sky).texture;
-scene.add((await new GLTFLoader().loadAsync('/object.glb')).scene);
-const { world_from_camera, fov_y_degrees } = await (await fetch('/camera.json')).json();
+const { world_from_camera, fov_y_degrees, file, stands } = await (await fetch('/camera.json')).json();
+const object = file.endsWith('.glb') ? (await new GLTFLoader().loadAsync(file)).scene : await new USDLoader().loadAsync(file);
+// Pictures of a package come when they come.
+for (let loaded = false; !loaded; await new Promise((later) => setTimeout(later, 50))) {
+  loaded = true;
+  object.traverse(({ material }) => (loaded &&= !material?.map || Boolean(material.map.image) && Boolean(material.metalnessMap.image)));
+}
+const moved = new THREE.Group();
+moved.position.fromArray(stands).negate();
+moved.add(object);
+scene.add(moved);
 const camera = new THREE.PerspectiveCamera(fov_y_degrees, 1, 0.01, 100);
 camera.matrixAutoUpdate = false;
 // Our world has z up, glTF's y.
@@ -42,31 +54,44 @@ window.picture = renderer.domElement.toDataURL('image/png');
 </script>"""
 
 
-def test_an_exported_glb_looks_the_same_in_three(server: RunningServer, browser: Browser, ball_asset: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("format", ["glb", "usdz"])
+def test_an_exported_file_looks_the_same_in_three(
+    format: Literal["glb", "usdz"], server: RunningServer, browser: Browser, ball_asset: str, tmp_path: Path
+) -> None:
     camera = start_view((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).tolist()
+    path = tmp_path / f"ball.{format}"
     with Client(server.address, token=server.token) as client:
-        client.export(ball_asset, "glb", tmp_path / "ball.glb")
+        client.export(ball_asset, format, path)
         session = client.open_session(ball_asset)
         session.edit({"op": "environment", "file": "studio.exr"})
         picture = session.frame(SIDE, SIDE, 256, camera, FOV_Y_DEGREES, background="transparent")
     light = (ROOT / "examples" / "environments" / "studio.exr").read_bytes()
     ours = Image.open(io.BytesIO(picture))
-    theirs = three_picture(
-        browser, (tmp_path / "ball.glb").read_bytes(), light, {"world_from_camera": camera, "fov_y_degrees": FOV_Y_DEGREES}
-    )
+    seen = {"world_from_camera": camera, "fov_y_degrees": FOV_Y_DEGREES, "stands": stands(path), "file": f"/object.{format}"}
+    theirs = three_picture(browser, path.read_bytes(), light, seen)
     a, b = (np.asarray(picture.convert("RGBA"), float) for picture in (ours, theirs))
     inside = (a[..., 3] > 254) & (b[..., 3] > 254)
     assert inside.sum() > 0.97 * max((a[..., 3] > 127).sum(), (b[..., 3] > 127).sum()) - 4 * SIDE, "the same silhouette"
     difference = np.abs(a - b)[inside][:, :3].mean()
-    print(f"mean difference {difference:.2f} of 255")
+    print(f"{format}: mean difference {difference:.2f} of 255")
     assert difference < DIFFERENCE, f"mean difference {difference:.1f} of 255"
 
 
-def three_picture(browser: Browser, glb: bytes, light: bytes, camera: dict) -> Image.Image:
+def stands(path: Path) -> list[float]:
+    """How far the file moves the object from where the asset has it [m], y up."""
+    if path.suffix != ".usdz":
+        return [0, 0, 0]
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    return list(UsdGeom.XformCommonAPI(stage.GetDefaultPrim()).GetXformVectors(Usd.TimeCode.Default())[0])
+
+
+def three_picture(browser: Browser, file: bytes, light: bytes, camera: dict) -> Image.Image:
     """What three.js alone draws of these files, on a page that has nothing of ours."""
     answers: dict[str, tuple[str, bytes]] = {
         "/": ("text/html", PAGE.replace("SIDE", str(SIDE)).encode()),
-        "/object.glb": ("model/gltf-binary", glb),
+        camera["file"]: ("application/octet-stream", file),
         "/light.exr": ("image/x-exr", light),
         "/camera.json": ("application/json", json.dumps(camera).encode()),
     }
