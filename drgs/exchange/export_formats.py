@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-ExportFormat = Literal["ply", "ply3", "glb", "mesh", "usdz", "usd", "env", "html"]
+ExportFormat = Literal["ply", "ply3", "spz", "glb", "mesh", "usdz", "usd", "env", "html"]
 """What `drgs.export_asset` writes."""
 DownloadFormat = Literal[ExportFormat, "zip"]
 """What the service gives out: these, and the asset itself."""
@@ -39,6 +39,11 @@ FILE_KINDS: dict[DownloadFormat, FileKind] = {
     ),
     "ply": FileKind(".ply", "Gaussians (2DGS PLY)", "2D Gaussians with the field names of 2DGS: SuperSplat"),
     "ply3": FileKind(".ply", "Gaussians (3DGS PLY)", "The same as flat ellipsoids, for viewers that want three scales"),
+    "spz": FileKind(
+        ".spz",
+        "Gaussians (SPZ)",
+        "The same in a seventh of the bytes, without materials: Scaniverse, Spark, Babylon.js and other viewers of compressed splats",
+    ),
     "usdz": FileKind(
         ".usdz",
         "Object for AR (USDZ)",

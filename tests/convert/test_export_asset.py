@@ -12,11 +12,13 @@ from drgs.exchange.exr import decode_environment
 from drgs.exchange.gaussian_ply import decode_gaussian_ply
 from drgs.exchange.ply import parse_ply
 from drgs.maths.color import srgb_from_linear
+from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.scene.asset import Asset
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
+from tests.exchange.read_spz import read_spz
 
 
 def ball_asset() -> Asset:
@@ -76,6 +78,31 @@ def test_the_third_scale_is_there_for_3dgs_viewers_only(tmp_path):
     assert (parse_ply((tmp_path / "a.ply").read_bytes()).elements["vertex"].scalars["scale_2"] < -8).all()
 
 
+def test_an_spz_holds_the_gaussians_upright_in_metres(tmp_path):
+    asset = ball_asset()
+    assert asset.gaussians is not None
+    assert export_asset(asset, tmp_path / "a.spz", "spz") == ""
+    found = read_spz((tmp_path / "a.spz").read_bytes())
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    assert np.abs(found.centers - 0.5 * (asset.gaussians.centers @ turn.T).numpy()).max() < 1e-4
+    assert np.abs(found.log_scales[:, :2] - np.log(0.5) - asset.gaussians.log_scales.numpy()).max() < 0.04
+    assert (found.log_scales[:, 2] == -10).all(), "as thin as the format goes"
+    wanted = turn @ rotation_from_quat_wxyz(asset.gaussians.quats_wxyz)
+    there = rotation_from_quat_wxyz(torch.from_numpy(found.quats_xyzw[:, [3, 0, 1, 2]]).float())
+    assert (there - wanted).abs().max() < 0.01
+    direction = torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
+    shown = evaluate_sh(torch.from_numpy(found.sh).float(), direction @ turn.T)
+    assert (shown - evaluate_sh(display_sh(asset.gaussians.sh), direction)).abs().max() < 0.03
+
+
+def test_splats_too_small_for_an_spz_are_counted(tmp_path):
+    asset = replace(ball_asset(), meters_per_unit=1e-3)
+    assert asset.gaussians is not None
+    small = int((asset.gaussians.log_scales.amin(1) + np.log(1e-3) < -10).sum())
+    assert 0 < small < 30
+    assert export_asset(asset, tmp_path / "a.spz", "spz") == f"{small} of 30 splats wider than they are"
+
+
 def test_the_environment_is_exported_bit_for_bit(tmp_path):
     asset = ball_asset()
     export_asset(asset, tmp_path / "sub" / "env.exr", "env")
@@ -96,7 +123,7 @@ def test_what_cannot_be_exported_is_refused_with_a_sentence_and_leaves_nothing(t
         export_asset(asset, tmp_path / "a.usda", "usdz")
     with pytest.raises(ValueError, match="needs Gaussians"):
         export_asset(replace(asset, gaussians=None), tmp_path / "a.ply", "ply")
-    with pytest.raises(ValueError, match="format 'fbx' is unknown; expected glb, mesh, html, ply, ply3, usdz, usd, env"):
+    with pytest.raises(ValueError, match="format 'fbx' is unknown; expected glb, mesh, html, ply, ply3, spz, usdz, usd, env"):
         export_asset(asset, tmp_path / "a.fbx", "fbx")  # pyright: ignore
     with pytest.raises(ValueError, match="is a folder"):
         export_asset(asset, tmp_path, "glb")

@@ -19,6 +19,7 @@ def test_the_table_holds_every_format_once():
         ("a.glb", "glb"),
         ("a.html", "html"),
         ("a.PLY", "ply"),
+        ("a.spz", "spz"),
         ("a.usdz", "usdz"),
         ("a.usda", "usd"),
         ("a.usdc", "usd"),
@@ -32,5 +33,5 @@ def test_a_suffix_stands_for_a_format(name: str, expected: str):
 
 @pytest.mark.parametrize("name", ["a", "a.fbx", "a.zip", "glb"])
 def test_a_suffix_that_stands_for_no_format_is_refused(name: str):
-    with pytest.raises(ValueError, match=r"expected \.glb, \.html, \.ply, \.usdz, \.exr, or give --format"):
+    with pytest.raises(ValueError, match=r"expected \.glb, \.html, \.ply, \.spz, \.usdz, \.exr, or give --format"):
         export_format_of(Path(name))

@@ -1,6 +1,7 @@
 """What leaves the page: stills to work on, films, and files that hold what was done to the object."""
 
 import json
+import math
 import zipfile
 from pathlib import Path
 
@@ -92,6 +93,8 @@ def test_what_was_made_gold_is_exported_as_gold_or_as_captured(ball: Viewer, tmp
     assert float(plain.metallic.mean()) < 0.05 and float(plain.albedo[:, 2].max()) > 0.7
     with zipfile.ZipFile(downloaded(ball, "link", "Object for AR (USDZ)", tmp_path / "ball.usdz")) as package:
         assert package.namelist()[0] == "object.usdc"
+    kilobytes = math.ceil((tmp_path / "ball.usdz").stat().st_size / 1e3)
+    expect(ball.page.get_by_role("link", name=f"Object for AR (USDZ) {kilobytes} kB")).to_be_visible()
     ball.page.get_by_role("switch", name="With this session’s edits").check()
 
 

@@ -157,6 +157,30 @@ def test_splats_in_gltf_by_another_program_are_read_as_they_were_meant(run_node,
     assert np.abs(shown - radiance(given, directions)).mean() < 0.01 and np.abs(shown - radiance(given, directions)).max() < 0.06
 
 
+def test_splat_transform_reads_an_exported_spz_as_it_was_meant(run_node, tmp_path):
+    asset = ball_asset()
+    export_asset(asset, tmp_path / "a.spz", "spz")
+    run_node("node_modules/@playcanvas/splat-transform/bin/cli.mjs", "--quiet", "--overwrite", tmp_path / "a.spz", tmp_path / "a.ply")
+    given, read = meant(asset), parse_ply((tmp_path / "a.ply").read_bytes()).elements["vertex"].scalars
+
+    def columns(*names: str) -> np.ndarray:
+        return np.stack([read[name] for name in names], -1).astype(float)
+
+    # It writes into a PLY what stands in an SPZ, whose frame has y up.
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    assert np.allclose(columns("x", "y", "z"), 0.5 * given["centers"] @ turn.T, atol=1e-4)
+    assert np.allclose(columns("scale_0", "scale_1"), given["log_scales"] + np.log(0.5), atol=0.04)
+    assert (columns("scale_2") == -10).all()
+    assert np.allclose(rotations({"quats_wxyz": columns("rot_0", "rot_1", "rot_2", "rot_3")}), turn @ rotations(given), atol=0.01)
+    assert np.allclose(1 / (1 + np.exp(-columns("opacity")[:, 0])), 1 / (1 + np.exp(-given["opacity_logits"])), atol=0.003)
+    sh = np.zeros((30, 16, 3))
+    sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
+    sh[:, 1:] = columns(*(f"f_rest_{k}" for k in range(45))).reshape(-1, 3, 15).transpose(0, 2, 1)
+    directions = np.random.default_rng(0).normal(size=given["centers"].shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert np.allclose(radiance({"sh": sh}, directions @ turn.T), radiance(given, directions), atol=0.03)
+
+
 def check_splats(run_node: Callable[..., str], path: Path, given: dict[str, np.ndarray], model: str) -> None:
     """AssertionError where splat-transform does not read a PLY as it was meant.
 

@@ -308,7 +308,7 @@ export interface ExportRequest {
   limits?: JobLimits;
   kind: "export";
   asset: string;
-  formats: ("ply" | "ply3" | "glb" | "mesh" | "usdz" | "usd" | "env" | "html" | "zip")[];
+  formats: ("ply" | "ply3" | "spz" | "glb" | "mesh" | "usdz" | "usd" | "env" | "html" | "zip")[];
 }
 
 /** A part of the surface that is held: some vertices by number, or those around a picked point. */

@@ -15,6 +15,9 @@ const withEdits = signal(true);
 /** The file that the server is writing; null while there is none. */
 const writing = signal<{ format: DownloadFormat; leaving: AbortController } | null>(null);
 
+/** Bytes of the files written so far, by address; after further edits a file may take some more or less. */
+const sizes = signal<Record<string, number>>({});
+
 export function Files() {
   const open = session.value!;
   const edited = log.value.edits.length > 0;
@@ -25,7 +28,9 @@ export function Files() {
     writing.value = { format, leaving };
     const file = await attempt(api.exportedFile(address(format), leaving.signal));
     writing.value = null;
-    if (file) download(file.content, file.name);
+    if (!file) return;
+    sizes.value = { ...sizes.value, [address(format)]: file.content.size };
+    download(file.content, file.name);
   };
   return (
     <Section title="Files">
@@ -47,7 +52,7 @@ export function Files() {
               }}
             >
               <Icon name="download" /> {title}
-              {writing.value?.format === format && <span class="dim">is being written…</span>}
+              {writing.value?.format === format ? <span class="dim">is being written…</span> : <span class="dim">{sizeInWords(sizes.value[address(format)])}</span>}
             </a>
             {writing.value?.format === format && (
               <button class="ghost" aria-label={`Cancel ${title}`} onClick={() => writing.value?.leaving.abort()}>
@@ -77,4 +82,9 @@ async function saveVersion(): Promise<void> {
   if (!saved) return;
   await attempt(refreshAssets());
   notify(`Saved as version ${saved.version}: it is in the list of assets.`, 'info');
+}
+
+function sizeInWords(bytes: number | undefined): string {
+  if (bytes === undefined) return '';
+  return bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 }
