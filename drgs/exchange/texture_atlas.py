@@ -1,7 +1,8 @@
 """A texture atlas of a mesh, and pictures painted into it from values at the vertices.
 
 Up to MAX_UNWRAP_FACES faces: charts by xatlas, few seams, pictures a person can retouch. Above, where unwrapping takes minutes: every
-two faces share a square cell, which is instant and as exact, but has a seam at every edge.
+two faces share a square cell, which is instant and as exact, but has a seam at every edge. Cells near one another in the picture hold faces near
+one another on the surface, for programs that draw a picture small mix what is near in it.
 In and out: numpy arrays. Rows of a picture run down, as glTF's texture coordinates do.
 """
 
@@ -18,6 +19,8 @@ TEXELS_PER_FACE = 40
 """What a face gets on average; values are linear within a face, so more would add nothing."""
 GUTTER = 4
 """Texels between charts, so that filtering and the first mip levels do not mix them."""
+_SORTED_CELLS = 12
+"""Side of the squares of cells in which faces are sorted, no longer halved."""
 _CHUNK = 1 << 19
 """Texels painted at once: some 200 bytes each."""
 _EDGE = 1e-3
@@ -43,7 +46,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_face: int = TEXEL
     # Charts fill about 0.65 of the picture; the size is the nearest power of two.
     size = int(np.clip(2 ** np.round(np.log2(np.sqrt(len(faces) * texels_per_face / 0.65))), MIN_SIZE, MAX_SIZE))
     if len(faces) > MAX_UNWRAP_FACES:
-        return _cells(faces)
+        return _cells(vertices, faces)
     atlas = xatlas.Atlas()
     atlas.add_mesh(_with_faces_of_unit_area(vertices, faces), np.ascontiguousarray(faces, np.uint32))
     options = xatlas.PackOptions()
@@ -51,7 +54,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_face: int = TEXEL
     atlas.generate(xatlas.ChartOptions(), options)
     vertex_of, atlas_faces, uv = atlas.get_mesh(0)
     if not np.array_equal(vertex_of[atlas_faces], faces) or not np.isfinite(uv).all():
-        return _cells(faces)  # xatlas left faces out or moved corners: it does so with faces of no area
+        return _cells(vertices, faces)  # xatlas left faces out or moved corners: it does so with faces of no area
     # Charts keep their texels where they fit into the power of two, and shrink a little where they do not.
     uv = uv * np.array([atlas.width, atlas.height]) / max(size, atlas.width, atlas.height)
     return Atlas(vertex_of.astype(np.int64), atlas_faces.astype(np.int32), uv.astype(np.float32), size, size)
@@ -65,10 +68,11 @@ def _with_faces_of_unit_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndar
     return np.ascontiguousarray(points / np.sqrt(area) if area > 0 else points, np.float32)
 
 
-def _cells(faces: np.ndarray) -> Atlas:
-    """Faces 2k and 2k+1 are the lower-left and upper-right halves of the k-th square cell, a gutter apart."""
+def _cells(vertices: np.ndarray, faces: np.ndarray) -> Atlas:
+    """Two faces are the lower-left and upper-right halves of each square cell, a gutter apart."""
     count = len(faces)
     columns = int(np.ceil(np.sqrt((count + 1) // 2)))
+    rows = max(int(np.ceil(((count + 1) // 2) / columns)), 1)
     cell = min(MAX_SIZE // columns, 12)
     if cell < 4:
         raise ValueError(
@@ -78,15 +82,42 @@ def _cells(faces: np.ndarray) -> Atlas:
     # Corners at texel centres; the halves keep a gap between their diagonals.
     lower = [(low, low + gap), (high - gap, high), (low, high)]
     upper = [(low + gap, low), (high, low), (high, high - gap)]
-    index = np.arange(count)
-    origin = np.stack([(index // 2) % columns, (index // 2) // columns], -1) * cell
-    corners = np.where((index % 2 == 0)[:, None, None], np.array(lower), np.array(upper)) + origin[:, None]
-    width = columns * cell
-    height = max(int(np.ceil(((count + 1) // 2) / columns)) * cell, 1)
-    uv = corners.reshape(-1, 2) / np.array([width, height])
+    places = _near_in_picture(np.asarray(vertices, np.float64)[faces].mean(1), columns, rows)
+    halves = np.where((places[:, 2] == 0)[:, None, None], np.array(lower), np.array(upper))
+    width, height = columns * cell, rows * cell
+    uv = (halves + cell * places[:, None, :2]).reshape(-1, 2) / np.array([width, height])
     return Atlas(
         faces.reshape(-1).astype(np.int64), np.arange(3 * count, dtype=np.int32).reshape(-1, 3), uv.astype(np.float32), width, height
     )
+
+
+def _near_in_picture(centers: np.ndarray, columns: int, rows: int) -> np.ndarray:
+    """(face, 3) column, row and half of a cell: the picture and the faces are halved together, until few are left to be sorted."""
+    places = np.zeros((len(centers), 3), np.int64)
+    waiting = [(np.arange(len(centers)), 0, 0, columns, rows)]
+    while waiting:
+        members, left, top, wide, tall = waiting.pop()
+        if max(wide, tall) <= _SORTED_CELLS:
+            spread = np.argsort(-np.ptp(centers[members], axis=0)) if len(members) else np.arange(2)
+            downwards = members[np.argsort(centers[members, spread[0]], kind="stable")]
+            for row in range(tall):
+                across = downwards[2 * wide * row : 2 * wide * (row + 1)]
+                across = across[np.argsort(centers[across, spread[1]], kind="stable")]
+                number = np.arange(len(across))
+                places[across] = np.stack([left + number // 2, np.full(len(across), top + row), number % 2], -1)
+            continue
+        first = (wide // 2, tall) if wide >= tall else (wide, tall // 2)
+        room, room_left = 2 * wide * tall, 2 * first[0] * first[1]
+        # As full as the whole; neither half gets more than it has room for.
+        taken = max(len(members) * room_left // room, len(members) - (room - room_left))
+        axis = int(np.ptp(centers[members], axis=0).argmax()) if len(members) else 0
+        order = members[np.argpartition(centers[members, axis], taken)] if 0 < taken < len(members) else members
+        waiting.append((order[:taken], left, top, *first))
+        if wide >= tall:
+            waiting.append((order[taken:], left + first[0], top, wide - first[0], tall))
+        else:
+            waiting.append((order[taken:], left, top + first[1], wide, tall - first[1]))
+    return places
 
 
 def _as_they_are(values: np.ndarray) -> np.ndarray:

@@ -80,6 +80,25 @@ def test_faces_without_area_fall_back_to_cells_instead_of_being_lost():
     assert np.isfinite(paint(atlas, vertices)).all()
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 577, 5120])
+def test_cells_that_are_near_in_the_picture_hold_faces_that_are_near_on_the_surface(count, monkeypatch):
+    """Who draws a picture small mixes its texels, eight by eight and more: whatever the order of the faces, they are of one place."""
+    monkeypatch.setattr(texture_atlas, "MAX_UNWRAP_FACES", 0)
+    mesh = trimesh.creation.icosphere(4)
+    faces = np.random.default_rng(0).permutation(np.asarray(mesh.faces, np.int32))[:count]
+    atlas = unwrap(np.asarray(mesh.vertices, np.float32), faces)
+    middles = atlas.uv[atlas.faces].mean(1) * [atlas.width, atlas.height]
+    cells = np.floor(middles / 12).astype(int) * 2 + [1, 0] * (middles[:, :1] % 12 > middles[:, 1:] % 12)
+    assert len(np.unique(cells, axis=0)) == count, "a half of a cell each"
+    if count == 5120:
+        picture = paint(atlas, np.asarray(mesh.vertices, np.float32))
+        height, width = (side // 8 * 8 for side in picture.shape[:2])
+        small = picture[:height, :width].reshape(height // 8, 8, width // 8, 8, 3).mean((1, 3))
+        column, row = np.minimum(middles.T // 8, [[width // 8 - 1], [height // 8 - 1]]).astype(int)
+        off = np.linalg.norm(small[row, column] - np.asarray(mesh.vertices)[faces].mean(1), axis=1)
+        assert off.mean() < 0.1, "two edges' length; 0.9 where cells are in the order of the faces"
+
+
 def test_painting_takes_memory_in_proportion_to_the_picture():
     mesh = trimesh.creation.icosphere(6)  # 81 920 faces, in cells
     atlas = unwrap(np.asarray(mesh.vertices), np.asarray(mesh.faces))
