@@ -49,6 +49,17 @@ def exr(pixels: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
+def claiming_exr(width: int, height: int, comment: str) -> bytes:
+    """Small, behind a comment in its header a picture that claims a size, and nothing of it."""
+    stream = io.BytesIO()
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "a comment": comment}
+    OpenEXR.File(header, {name: np.ones((2, 4), np.float32) for name in "RGB"}).write(stream)
+    data = bytearray(stream.getvalue())
+    for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+        struct.pack_into("<4i", data, data.rindex(name) + len(name) + 4, 0, 0, width - 1, height - 1)
+    return bytes(data) + bytes(2 << 20)
+
+
 def read_exr(data: bytes) -> dict[str, np.ndarray]:
     """Channel name -> (height, width)."""
     with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:

@@ -7,10 +7,11 @@ Source: OpenEXR 3; Ward 1991, "Real Pixels" and the Radiance file format notes f
 
 import contextlib
 import io
-import re
 import struct
 import sys
 import warnings
+from dataclasses import dataclass
+from typing import IO
 
 import numpy as np
 import OpenEXR
@@ -24,23 +25,51 @@ FREE_BYTES = 64 << 20
 MOST_BYTES = 2 << 30
 """Of all channels of a picture, as float32: 16384 x 8192 in three colours takes 1.5 GiB."""
 _ROWS_AT_ONCE = 64
+_HEAD_BYTES = 1 << 16
+"""Of a Radiance file, within which its pixels begin."""
+_MOST_ATTRIBUTES = 10_000
+"""Of an OpenEXR header that is looked through."""
+_LONGEST_NAME = 256
+"""Of an attribute, with the zero behind it."""
 MAX_RADIANCE = 1e12
 """Of a texel: hundreds of times the sun's disc in any unit that is in use, and with room for sums and squares of it in float32."""
 
 
-def decode_environment(data: bytes, name: str = "environment", clamp_negative: bool = True) -> np.ndarray:
+@dataclass(frozen=True)
+class PictureLimits:
+    """What a picture's header may claim; it is compared before a pixel is decoded."""
+
+    width: int = MAX_WIDTH
+    height: int = MAX_HEIGHT
+    bytes: int = MOST_BYTES
+    """Of all channels as float32."""
+
+
+@dataclass(frozen=True)
+class PictureClaim:
+    """What a picture's header says of it."""
+
+    width: int
+    height: int
+    channels: int
+
+
+def decode_environment(
+    data: bytes, name: str = "environment", clamp_negative: bool = True, limits: PictureLimits | None = None
+) -> np.ndarray:
     """(height, width = 2 height, 3) linear radiance of an EXR or Radiance HDR file.
 
     Args:
         clamp_negative: set negative values (a resampling filter's ringing) to 0, with a warning.
+        limits: as large as is read anywhere where None.
 
     Raises:
         ValueError: damaged, not 2:1, too large, without R, G and B, or a value is not finite or beyond MAX_RADIANCE.
     """
     if data[:4] == b"\x76\x2f\x31\x01":
-        radiance = _decode_exr_rgb(data, name)
+        radiance = _decode_exr_rgb(data, name, limits)
     elif data[:2] == b"#?":
-        radiance = decode_hdr(data, name)
+        radiance = decode_hdr(data, name, limits)
     else:
         raise ValueError(f"{name}: is neither an OpenEXR nor a Radiance HDR file")
     height, width, _ = radiance.shape
@@ -62,15 +91,54 @@ def decode_environment(data: bytes, name: str = "environment", clamp_negative: b
     return radiance
 
 
-def picture_size(head: bytes) -> tuple[int, int] | None:
-    """Width and height that the first 64 kB of an OpenEXR or Radiance HDR file claim; None where they say nothing of it."""
-    window = b"dataWindow\0box2i\0"
-    at = head.find(window)
-    if head[:4] == b"\x76\x2f\x31\x01" and at >= 0 and len(head) >= at + len(window) + 20:
-        left, top, right, bottom = struct.unpack_from("<4i", head, at + len(window) + 4)
-        return right - left + 1, bottom - top + 1
-    said = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", head) if head[:2] == b"#?" else None
-    return None if said is None else (int(said[2]), int(said[1]))
+def picture_claim(stream: IO[bytes]) -> PictureClaim | None:
+    """What the header of an OpenEXR or Radiance HDR file claims, as the decoders read it; None where it says nothing that they would take.
+
+    Args:
+        stream: at the file's beginning; no more than its header is read.
+    """
+    head = stream.read(8)
+    if head[:4] == b"\x76\x2f\x31\x01":
+        return _exr_claim(stream)
+    try:
+        height, width, _ = _hdr_size(head + stream.read(_HEAD_BYTES), "")
+    except ValueError:
+        return None
+    return PictureClaim(width, height, 3)
+
+
+def _exr_claim(stream: IO[bytes]) -> PictureClaim | None:
+    """By the attributes of the first header one by one: what looks like one may be a part of another, and comments may be of any length."""
+
+    def text() -> bytes:
+        found = bytearray()
+        while (byte := stream.read(1)) not in (b"", b"\0") and len(found) < _LONGEST_NAME:
+            found += byte
+        return bytes(found)
+
+    sizes: list[tuple[int, int]] = []
+    channels = 0
+    for _ in range(_MOST_ATTRIBUTES):
+        name = text()
+        if not name:
+            break
+        kind, length = text(), stream.read(4)
+        if len(length) < 4 or (size := struct.unpack("<i", length)[0]) < 0:
+            return None
+        if name == b"dataWindow" and size == 16 and len(window := stream.read(16)) == 16:
+            left, top, right, bottom = struct.unpack("<4i", window)
+            sizes.append((right - left + 1, bottom - top + 1))
+        elif kind == b"chlist":
+            end = stream.tell() + size
+            while stream.tell() < end and text():
+                stream.seek(16, 1)
+                channels += 1
+            stream.seek(end)
+        else:
+            stream.seek(size, 1)
+    if len(sizes) != 1 or min(sizes[0]) < 1:
+        return None
+    return PictureClaim(*sizes[0], channels)
 
 
 def encode_environment(radiance: np.ndarray) -> bytes:
@@ -110,20 +178,22 @@ def encode_maps(
     return encode_exr({key: np.where(nothing, np.float32(empty[key]), values) for key, values in channels.items()})
 
 
-def decode_exr(data: bytes, name: str = "EXR") -> dict[str, np.ndarray]:
+def decode_exr(data: bytes, name: str = "EXR", limits: PictureLimits | None = None) -> dict[str, np.ndarray]:
     """Channel name -> (height, width) float32.
+
+    Args:
+        limits: as large as is read anywhere where None.
 
     Raises:
         ValueError: damaged, too large, deep, of several parts, or with subsampled channels.
     """
+    limits = limits or PictureLimits()
     try:
         with OpenEXR.File(io.BytesIO(data), separate_channels=True, header_only=True) as head:
             parts, window = len(head.parts), head.header()["dataWindow"]
             kind, channels = head.header()["type"], head.header()["channels"]
         width, height = (int(window[1][k]) - int(window[0][k]) + 1 for k in (0, 1))
-        if not (0 < width <= MAX_WIDTH and 0 < height <= MAX_HEIGHT):
-            raise ValueError(f"{name}: is {width}x{height}; the limit is {MAX_WIDTH}x{MAX_HEIGHT}")
-        _check_claim(width * height * len(channels) * 4, len(data), f"{name}: {width}x{height} with {len(channels)} channels")
+        _check_claim(PictureClaim(width, height, len(channels)), len(data), limits, name)
         if (
             parts != 1
             or kind not in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
@@ -142,20 +212,20 @@ def decode_exr(data: bytes, name: str = "EXR") -> dict[str, np.ndarray]:
     return pixels
 
 
-def _decode_exr_rgb(data: bytes, name: str) -> np.ndarray:
-    channels = decode_exr(data, name)
+def _decode_exr_rgb(data: bytes, name: str, limits: PictureLimits | None) -> np.ndarray:
+    channels = decode_exr(data, name, limits)
     if not {"R", "G", "B"} <= set(channels):
         raise ValueError(f"{name}: has the channels {', '.join(sorted(channels))}; expected R, G, B")
     return np.stack([channels[key] for key in "RGB"], -1)
 
 
-def decode_hdr(data: bytes, name: str = "HDR") -> np.ndarray:
-    """(height, width, 3) linear values of a Radiance RGBE picture stored top to bottom, left to right.
+def _hdr_size(data: bytes, name: str) -> tuple[int, int, int]:
+    """Height, width, and where the pixels begin.
 
     Raises:
-        ValueError: damaged, XYZE, another orientation, or too large.
+        ValueError: no header, XYZE, or another orientation.
     """
-    end = data.find(b"\n\n", 0, 65536)
+    end = data.find(b"\n\n", 0, _HEAD_BYTES)
     line_end = data.find(b"\n", end + 2, end + 200)
     if not data.startswith((b"#?RADIANCE", b"#?RGBE")) or end < 0 or line_end < 0:
         raise ValueError(f"{name}: is not a Radiance HDR file (no header)")
@@ -165,14 +235,23 @@ def decode_hdr(data: bytes, name: str = "HDR") -> np.ndarray:
     resolution = data[end + 2 : line_end].decode("ascii", "replace").split()
     match resolution:
         case ["-Y", rows, "+X", columns] if rows.isdigit() and columns.isdigit():
-            height, width = int(rows), int(columns)
+            return int(rows), int(columns), line_end + 1
         case _:
             raise ValueError(f"{name}: has the resolution line {' '.join(resolution)!r}; expected '-Y height +X width'")
-    if not (0 < width <= MAX_WIDTH and 0 < height <= MAX_HEIGHT):
-        raise ValueError(f"{name}: is {width}x{height}; the limit is {MAX_WIDTH}x{MAX_HEIGHT}")
-    _check_claim(width * height * 12, len(data), f"{name}: {width}x{height}")
+
+
+def decode_hdr(data: bytes, name: str = "HDR", limits: PictureLimits | None = None) -> np.ndarray:
+    """(height, width, 3) linear values of a Radiance RGBE picture stored top to bottom, left to right.
+
+    Args:
+        limits: as large as is read anywhere where None.
+
+    Raises:
+        ValueError: damaged, XYZE, another orientation, or too large.
+    """
+    height, width, position = _hdr_size(data, name)
+    _check_claim(PictureClaim(width, height, 3), len(data), limits or PictureLimits(), name)
     radiance = np.empty((height, width, 3), np.float32)
-    position = line_end + 1
     for first in range(0, height, _ROWS_AT_ONCE):  # never all of them as bytes, exponents and floats at a time
         rgbe = np.empty((min(_ROWS_AT_ONCE, height - first), width, 4), np.uint8)
         for row in range(len(rgbe)):
@@ -187,19 +266,22 @@ def decode_hdr(data: bytes, name: str = "HDR") -> np.ndarray:
     return radiance
 
 
-def _check_claim(claimed_bytes: int, file_bytes: int, what: str) -> None:
+def _check_claim(claim: PictureClaim, file_bytes: int, limits: PictureLimits, name: str) -> None:
     """
-    Args:
-        claimed_bytes: that the picture would take in memory by what its header says.
-
     Raises:
-        ValueError: they are more than is read, or than a file of this size can hold.
+        ValueError: the picture would be larger than is read, or than a file of this size can hold.
     """
-    if claimed_bytes > MOST_BYTES:
-        raise ValueError(f"{what} take {claimed_bytes} bytes in memory; the limit is {MOST_BYTES}")
-    if claimed_bytes > FREE_BYTES and claimed_bytes > MOST_TIMES_ITS_SIZE * file_bytes:
+    size = f"{claim.width}x{claim.height}"
+    if not (0 < claim.width <= limits.width and 0 < claim.height <= limits.height):
+        raise ValueError(f"{name}: is {size}; the limit is {limits.width}x{limits.height}: make it smaller")
+    what, claimed = f"{name}: {size}", claim.width * claim.height * claim.channels * 4
+    if claim.channels > 3:
+        what += f" with {claim.channels} channels"
+    if claimed > limits.bytes:
+        raise ValueError(f"{what} take {claimed} bytes in memory; the limit is {limits.bytes}")
+    if claimed > FREE_BYTES and claimed > MOST_TIMES_ITS_SIZE * file_bytes:
         raise ValueError(
-            f"{what} take {claimed_bytes} bytes in memory, more than {MOST_TIMES_ITS_SIZE} times the file's {file_bytes}; it is damaged"
+            f"{what} take {claimed} bytes in memory, more than {MOST_TIMES_ITS_SIZE} times the file's {file_bytes}; it is damaged"
         )
 
 

@@ -1,10 +1,11 @@
+import io
 import tracemalloc
 
 import numpy as np
 import OpenEXR
 import pytest
 
-from drgs.exchange.exr import decode_environment, decode_exr, decode_hdr, encode_environment, encode_exr, encode_maps, picture_size
+from drgs.exchange.exr import decode_environment, decode_exr, decode_hdr, encode_environment, encode_exr, encode_maps, picture_claim
 
 
 def sky(height: int = 4) -> np.ndarray:
@@ -154,7 +155,24 @@ def test_rows_that_are_turned_into_floats_a_few_at_a_time_are_the_same() -> None
     np.testing.assert_array_equal(found, exact.astype(np.float32))
 
 
+def claim_of(data: bytes) -> tuple[int, int, int] | None:
+    claim = picture_claim(io.BytesIO(data))
+    return None if claim is None else (claim.width, claim.height, claim.channels)
+
+
 def test_a_size_is_read_from_the_head_of_either_format() -> None:
-    assert picture_size(old_runs(512, 32)) == (512, 32)
-    assert picture_size(encode_environment(np.ones((8, 16, 3), np.float32))) == (16, 8)
-    assert picture_size(b"nonsense") is None and picture_size(b"#?RADIANCE\n\n") is None
+    assert claim_of(old_runs(512, 32)) == (512, 32, 3)
+    assert claim_of(encode_environment(np.ones((8, 16, 3), np.float32))) == (16, 8, 3)
+    assert claim_of(b"nonsense") is None and claim_of(b"#?RADIANCE\n\n") is None and claim_of(b"") is None
+
+
+def test_a_size_is_found_behind_whatever_a_header_holds(tmp_path) -> None:
+    """What the decoder would read counts, not what looks like it."""
+    channels = {key: np.ones((8, 16), np.float32) for key in "RGBA"}
+    for comment in ("x" * 100_000, "dataWindow\0box2i\0\x10\0\0\0" + "\0" * 16):
+        OpenEXR.File({"type": OpenEXR.scanlineimage, "a comment": comment}, channels).write(str(tmp_path / "a.exr"))
+        data = (tmp_path / "a.exr").read_bytes()
+        assert claim_of(data) == (16, 8, 4) and decode_exr(data)["R"].shape == (8, 16)
+    spaced = old_runs(512, 256).replace(b"-Y 256 +X 512\n", b"-Y  256 +X 512 \n")
+    assert claim_of(spaced) == (512, 256, 3) and decode_hdr(spaced).shape == (256, 512, 3)
+    assert claim_of(data[:60]) is None

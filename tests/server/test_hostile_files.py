@@ -34,14 +34,21 @@ class Evil:
 PICKLE = pickle.dumps(Evil(), protocol=4)
 
 
-def exr(width: int = 4, height: int = 2, window: tuple[int, int, int, int] | None = None, value: float = 1.0) -> bytes:
+def exr(
+    width: int = 4,
+    height: int = 2,
+    window: tuple[int, int, int, int] | None = None,
+    value: float = 1.0,
+    keys: str = "RGB",
+    comment: str = "",
+) -> bytes:
     stream = io.BytesIO()
-    channels = {key: np.full((height, width), value, np.float32) for key in "RGB"}
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(stream)
+    channels = {key: np.full((height, width), value, np.float32) for key in keys}
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "a comment": comment}, channels).write(stream)
     data = bytearray(stream.getvalue())
     if window is not None:
         for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
-            at = data.index(name) + len(name) + 4
+            at = data.rindex(name) + len(name) + 4
             struct.pack_into("<4i", data, at, *window)
     return bytes(data)
 
@@ -127,6 +134,16 @@ ENVIRONMENTS: dict[str, bytes] = {
     "larger than a service takes.hdr": hdr(b"-Y 5000 +X 10000\n", bytes(1 << 20)),
     "a run longer than its row.hdr": hdr(b"-Y 8 +X 16\n", b"\2\2\0\x10" + b"\xff\1" * 400),
 }
+LARGE: dict[str, bytes] = {
+    "plain.hdr": hdr(b"-Y 5000 +X 10000\n", bytes(1 << 20)),
+    "with more blanks.hdr": hdr(b"-Y  5000   +X 10000 \n", bytes(1 << 20)),
+    "plain.exr": exr(window=(0, 0, 9999, 4999)) + bytes(1 << 20),
+    "behind a long comment.exr": exr(window=(0, 0, 9999, 4999), comment="x" * 70_000) + bytes(1 << 20),
+    "behind a comment that says otherwise.exr": exr(window=(0, 0, 9999, 4999), comment="dataWindow\0box2i\0\x10\0\0\0" + "\0" * 16)
+    + bytes(1 << 20),
+    "in five channels.exr": exr(window=(0, 0, 8191, 4095), keys="RGBAZ") + bytes(1 << 20),
+}
+"""Environments beyond the largest one that a service takes, which other doors read."""
 MESHES: dict[str, bytes] = {
     "nothing.ply": b"",
     "a pickle.ply": PICKLE,
@@ -196,6 +213,11 @@ def test_a_hostile_environment_is_refused(refuse: Callable[[str, str, bytes], st
     refuse("environment", name, ENVIRONMENTS[name])
 
 
+@pytest.mark.parametrize("name", LARGE)
+def test_an_environment_beyond_what_a_service_takes_is_refused_by_its_header(refuse: Callable[[str, str, bytes], str], name: str) -> None:
+    assert "the limit is" in refuse("environment", name, LARGE[name])
+
+
 @pytest.mark.parametrize("name", MESHES)
 def test_a_hostile_asset_or_mesh_is_refused(refuse: Callable[[str, str, bytes], str], name: str) -> None:
     refuse("asset", name, MESHES[name])
@@ -204,8 +226,10 @@ def test_a_hostile_asset_or_mesh_is_refused(refuse: Callable[[str, str, bytes], 
 def test_the_memory_of_an_environment_is_estimated_by_what_its_header_claims(tmp_path: Path) -> None:
     (tmp_path / "small.hdr").write_bytes(hdr())
     (tmp_path / "large.hdr").write_bytes(hdr(b"-Y 4096 +X 8192\n", b""))
-    small, large = (file_tool.file_tool_bytes(tmp_path / f"{name}.hdr") for name in ("small", "large"))
-    assert small < 128 << 20 < 1 << 30 < large < 2 << 30
+    (tmp_path / "spaced.hdr").write_bytes(hdr(b"-Y  4096 +X 8192 \n", b""))
+    (tmp_path / "unclear.hdr").write_bytes(hdr(b"-Y many +X 8192\n", b""))
+    small, *large = (file_tool.file_tool_bytes(tmp_path / f"{name}.hdr") for name in ("small", "large", "spaced", "unclear"))
+    assert small < 128 << 20 and all(1 << 30 < one < 2 << 30 for one in large)
 
 
 def test_the_tool_cannot_take_more_memory_than_its_limit() -> None:

@@ -182,10 +182,10 @@ def exr_size(path: Path) -> tuple[int, int]:
     Raises:
         ValueError: no EXR, or its header has no dataWindow.
     """
-    from drgs.exchange.exr import picture_size
+    from drgs.exchange.exr import picture_claim
 
     with path.open("rb") as file:
-        size = picture_size(file.read(65536))
-    if size is None:
+        claim = picture_claim(file)
+    if claim is None:
         raise ValueError(f"{path.name}: expected an OpenEXR file with a dataWindow in its header")
-    return size
+    return claim.width, claim.height

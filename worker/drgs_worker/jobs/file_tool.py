@@ -38,9 +38,14 @@ ENVIRONMENT_BYTES = 96 << 20
 """Of the tool while it reads an environment, for which it needs no torch, without any pixels."""
 PIXEL_BYTES = 36
 """Of a pixel of an environment: read, looked at, and written."""
-MOST_ENVIRONMENT_PIXELS = 8192 * 4096
+CHANNEL_BYTES = 8
+"""Of a pixel in each channel more than its three, which are read and thrown away."""
+MOST_ENVIRONMENT_SIDES = (8192, 4096)
 """Of an environment that a service takes: 1.2 GiB while it is read, and 400 MB in memory while something is lit by it."""
-HEAD_BYTES = 1 << 16
+MOST_CHANNEL_BYTES = 512 << 20
+"""Of all its channels as float32: four of the largest size, or more of a smaller."""
+MOST_ENVIRONMENT_FILE = 640 << 20
+"""Bytes of its file: such channels without any packing, and a long header."""
 
 
 class FileToolError(ValueError):
@@ -49,18 +54,21 @@ class FileToolError(ValueError):
 
 def file_tool_bytes(source: Path) -> int:
     """Memory that the tool takes to work on a file or a folder, estimated: what it is written in, and a few copies of what the source holds."""
-    if source.suffix in (".exr", ".hdr"):
-        width, height = _claimed_size(source) or (0, 0)
-        return ENVIRONMENT_BYTES + PIXEL_BYTES * min(max(width * height, 0), MOST_ENVIRONMENT_PIXELS)
     size = source.stat().st_size if source.is_file() else sum(path.stat().st_size for path in source.rglob("*") if path.is_file())
+    if source.suffix in (".exr", ".hdr"):
+        return ENVIRONMENT_BYTES + min(size, MOST_ENVIRONMENT_FILE) + _pixel_bytes(source)
     return TOOL_BYTES + COPIES * size
 
 
-def _claimed_size(picture: Path) -> tuple[int, int] | None:
-    from drgs.exchange.exr import picture_size
+def _pixel_bytes(picture: Path) -> int:
+    """What decoding a picture takes by its header; the most that any may take where that says nothing, for then the decoder has the last word."""
+    from drgs.exchange.exr import picture_claim
 
     with picture.open("rb") as file:
-        return picture_size(file.read(HEAD_BYTES))
+        claim = picture_claim(file)
+    width, height = MOST_ENVIRONMENT_SIDES
+    most = width * height * PIXEL_BYTES
+    return most if claim is None else min(most, claim.width * claim.height * (PIXEL_BYTES + CHANNEL_BYTES * max(claim.channels - 3, 0)))
 
 
 async def run_file_tool(*arguments: str) -> None:
@@ -149,12 +157,13 @@ def edited_asset(asset_folder: Path, edits: Path, environments: Path, version: i
 
 
 def make_environment(source: Path, out: Path) -> None:
-    from drgs.exchange.exr import decode_environment, encode_environment
+    from drgs.exchange.exr import PictureLimits, decode_environment, encode_environment
 
-    width, height = _claimed_size(source) or (0, 0)
-    if width * height > MOST_ENVIRONMENT_PIXELS:
-        raise ValueError(f"{source}: is {width}x{height}; a service takes environments of at most 8192x4096: make it smaller")
-    out.write_bytes(encode_environment(decode_environment(source.read_bytes(), source.name)))
+    size = source.stat().st_size
+    if size > MOST_ENVIRONMENT_FILE:
+        raise ValueError(f"{source}: has {size} bytes; the limit for an environment is {MOST_ENVIRONMENT_FILE}: make it smaller")
+    limits = PictureLimits(*MOST_ENVIRONMENT_SIDES, MOST_CHANNEL_BYTES)
+    out.write_bytes(encode_environment(decode_environment(source.read_bytes(), source.name, limits=limits)))
 
 
 def export(asset_folder: Path, out: Path, format: Any) -> None:
