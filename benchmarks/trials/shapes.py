@@ -4,6 +4,7 @@ import io
 import json
 import struct
 import zipfile
+import zlib
 
 import numpy as np
 import OpenEXR
@@ -91,6 +92,51 @@ def glb(document: dict, binary: bytes) -> bytes:
     binary += b"\0" * (-len(binary) % 4)
     chunks = struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(binary), 0x004E4942) + binary
     return struct.pack("<3I", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+
+def claiming_png(side: int) -> bytes:
+    """A square picture of nothing, a thousandth of what it takes in memory."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    packer, rows = zlib.compressobj(1), side
+    packed, many = b"", bytes(100 * (1 + 3 * side))
+    while rows:
+        packed += packer.compress(many[: min(rows, 100) * (1 + 3 * side)])
+        rows -= min(rows, 100)
+    head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", packed + packer.flush()) + chunk(b"IEND", b"")
+
+
+def textured_glb(picture: bytes) -> bytes:
+    """A ball under a picture, whatever that is."""
+    vertices, faces = ball(6)
+    views = [
+        vertices.tobytes(),
+        (vertices[:, :2] / 2 + 0.5).tobytes(),
+        faces.astype("<u4").tobytes(),
+        picture + b"\0" * (-len(picture) % 4),
+    ]
+    ends = np.cumsum([0, *(len(view) for view in views)]).tolist()
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": 3, "mimeType": "image/png"}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(vertices), "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5126, "count": len(vertices), "type": "VEC2"},
+            {"bufferView": 2, "componentType": 5125, "count": int(faces.size), "type": "SCALAR"},
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": start, "byteLength": len(view)} for start, view in zip(ends, views, strict=False)],
+        "buffers": [{"byteLength": ends[-1]}],
+    }
+    return glb(document, b"".join(views))
 
 
 def sparse_glb() -> bytes:

@@ -8,7 +8,20 @@ from functools import partial
 import numpy as np
 
 from benchmarks.trials.changes import finite_picture
-from benchmarks.trials.shapes import ball, claiming_exr, exr, glb, hdr, hdr_of_repeats, obj, ply, sparse_glb, zipped
+from benchmarks.trials.shapes import (
+    ball,
+    claiming_exr,
+    claiming_png,
+    exr,
+    glb,
+    hdr,
+    hdr_of_repeats,
+    obj,
+    ply,
+    sparse_glb,
+    textured_glb,
+    zipped,
+)
 from benchmarks.trials.site import Site, Trial
 from benchmarks.trials.watch import MemoryWatch
 
@@ -102,6 +115,11 @@ MESHES: dict[str, tuple[str, Callable[[], bytes], bool]] = {
         "a.glb", lambda: _triangle_glb(accessors=[{"bufferView": 0, "componentType": 5126, "count": 10**400, "type": "VEC3"}]), False,
     ),
     "a file elsewhere": ("a.glb", lambda: _triangle_glb(buffers=[{"byteLength": 36, "uri": "file:///etc/passwd"}]), False),
+    "a texture of 169 megapixels": ("a.glb", lambda: textured_glb(claiming_png(13_000)), False),
+    "a texture of 67 megapixels": ("a.glb", lambda: textured_glb(claiming_png(8192)), False),
+    "a texture that is none": ("a.glb", lambda: textured_glb(b"<svg/>"), False),
+    "nodes in a circle": ("a.glb", lambda: _triangle_glb(nodes=[{"children": [1]}, {"children": [0], "mesh": 0}]), False),
+    "corners of an OBJ from 0": ("a.obj", lambda: b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", False),
     "deep JSON": ("a.glb", lambda: b"glTF" + struct.pack("<4I", 2, 20 + 200_000, 200_000, 0x4E4F534A) + b"[" * 200_000, False),
     "an OBJ of one line": ("a.obj", lambda: b"f 1 2 3 " * 500_000, False),
     "an OBJ without corners": ("a.obj", lambda: b"v 0 0 0\nf 1 1 1\n", False),

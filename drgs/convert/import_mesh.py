@@ -7,9 +7,12 @@ definition and is turned to z up; PLY and OBJ coordinates are taken as they are.
 the OBJ. Splats of a GLB become Gaussians that are bound to the mesh (import_splats).
 """
 
+import io
 import json
+import re
 import struct
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +22,13 @@ import torch
 import trimesh
 from jaxtyping import Float, Int, Shaped
 from numpy import ndarray
+from PIL import Image
 from torch import Tensor
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from drgs.convert.import_splats import import_splats
+from drgs.convert.sample_textures import Textures
 from drgs.exchange.gltf_accessors import open_gltf
-from drgs.exchange.pictures import as_eight_bits
 from drgs.exchange.ply import parse_ply, triangles_from_faces
 from drgs.maths.color import linear_from_srgb
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
@@ -35,9 +39,9 @@ from drgs.scene.mesh import TriangleMesh, refuse_unusable, vertex_normals
 
 MAX_BYTES = 2 << 30
 MAX_VERTICES = 20_000_000
-MAX_TEXTURE_PIXELS = 1 << 28
 ENVIRONMENT_HEIGHT = 16
 """Of the constant light an imported mesh gets; any size says the same."""
+_CORNER_ZERO = re.compile(rb"^f[ \t](?:.*?[ \t])?0+(?=[/ \t\r]|$)", re.MULTILINE)
 _TRIANGLE_FAN = 6
 """Mode of a glTF primitive."""
 
@@ -161,26 +165,46 @@ def _read_ply(path: Path) -> list[_Part]:
 
 def _read_glb(path: Path) -> list[_Part]:
     data, factors = _glb_with_numbered_materials(path)
-    try:
-        scene = trimesh.load_scene(trimesh.util.wrap_as_stream(data), file_type="glb", resolver=_BesideResolver(None), process=False)
-    except Exception as error:  # trimesh lets whatever a damaged file provokes escape
-        raise ValueError(f"{path}: is not a readable GLB ({error!r})") from error
+
+    def load() -> trimesh.Scene:
+        return trimesh.load_scene(trimesh.util.wrap_as_stream(data), file_type="glb", resolver=_BesideResolver(None), process=False)
+
     z_up_from_y_up = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    return _parts_from_scene(scene, z_up_from_y_up, factors, str(path))
+    return _parts_of(load, z_up_from_y_up, factors, path, "GLB")
 
 
 def _read_obj(path: Path) -> list[_Part]:
+    text, beside = _utf8(path.read_bytes()), _BesideResolver(path.parent)
+    corner = _CORNER_ZERO.search(text)
+    if corner is not None:
+        raise ValueError(f"{path}: the face {corner[0][:60]!r} names vertex 0; vertices of an OBJ count from 1")
+
+    def load() -> trimesh.Scene:
+        stream = trimesh.util.wrap_as_stream(text)
+        return trimesh.load_scene(stream, file_type="obj", resolver=beside, process=False, maintain_order=True)
+
+    parts = _parts_of(load, np.eye(4), {}, path, "OBJ")
+    if beside.unreadable:
+        raise ValueError(f"{path}: its texture {beside.unreadable[0][:100]!r} is damaged, or no picture that is read here")
+    return parts
+
+
+def _parts_of(
+    load: Callable[[], trimesh.Scene], root: Float[ndarray, "4 4"], factors: dict[str, dict], path: Path, kind: str
+) -> list[_Part]:
     try:
-        stream = trimesh.util.wrap_as_stream(_utf8(path.read_bytes()))
-        scene = trimesh.load_scene(stream, file_type="obj", resolver=_BesideResolver(path.parent), process=False, maintain_order=True)
-    except Exception as error:  # as above
-        raise ValueError(f"{path}: is not a readable OBJ ({error!r})") from error
-    return _parts_from_scene(scene, np.eye(4), {}, str(path))
+        return _parts_from_scene(load(), root, factors, str(path))
+    except MemoryError:
+        raise
+    except Exception as error:  # trimesh lets whatever a damaged file provokes escape
+        if isinstance(error, ValueError) and str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: is not a readable {kind} ({error!r})") from error
 
 
 def _parts_from_scene(scene: trimesh.Scene, root: Float[ndarray, "4 4"], factors: dict[str, dict], name: str) -> list[_Part]:
     """Every triangle mesh under every node, moved to world space."""
-    parts = []
+    parts, textures = [], Textures(name)
     rank = {key: k for k, key in enumerate(scene.geometry)}
     for node in sorted(
         scene.graph.nodes_geometry, key=lambda node: (rank[scene.graph[node][1]], str(node))
@@ -194,7 +218,7 @@ def _parts_from_scene(scene: trimesh.Scene, root: Float[ndarray, "4 4"], factors
         world_from_mesh = root @ matrix
         linear = world_from_mesh[:3, :3]
         normals = mesh._cache["vertex_normals"]  # None unless the file has them; the property would compute them
-        albedo, roughness, metallic = _vertex_materials(mesh, factors, name)
+        albedo, roughness, metallic = _vertex_materials(mesh, factors, textures, name)
         faces = mesh.faces[:, ::-1] if np.linalg.det(linear) < 0 else mesh.faces
         part = _Part(mesh.vertices @ linear.T + world_from_mesh[:3, 3], faces, None, albedo, roughness, metallic)
         if normals is not None:
@@ -205,11 +229,13 @@ def _parts_from_scene(scene: trimesh.Scene, root: Float[ndarray, "4 4"], factors
 
 
 def _vertex_materials(
-    mesh: trimesh.Trimesh, factors: dict[str, dict], name: str
+    mesh: trimesh.Trimesh, factors: dict[str, dict], textures: Textures, name: str
 ) -> tuple[Float[ndarray, "vertex 3"], Float[ndarray, "vertex"], Float[ndarray, "vertex"]]:
     count = len(mesh.vertices)
     own: Any = mesh.vertex_attributes
     visual: Any = mesh.visual
+    if {"_ALBEDO", "_ROUGHNESS", "_METALLIC"} <= set(own):
+        return own["_ALBEDO"].reshape(count, 3), own["_ROUGHNESS"].reshape(count), own["_METALLIC"].reshape(count)
     albedo = np.full((count, 3), DEFAULT_ALBEDO)
     roughness, metallic = np.full(count, DEFAULT_ROUGHNESS), np.full(count, DEFAULT_METALLIC)
     material, uv = getattr(visual, "material", None), getattr(visual, "uv", None)
@@ -217,10 +243,11 @@ def _vertex_materials(
         exact = factors.get(str(material.name), {})
         albedo[:] = exact.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])[:3]
         roughness[:], metallic[:] = exact.get("roughnessFactor", 1.0), exact.get("metallicFactor", 1.0)
-        if uv is not None and material.baseColorTexture is not None:
-            albedo *= _linear(_sample_texture(material.baseColorTexture, _texture_uv(uv, exact.get("baseColorTexture"), name), name)[:, :3])
-        if uv is not None and material.metallicRoughnessTexture is not None:
-            texels = _sample_texture(material.metallicRoughnessTexture, _texture_uv(uv, exact.get("metallicRoughnessTexture"), name), name)
+        # What the file names counts, not what trimesh found: it passes over a picture that it cannot open.
+        if uv is not None and "baseColorTexture" in exact:
+            albedo *= _linear(textures.sample(material.baseColorTexture, _texture_uv(uv, exact["baseColorTexture"], name)))
+        if uv is not None and "metallicRoughnessTexture" in exact:
+            texels = textures.sample(material.metallicRoughnessTexture, _texture_uv(uv, exact["metallicRoughnessTexture"], name))
             roughness, metallic = roughness * texels[:, 1], metallic * texels[:, 2]
         colors = visual.vertex_attributes.get("color")
         if colors is not None:
@@ -228,14 +255,12 @@ def _vertex_materials(
             albedo *= np.asarray(colors, np.float64)[:, :3] / scale  # COLOR_0 is linear
     elif isinstance(material, SimpleMaterial) and visual.defined:
         if uv is not None and material.image is not None:
-            albedo = _linear(_sample_texture(material.image, uv, name)[:, :3])
+            albedo = _linear(textures.sample(material.image, uv))
         elif material.diffuse is not None:
             albedo[:] = np.asarray(material.diffuse, np.float64)[:3] / 255
     elif visual.kind == "vertex":
         colors = np.asarray(visual.vertex_colors, np.float64)[:, :3] / 255
         albedo = colors if factors else _linear(colors)  # linear in glTF, as on the screen in OBJ
-    if {"_ALBEDO", "_ROUGHNESS", "_METALLIC"} <= set(own):
-        albedo, roughness, metallic = own["_ALBEDO"].reshape(count, 3), own["_ROUGHNESS"].reshape(count), own["_METALLIC"].reshape(count)
     return albedo, roughness, metallic
 
 
@@ -256,27 +281,6 @@ def _texture_uv(uv: Float[ndarray, "vertex 2"], use: object, name: str) -> Float
         return uv
     (scale_u, scale_v), (offset_u, offset_v) = transform.get("scale", (1, 1)), transform.get("offset", (0, 0))
     return np.stack([uv[:, 0] * scale_u + offset_u, 1 - ((1 - uv[:, 1]) * scale_v + offset_v)], -1)
-
-
-def _sample_texture(image: Any, uv: Float[ndarray, "vertex 2"], name: str) -> Float[ndarray, "vertex 3"]:
-    """(vertex, 3) bilinear values in 0..1, repeating; uv has its origin at the lower left, as trimesh turns it."""
-    width, height = image.size
-    if width * height > MAX_TEXTURE_PIXELS:
-        raise ValueError(f"{name}: has a texture of {width}x{height} pixels; the limit is {MAX_TEXTURE_PIXELS} pixels")
-    try:
-        texels = np.asarray(as_eight_bits(image).convert("RGB"), np.float32) / 255
-    except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises for damaged pictures
-        raise ValueError(f"{name}: holds a damaged texture ({error})") from error
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise ValueError(f"{name}: holds texture coordinates that are not finite")
-    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-
-    def row(y_index: Int[ndarray, "vertex"]) -> Float[ndarray, "vertex 3"]:
-        return texels[y_index % height, x0 % width] * (1 - fx) + texels[y_index % height, (x0 + 1) % width] * fx
-
-    return row(y0) * (1 - fy) + row(y0 + 1) * fy
 
 
 def _join_seams(part: _Part) -> _Part:
@@ -369,13 +373,21 @@ class _BesideResolver(trimesh.resolvers.Resolver):
 
     def __init__(self, folder: Path | None):
         self.folder = folder
+        self.unreadable: list[str] = []
+        """Pictures that trimesh will pass over in silence."""
 
     def get(self, key: str) -> bytes:
         file = Path(key.strip())
         if self.folder is None or file.name != str(file) or not (self.folder / file).is_file():
             raise ValueError(f"{key!r} is not a file beside the mesh")
         data = (self.folder / file).read_bytes()
-        return _utf8(data) if file.suffix.lower() == ".mtl" else data
+        if file.suffix.lower() == ".mtl":
+            return _utf8(data)
+        try:
+            Image.open(io.BytesIO(data))
+        except Exception:  # whatever a damaged picture provokes; the reader says so
+            self.unreadable.append(key.strip())
+        return data
 
     def write(self, name: str, data: bytes) -> None:
         raise ValueError("a mesh is read here, not written")

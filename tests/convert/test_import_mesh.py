@@ -1,6 +1,7 @@
 import io
 import json
 import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from drgs.convert import sample_textures
 from drgs.convert.import_mesh import import_mesh
 from drgs.exchange.glb import decode_glb
 from drgs.exchange.ply import encode_ply
@@ -312,3 +314,106 @@ def test_a_vertex_far_away_is_refused(tmp_path):
     (tmp_path / "a.ply").write_bytes(encode_ply(columns, FACES))
     with pytest.raises(ValueError, match=r"a vertex at 1e\+30; expected coordinates up to 1e\+09"):
         import_mesh(tmp_path / "a.ply")
+
+
+def with_picture(picture: bytes) -> bytes:
+    """The tetrahedron under a texture of these bytes, whatever they are."""
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+        INDICES,
+        {"bufferView": 2, "componentType": 5126, "count": 4, "type": "VEC2"},
+    ]
+    return glb_of(
+        accessors,
+        [VERTICES.tobytes(), FACES.astype("<u4").tobytes(), SIDES.tobytes(), picture + b"\0" * (-len(picture) % 4)],
+        {"POSITION": 0, "TEXCOORD_0": 2},
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        textures=[{"source": 0}],
+        images=[{"bufferView": 3, "mimeType": "image/png"}],
+    )
+
+
+def png(width: int = 8, height: int = 4, mode: str = "L") -> bytes:
+    stream = io.BytesIO()
+    Image.new(mode, (width, height), 255).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def claiming_png(width: int, height: int) -> bytes:
+    """A few bytes that claim many pixels."""
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = [(b"IHDR", head), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
+
+
+@pytest.mark.parametrize(
+    ("picture", "words"),
+    [
+        (b"<svg/>", "names a texture that cannot be read"),
+        (png()[:20], "names a texture that cannot be read"),
+        (png()[:-30], "damaged texture"),
+        (claiming_png(20_000, 20_000), "names a texture that cannot be read"),
+        (claiming_png(12_000, 12_000), "the limit is 134217728"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+def test_a_texture_is_read_or_refused_and_never_left_out(picture, words, tmp_path):
+    (tmp_path / "a.glb").write_bytes(with_picture(picture))
+    with pytest.raises(ValueError, match=words):
+        import_mesh(tmp_path / "a.glb")
+
+
+def test_all_textures_of_a_file_count_together(monkeypatch):
+    monkeypatch.setattr(sample_textures, "MAX_TEXTURE_PIXELS", 70)
+    first, second = (Image.new("RGB", (8, 4)) for _ in range(2))
+    textures = sample_textures.Textures("a.glb")
+    for image in (first, second, first):
+        textures.sample(image, SIDES)
+    with pytest.raises(ValueError, match=r"a\.glb: has a texture of 8x4 pixels, with which its textures have 96"):
+        textures.sample(Image.new("RGB", (8, 4)), SIDES)
+
+
+def test_a_tall_texture_is_sampled_as_a_whole_one_would_be():
+    """Bands are of no matter to what lies on both sides of their borders."""
+    texels = np.random.default_rng(0).integers(0, 256, (600, 5, 3), np.uint8)
+    uv = np.random.default_rng(1).uniform(-1, 2, (5000, 2))
+    x, y = uv[:, 0] * 5 - 0.5, (1 - uv[:, 1]) * 600 - 0.5
+    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    weights = [(1 - x + x0) * (1 - y + y0), (x - x0) * (1 - y + y0), (1 - x + x0) * (y - y0), (x - x0) * (y - y0)]
+    places = [(y0, x0), (y0, x0 + 1), (y0 + 1, x0), (y0 + 1, x0 + 1)]
+    expected = sum(w[:, None] * texels[row % 600, column % 5] / 255 for w, (row, column) in zip(weights, places, strict=True))
+    np.testing.assert_allclose(sample_textures.Textures("a").sample(Image.fromarray(texels), uv), expected, atol=1e-5)
+
+
+def test_a_damaged_picture_beside_an_obj_is_named_and_a_missing_one_is_not_missed(tmp_path):
+    lines = [f"v {x} {y} {z}" for x, y, z in VERTICES] + ["vt 0.5 0.5"] + [f"f {a + 1}/1 {b + 1}/1 {c + 1}/1" for a, b, c in FACES]
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl m\n" + "\n".join(lines) + "\n")
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 1 0 0\nmap_Kd wood.png\n")
+    assert import_mesh(tmp_path / "a.obj").mesh.albedo[0].tolist() == [1, 0, 0]
+    (tmp_path / "wood.png").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match=r"its texture 'wood\.png' is damaged"):
+        import_mesh(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 0", "f 1/1 0/2 2/3", "f 1 00 3 2", "f 1 2 3 0//1"])
+def test_vertex_0_of_an_obj_is_no_vertex(face, tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 10 0\nf 1 2 3\n" + face + "\n")
+    with pytest.raises(ValueError, match="vertices of an OBJ count from 1"):
+        import_mesh(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]},
+        {"scenes": [], "scene": 5},
+        {"accessors": [{"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC2"}, {"bufferView": 1} | INDICES]},
+    ],
+)
+def test_what_is_wrong_with_a_glb_names_the_file(changes, tmp_path):
+    accessors = [{"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"}, INDICES]
+    views = [VERTICES.tobytes(), FACES.astype("<u4").tobytes()]
+    given = changes.pop("accessors", accessors)
+    (tmp_path / "a.glb").write_bytes(glb_of(given, views, {"POSITION": 0}, **changes))
+    with pytest.raises(ValueError, match=r"a\.glb: is not a readable GLB"):
+        import_mesh(tmp_path / "a.glb")
