@@ -60,8 +60,19 @@ BODIES: dict[str, bytes] = {
     "matter that is none": b'{"edit": {"op": "simulate", "scene": {"matter": {"preset": "porridge"}}, "time": 0.1}}',
     "a mesh elsewhere": b'{"edit": {"op": "simulate", "scene": {"acts": [{"shape": {"mesh": {"file": "/etc/passwd"}}}]}, "time": 0.1}}',
 }  # fmt: skip
+CALLS: tuple[tuple[str, dict], ...] = (
+    ("/api/sessions", {"asset": "0"}),
+    ("/api/login", {"token": "x"}),
+    ("/api/jobs", {"kind": "build", "dataset": "x", "name": "n", "preset": "fast"}),
+    ("/api/jobs", {"kind": "export", "asset": "0", "formats": ["glb"]}),
+    ("/api/jobs", {"kind": "simulate", "asset": "0", "scene": {"matter": {"preset": "jelly"}}}),
+    ("/api/jobs", {"kind": "redecouple", "asset": "0", "preset": "full"}),
+    ("/api/jobs", {"kind": "render", "asset": "0", "environments": ["own"], "variants": [{"name": "a", "edits": []}]}),
+)
+ODD_TEXTS = ("\0", "\ud800", "a\0b", "~nobody-of-this-name/x", "x" * 400, "", "\u202e", "../..")
 KINDS: tuple[Any, ...] = (None, "x", [], {}, True, "1e5", [[[]]])
 RIGHT_NAMES = ("Version 1", "before", "v2", "a", "x" * 80, "Grün – süß", "日本語", "a-b_c.d (1)", "100 %", "it's", "x1f", "n", "0")
+UNSEEN_NAMES = ("\u200b", "\ufeff", "\u2060\u200e", "\u3164", "\u2800", "\u0300", "\ufe0f")
 WRONG_NAMES = ("a\nb", "a\x00b", "\x1f", "a\tb", "a\x7fb", "x" * 500, "\r", "a\u2028b", "\x85", " ", "\u202eabc")
 BAD_QUERIES: dict[str, tuple[str, ...]] = {
     "width": ("0", "-1", "15", "4097", "1e3", "NaN", "9" * 30, "", "64;rm", "0x40", "64.5", "true"),
@@ -105,6 +116,12 @@ def trials() -> Iterator[Trial]:
     for name in WRONG_NAMES:
         yield Trial("names", f"snapshot {name[:30]!r} is refused", partial(_wrong_name, name))
         yield Trial("names", f"job {name[:30]!r} is refused or cleaned", partial(_job_name, name))
+    for name in UNSEEN_NAMES:
+        yield Trial("names", f"snapshot {name!a}, which nobody sees, is refused", partial(_wrong_name, name))
+    for number, (path, document) in enumerate(CALLS):
+        yield Trial("texts", f"{path} with odd strings in call {number}", partial(_odd_texts, path, document))
+    for query in ("assets?search=%00", "assets/%00", "sessions/a%00b", "jobs/%00/log"):
+        yield Trial("texts", f"/api/{query} is no address", partial(_odd_address, f"/api/{query}"))
     for path in ("undo", "redo", "snapshots/none/restore"):
         yield Trial("bodies", f"{path} where there is nothing", partial(_nothing_to_do, path))
 
@@ -219,6 +236,27 @@ def _job_name(name: str, site: Site) -> str | None:
     site.request("POST", f"/api/jobs/{answer.document['id']}/cancel")
     shown = answer.document["name"]
     return None if shown.isprintable() and len(shown) <= 100 else f"it is shown as {shown!r}"
+
+
+def _odd_texts(path: str, document: dict, site: Site) -> str | None:
+    """In place of each string of a body."""
+
+    def places(node: Any, way: tuple = ()) -> Iterator[tuple]:
+        if isinstance(node, str):
+            yield way
+        elif isinstance(node, dict | list):
+            for key, inner in node.items() if isinstance(node, dict) else enumerate(node):
+                yield from places(inner, (*way, key))
+
+    for way in places(document):
+        for text in ODD_TEXTS:
+            if complaint := site.complaint(site.send("POST", path, replaced(document, way, text), bearer=path != "/api/login")):
+                return f"{'.'.join(map(str, way))} = {text[:20]!a}: {complaint}"
+    return None
+
+
+def _odd_address(path: str, site: Site) -> str | None:
+    return site.complaint(site.request("GET", path), {400, 404, 422})
 
 
 def _nothing_to_do(path: str, site: Site) -> str | None:

@@ -29,6 +29,19 @@ GOOD = [
     "n" * 100,
 ]
 BAD = ["", " ", ".", "..", "a/b", "a\\b", "two\nlines", "nul\0", "\x1b[2J", "\x7f", "\x85", "a\u2028b", "\u202egnp.exe", "n" * 101]
+UNSEEN = [
+    "\u200b",
+    "\ufeff",
+    "\u2060\u200e",
+    "\xad",
+    "\u3164",
+    "\u2800 \u2800",
+    "\u115f\u1160",
+    "\u0300\u0301",
+    "\ufe0f",
+    "\u034f",
+    "\U000e0041",
+]
 ADAPTER = TypeAdapter(UserName)
 
 
@@ -41,6 +54,14 @@ def test_names_that_people_choose_are_taken(name: str) -> None:
 def test_what_is_no_line_of_text_is_no_name(name: str) -> None:
     with pytest.raises(ValidationError):
         ADAPTER.validate_python(name)
+
+
+@pytest.mark.parametrize("name", UNSEEN)
+def test_what_cannot_be_seen_is_no_name(name: str) -> None:
+    """Two of them would look alike in every list."""
+    with pytest.raises(ValidationError):
+        ADAPTER.validate_python(name)
+    assert name_from_file(name, "upload") == "upload"
 
 
 @given(st.text(max_size=130))

@@ -1,6 +1,8 @@
 """What the service says when something goes wrong: short, without its own folders, and on a connection that stays open."""
 
+import copy
 import http.client
+import json
 import socket
 import threading
 import time
@@ -101,3 +103,50 @@ def test_numbers_that_cannot_be_computed_with_are_the_callers_mistake(
     monkeypatch.setattr(PaintedAsset, "pose", fail)
     response = service.client.get(f"/api/sessions/{session}/frame.jpg")
     assert response.status_code == 422 and str(error) in response.json()["detail"]
+
+
+def texts(document: object, way: tuple = ()) -> Iterator[tuple]:
+    """Ways to all strings in a document."""
+    if isinstance(document, dict | list):
+        for key, inner in document.items() if isinstance(document, dict) else enumerate(document):
+            yield from texts(inner, (*way, key))
+    elif isinstance(document, str):
+        yield way
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [
+        ("POST", "/api/sessions", {"asset": "0"}),
+        ("POST", "/api/login", {"token": "x"}),
+        ("POST", "/api/jobs", {"kind": "build", "dataset": "x", "name": "n", "preset": "fast"}),
+        ("POST", "/api/jobs", {"kind": "export", "asset": "0", "formats": ["glb"]}),
+        ("POST", "/api/jobs", {"kind": "simulate", "asset": "0", "scene": {"matter": {"preset": "jelly"}}}),
+        ("POST", "/api/jobs", {"kind": "redecouple", "asset": "0", "preset": "full"}),
+        ("POST", "/api/jobs", {"kind": "render", "asset": "0", "environments": ["own"], "variants": [{"name": "a", "edits": []}]}),
+        ("POST", "{session}/save", {"name": "x"}),
+        ("POST", "{session}/edits", {"edit": {"op": "environment", "file": "studio.exr"}}),
+        ("POST", "{session}/edits", {"edit": {"op": "pose", "clip": "x", "time": 0}}),
+        ("PUT", "{session}/edits", {"edits": [{"op": "material", "select": {"weights_file": "x"}, "set": {"roughness": 1}}]}),
+    ],
+)
+@pytest.mark.parametrize("bad", ["\0", "\ud800", "a\0b", "~nobody-of-this-name/x", "x" * 400])
+def test_no_string_of_a_body_is_too_odd_for_a_sentence(service: Service, method: str, path: str, body: dict, bad: str) -> None:
+    address = path.format(session=f"/api/sessions/{service.open_session()}")
+    for way in texts(body):
+        changed = copy.deepcopy(body)
+        node = changed
+        for key in way[:-1]:
+            node = node[key]
+        node[way[-1]] = bad
+        answer = service.client.request(method, address, content=json.dumps(changed), headers={"Content-Type": "application/json"})
+        assert answer.status_code in (201, 401, 403, 404, 422), (way, answer.text)
+        assert answer.status_code == 201 or answer.json()["detail"].endswith((".", "?", "!"))
+
+
+@pytest.mark.parametrize(
+    "path", ["/api/assets?search=%00", "/api/assets/%00", "/api/sessions/a%00b", "/api/jobs/%00/log", "/api/weights/%00", "/%00"]
+)
+def test_an_address_with_nul_is_none(service: Service, path: str) -> None:
+    """Postgres raises at such text, and SQLite takes what stands before it: a search for it found everything."""
+    assert service.client.get(path).status_code == 400

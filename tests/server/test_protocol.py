@@ -3,9 +3,11 @@
 import struct
 
 import pytest
+from pydantic import ValidationError
 
 from drgs_server.generate_types import CONSTANTS_OUTPUT, OUTPUT, constants_text, typescript_from_schema, typescript_text
 from drgs_server.live.frame_header import FRAME_HEADER, FrameHeader, pack_frame, unpack_frame
+from drgs_server.live.messages import client_message
 
 
 def test_the_generated_types_are_up_to_date() -> None:
@@ -31,3 +33,10 @@ def test_numbers_too_large_for_the_header_are_capped() -> None:
 def test_a_schema_that_has_no_typescript_is_refused() -> None:
     with pytest.raises(ValueError):
         typescript_from_schema({"type": "object", "properties": {"a": {"type": "string"}}})
+
+
+@pytest.mark.parametrize("key", ["a\\u0000b", "\\ud800", ""])
+def test_a_key_of_a_client_is_text(key: str) -> None:
+    """It is stored with the change, and not all databases hold all that JSON can say."""
+    with pytest.raises(ValidationError):
+        client_message.validate_json('{"type": "undo", "id": 1, "key": "' + key + '"}')

@@ -17,7 +17,7 @@ from drgs_worker.jobs.requests import (
     RenderRequest,
     SimulateRequest,
 )
-from drgs_worker.store.user_names import UserName
+from drgs_worker.store.user_names import PlainText, UserName
 
 __all__ = ["BuildRequest", "ExportRequest", "RedecoupleRequest", "RenderRequest", "SimulateRequest"]
 
@@ -149,7 +149,7 @@ class EnvironmentList(_Body):
 
 
 class SessionRequest(_Body):
-    asset: str
+    asset: Annotated[str, Field(max_length=64), PlainText]
 
 
 class SessionInfo(_Body):

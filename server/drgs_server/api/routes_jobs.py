@@ -221,10 +221,15 @@ def _find_capture(context: ServerContext, dataset: str) -> Path:
         if not context.settings.sample_capture.is_dir():
             raise ProblemError(404, "This installation has no sample capture.")
         return context.settings.sample_capture.resolve()
-    folder = Path(dataset).expanduser().resolve()
-    if not any(folder.is_relative_to(root.resolve()) for root in context.settings.capture_roots):
+    try:
+        folder = Path(dataset).expanduser().resolve()
+        is_allowed = any(folder.is_relative_to(root.resolve()) for root in context.settings.capture_roots)
+        is_there = is_allowed and folder.is_dir()
+    except (OSError, RuntimeError):  # too long a name, links in a circle, the home of nobody
+        is_allowed = is_there = False
+    if not is_allowed:
         raise ProblemError(403, "This folder is not below one that the server was started with (--captures); upload a zip instead.")
-    if not folder.is_dir():
+    if not is_there:
         raise ProblemError(404, "There is no such folder.")
     return folder
 

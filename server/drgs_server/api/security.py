@@ -77,6 +77,8 @@ class Gatekeeper:
         twice = next((name for name in SAID_ONCE if len(headers.getlist(name)) > 1), None)
         if twice is not None:
             return 400, f"The header {twice.title()} was sent more than once; send it once."
+        if "\0" in scope["path"] or b"%00" in scope.get("query_string", b""):
+            return 400, "An address holds no NUL; nothing has one in its name."
         host, origin = headers.get("host", ""), headers.get("origin")
         if not self.is_our_host(host):
             return 400, "This Host name is not served here; use the address that `drgs serve` printed."

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 from drgs.scene.edits import Edit
 from drgs.scene.tone_curve import ToneCurve
 from drgs_worker.jobs.requests import MAX_PICTURE_SAMPLES, Matrix, check_rigid
+from drgs_worker.store.user_names import PlainText
 
 PROTOCOL_VERSION = 1
 """A client of another version is told so and closed with 1002."""
@@ -45,7 +46,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Row = tuple[Finite, Finite, Finite, Finite]
 Vector = tuple[Finite, Finite, Finite]
 Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
-ClientKey = Annotated[str, Field(min_length=1, max_length=64)]
+ClientKey = Annotated[str, Field(min_length=1, max_length=64), PlainText]
 
 
 class _Message(BaseModel):

@@ -12,7 +12,7 @@ from drgs.exchange.export_formats import FILE_KINDS, DownloadFormat
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.scene.edits import Coordinate, Edit, Triple
 from drgs.scene.tone_curve import ToneCurve
-from drgs_worker.store.user_names import UserName
+from drgs_worker.store.user_names import PlainText, UserName
 
 JobKind = Literal["build", "redecouple", "simulate", "render", "export"]
 PresetName = Literal["draft", "fast", "full"]
@@ -77,7 +77,7 @@ class BuildRequest(_Job):
     """A build of a capture that the server can already see. A zip is uploaded as multipart instead, with the same fields."""
 
     kind: Literal["build"] = "build"
-    dataset: Annotated[str, Field(max_length=1000)]
+    dataset: Annotated[str, Field(max_length=1000), PlainText]
     """`sample` for the bundled capture, or a folder below a root that was allowed when the server started."""
     preset: PresetName = "fast"
     binding: BindingName = "particles"
@@ -91,7 +91,7 @@ class RedecoupleRequest(_Job):
     """Separate material and light of a built asset again, on its geometry, with the effort of another preset: a new asset."""
 
     kind: Literal["redecouple"]
-    asset: Annotated[str, Field(max_length=64)]
+    asset: Annotated[str, Field(max_length=64), PlainText]
     preset: PresetName = "full"
 
 
@@ -99,7 +99,7 @@ class SimulateRequest(_Job):
     """Move an asset's matter; the clip is played by `pose` edits that name it, and by batch renders."""
 
     kind: Literal["simulate"]
-    asset: Annotated[str, Field(max_length=64)]
+    asset: Annotated[str, Field(max_length=64), PlainText]
     scene: dict = Field(default_factory=dict)
     """As in `drgs simulate --scene`; empty: a jelly under its own weight."""
 
@@ -164,7 +164,7 @@ class RenderRequest(_Job):
     """Pictures of every variant under every environment from every camera, named variant-environment-camera.png."""
 
     kind: Literal["render"]
-    asset: Annotated[str, Field(max_length=64)]
+    asset: Annotated[str, Field(max_length=64), PlainText]
     cameras: list[RenderCamera] = Field(default_factory=list, max_length=1000)
     turntable: Turntable | None = None
     """Instead of cameras; with neither, one picture from the start view."""
@@ -215,7 +215,7 @@ class ExportRequest(_Job):
     """Files for other programs, kept with the job until it is deleted."""
 
     kind: Literal["export"]
-    asset: Annotated[str, Field(max_length=64)]
+    asset: Annotated[str, Field(max_length=64), PlainText]
     formats: Annotated[list[DownloadFormat], Field(min_length=1, max_length=len(FILE_KINDS))]
 
     @model_validator(mode="after")
