@@ -1,14 +1,58 @@
-"""Pictures of more than 8 bits a channel, made 8-bit. In and out: Pillow images.
+"""Pictures of more than 8 bits a channel, made 8-bit, and what cameras wrote into them. In and out: Pillow images.
 
 Pillow's own `convert` cuts 16-bit grey off at 255, so that all but the darkest shades become white: whoever reads pictures of strangers calls
 `as_eight_bits` before it. Colour of 16 bits needs nothing, since Pillow keeps the high byte of each channel as it reads.
 """
 
+import math
+
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 _MOST = 65535
 """Of a 16-bit channel."""
+
+
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What makes a picture of an EXIF orientation upright."""
+
+
+def read_exif(image: Image.Image, folder: int | None = None) -> dict[int, object]:
+    """EXIF's values by tag, of one of its folders; none where they are damaged, for then the picture is no worse than one without."""
+    try:
+        found = image.getexif()
+        return dict(found if folder is None else found.get_ifd(folder))
+    except Exception:  # Pillow lets whatever a damaged block provokes escape
+        return {}
+
+
+def exif_number(values: dict[int, object], tag: int) -> float | None:
+    """A value above nothing; None where there is none, or no number."""
+    try:
+        number = float(values[tag])  # type: ignore[arg-type]
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def orientation_of(image: Image.Image) -> int:
+    """EXIF's, from 1 (upright) to 8; 1 where there is none of these."""
+    found = read_exif(image).get(ExifTags.Base.Orientation)
+    return found if isinstance(found, int) and found in _TURNS else 1
+
+
+def upright(image: Image.Image) -> Image.Image:
+    """The picture turned as EXIF's orientation says."""
+    turn = _TURNS.get(orientation_of(image))
+    return image if turn is None else image.transpose(turn)
 
 
 def as_eight_bits(image: Image.Image) -> Image.Image:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
-from PIL import ExifTags, Image, ImageOps
+from PIL import Image
 
-from drgs.exchange.pictures import as_eight_bits
+from drgs.exchange.pictures import as_eight_bits, orientation_of, upright
 from drgs.reconstruct.capture.load_views.checks import HEIC_SUFFIXES, CaptureFault, check_least_side, damaged
 from drgs.reconstruct.capture.load_views.read_pictures import mask_channel, mask_of_depth
 
@@ -52,10 +52,10 @@ def small_picture(file: PictureFile, side: int) -> SmallPicture:
     """
     try:
         with Image.open(file.image, formats=_formats(file.image)) as image:
-            orientation = image.getexif().get(ExifTags.Base.Orientation, 1) if file.turned_by_exif else 1
+            orientation = orientation_of(image) if file.turned_by_exif else 1
             width, height = reversed(image.size) if orientation >= FIRST_TURNED else image.size
             image.draft(None, (side, side))  # a JPEG is not decoded any larger
-            picture = as_eight_bits(image if orientation == 1 else ImageOps.exif_transpose(image))
+            picture = as_eight_bits(image if orientation == 1 else upright(image))
             has_alpha = "A" in picture.getbands() or "transparency" in picture.info
             check_least_side((width, height), file.image)
             scale = min(1.0, side / max(width, height))

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
-from PIL import Image, ImageOps
+from PIL import Image
 
-from drgs.exchange.pictures import as_eight_bits
+from drgs.exchange.pictures import as_eight_bits, exif_number, orientation_of, read_exif, upright
 from drgs.reconstruct.capture.laplacian_variance import laplacian_variance
 from drgs.reconstruct.capture.load_views.checks import HEIC_SUFFIXES, check_least_side, image_size
 from drgs.reconstruct.pose.backdrop_masks import backdrop_mask
@@ -36,7 +36,7 @@ BACKDROP_SHARE = 0.9
 """Of pictures without masks that must have a plain backdrop, for it to be taken for one."""
 OPAQUE = 128
 """Of a mask: from this shade on a pixel is the object's."""
-EXIF_ORIENTATION, EXIF_FOLDER, EXIF_FOCAL_35MM = 0x0112, 0x8769, 0xA405
+EXIF_FOLDER, EXIF_FOCAL_35MM = 0x8769, 0xA405
 
 
 @dataclass(frozen=True)
@@ -135,27 +135,26 @@ def _prepare(photo: Photo, work: Path) -> PreparedPhoto | str:
             image_size(photo.path)  # which refuses what is too large, too
         with Image.open(photo.path) as image:
             image.load()
-            exif = image.getexif()
-            focal_35mm = exif.get_ifd(EXIF_FOLDER).get(EXIF_FOCAL_35MM)
-            usable_as_it_is = image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and exif.get(EXIF_ORIENTATION, 1) == 1
+            focal_35mm = exif_number(read_exif(image, EXIF_FOLDER), EXIF_FOCAL_35MM)
+            usable_as_it_is = image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and orientation_of(image) == 1
             usable_as_it_is &= "transparency" not in image.info
             is_photographic = image.format != "PNG"
-            upright = as_eight_bits(ImageOps.exif_transpose(image))
-        check_least_side(upright.size, photo.path)
-        alpha = np.asarray(upright.convert("RGBA"))[..., 3] if "A" in upright.getbands() or "transparency" in upright.info else None
-        mask = _mask(photo, alpha, upright.size)
+            turned = as_eight_bits(upright(image))
+        check_least_side(turned.size, photo.path)
+        alpha = np.asarray(turned.convert("RGBA"))[..., 3] if "A" in turned.getbands() or "transparency" in turned.info else None
+        mask = _mask(photo, alpha, turned.size)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         return " ".join(str(error).split()).rstrip(".")
     file = f"{photo.name}{'.jpg' if is_photographic and alpha is None else '.png'}"
     if usable_as_it_is:
         _link(photo.path, work / "images" / file)
     else:
-        upright.convert("RGB").save(work / "images" / file, quality=JPEG_QUALITY, subsampling=0)
+        turned.convert("RGB").save(work / "images" / file, quality=JPEG_QUALITY, subsampling=0)
     if mask is not None:
         Image.fromarray(mask).save(work / "masks" / f"{file}.png")
     digest = hashlib.sha256(photo.path.read_bytes() + (b"" if photo.mask is None else photo.mask.read_bytes())).hexdigest()
-    focal = float(focal_35mm) / DIAGONAL_OF_35MM * float(np.hypot(*upright.size)) if focal_35mm else None
-    return PreparedPhoto(photo.name, file, mask is not None, *upright.size, focal, _sharpness(upright, mask), digest)
+    focal = focal_35mm / DIAGONAL_OF_35MM * float(np.hypot(*turned.size)) if focal_35mm else None
+    return PreparedPhoto(photo.name, file, mask is not None, *turned.size, focal, _sharpness(turned, mask), digest)
 
 
 def _mask(photo: Photo, alpha: UInt8[ndarray, "height width"] | None, size: tuple[int, int]) -> UInt8[ndarray, "height width"] | None:

@@ -4,6 +4,7 @@ import json
 import math
 import pickle
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -49,10 +50,19 @@ def _mirror(matrix: list) -> None:
         matrix[row][0] *= -1
 
 
+def _unpacking_text(folder: Path) -> None:
+    """A chunk of text behind the header that unpacks to two megabytes."""
+    path = folder / "train" / "r_001.png"
+    whole, chunk = path.read_bytes(), b"zTXtk\0\0" + zlib.compress(bytes(2_000_000))
+    at = whole.index(b"IDAT") - 4
+    path.write_bytes(whole[:at] + struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + whole[at:])
+
+
 SYNTHETIC_FAULTS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "missing image": (lambda folder: (folder / "train" / "r_004.png").unlink(), ["r_004.png", "no such image", "transforms_train.json"]),
     "wrong size": (_edit(lambda d: d.update(w=100, h=80, fl_x=90.0)), ["r_000.png", "72x56", "100x80"]),
     "unreadable image": (lambda folder: (folder / "train" / "r_001.png").write_bytes(b"not a picture"), ["r_001.png", "not a readable"]),
+    "text that unpacks": (_unpacking_text, ["r_001.png", "not a readable", "too large"]),
     "half an image": (
         lambda folder: (folder / "train" / "r_001.png").write_bytes((folder / "train" / "r_001.png").read_bytes()[:200]),
         ["r_001.png", "cannot be decoded"],

@@ -121,7 +121,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
             size = image.size
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise damaged(path, f"not a readable PNG, JPEG or WebP image ({_why_unreadable(path, error)}).") from error
     if size[0] * size[1] > MOST_PIXELS:
         raise ValueError(f"{path}: {size[0]}x{size[1]} pixels, expected at most {MOST_PIXELS // 10**6} megapixels.")

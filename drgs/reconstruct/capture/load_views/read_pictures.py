@@ -15,7 +15,7 @@ from numpy import ndarray
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from drgs.exchange.pictures import as_eight_bits
+from drgs.exchange.pictures import as_eight_bits, exif_number, read_exif
 from drgs.reconstruct.capture.exposures import gains_of_files
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, camera_of, resize_pinhole
 from drgs.reconstruct.capture.load_views.checks import damaged
@@ -95,13 +95,12 @@ def _decode(photograph: Photograph) -> tuple[UInt8[ndarray, "height width 3"], U
 
 def _exposure(image: Image.Image) -> float | None:
     """Time [s] times sensitivity [ISO] over the f-number's square, by EXIF; None where one is missing or no positive number."""
-    told = image.getexif().get_ifd(ExifTags.IFD.Exif)
-    values = [told.get(tag) for tag in (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)]
-    try:
-        seconds, sensitivity, f_number = (float(value) for value in values if value is not None)
-    except (TypeError, ValueError, ZeroDivisionError):  # too few of them, or no numbers
+    told = read_exif(image, ExifTags.IFD.Exif)
+    tags = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
+    seconds, sensitivity, f_number = (exif_number(told, tag) for tag in tags)
+    if seconds is None or sensitivity is None or f_number is None:
         return None
-    exposure = seconds * sensitivity / f_number**2 if f_number else 0.0
+    exposure = seconds * sensitivity / f_number / f_number
     return exposure if np.isfinite(exposure) and exposure > 0 else None
 
 
