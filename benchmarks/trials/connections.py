@@ -38,6 +38,10 @@ JUNK: dict[str, bytes] = {
     "a stream of version 0": b"GET /api/sessions/x/stream HTTP/1.1\r\n" + HOST
     + b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 0\r\nSec-WebSocket-Key: x\r\n\r\n",
     "a body of 1 TB": b"POST /api/login HTTP/1.1\r\n" + HOST + b"Content-Length: 1000000000000\r\nConnection: close\r\n\r\n",
+    "a packed body": b"POST /api/login HTTP/1.1\r\n" + HOST + b"Content-Encoding: gzip\r\nContent-Length: 2\r\n\r\n\x1f\x8b",
+    "an unknown expectation": b"POST /api/login HTTP/1.1\r\n" + HOST + b"Expect: 200-maybe\r\nContent-Length: 2\r\n\r\n{}",
+    "a trailer with NUL": b"POST /api/login HTTP/1.1\r\n" + HOST + b"Transfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\nX: a\x00b\r\n\r\n",
+    "two transfer encodings": b"POST /api/login HTTP/1.1\r\n" + HOST + b"Transfer-Encoding: chunked\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
     "line ends alone": b"\r\n" * 5000,
     "a request in line feeds": b"GET /healthz HTTP/1.1\nHost: localhost\n\n",
 }  # fmt: skip

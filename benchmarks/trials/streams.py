@@ -54,6 +54,7 @@ def trials() -> Iterator[Trial]:
     for title, document in REJECTED.items():
         yield Trial("streams", f"{title} is rejected", partial(_rejected, document))
     yield Trial("streams", "a session that is none", _no_session)
+    yield Trial("streams", "text that is none", _no_text)
     yield Trial("streams", "messages without end are not taken", _many_bad)
     yield Trial("streams", "a viewer that never reads costs little memory", _stalled)
     yield Trial("streams", "viewers that vanish are forgotten", _vanished)
@@ -136,6 +137,19 @@ def _no_session(site: Site) -> str | None:
             return _sentence(site, until(socket, "error")["message"])
     except (ConnectionClosed, InvalidStatus):
         return None
+
+
+def _no_text(site: Site) -> str | None:
+    """The stream is closed, and said so; the log is looked through in the end."""
+    with opened(site, site.session()) as socket:
+        socket.send(b"\xff\xfe", text=True)
+        try:
+            while True:
+                socket.recv(timeout=20)
+        except ConnectionClosed:
+            return site.is_well() if socket.protocol.close_code == 1007 else f"it was closed with {socket.protocol.close_code}"
+        except TimeoutError:
+            return "the stream is still open"
 
 
 def _many_bad(site: Site) -> str | None:

@@ -21,6 +21,7 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from drgs.openmp import sleep_at_once
 from drgs_server.api.connections import guarded_connections
 from drgs_server.api.rate_limit import KeepPeer
+from drgs_server.api.text_streams import TextStream
 from drgs_server.app import create_app
 from drgs_worker.logs import set_up_logging
 from drgs_worker.store.backups import restore_backups
@@ -101,7 +102,7 @@ def uvicorn_config(app: ASGIApp, settings: ServiceSettings) -> uvicorn.Config:
         log_config=None,
         log_level="warning",
         http=guarded_connections(settings.limits),
-        ws="websockets-sansio",
+        ws=TextStream,
         ws_max_size=1 << 20,
         ws_max_queue=32,
         ws_per_message_deflate=False,  # on, it costs a third of the frame rate at 1080p and gains nothing on JPEG

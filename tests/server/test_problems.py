@@ -1,9 +1,13 @@
 """What the service says when something goes wrong: short, without its own folders, and on a connection that stays open."""
 
 import copy
+import errno
+import gzip
 import http.client
 import json
+import os
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -12,6 +16,8 @@ from contextlib import contextmanager
 import pytest
 import uvicorn
 from conftest import Service
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from drgs_server.render.interface import AbstractPose
 from drgs_server.run import uvicorn_config
@@ -150,3 +156,49 @@ def test_no_string_of_a_body_is_too_odd_for_a_sentence(service: Service, method:
 def test_an_address_with_nul_is_none(service: Service, path: str) -> None:
     """Postgres raises at such text, and SQLite takes what stands before it: a search for it found everything."""
     assert service.client.get(path).status_code == 400
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO, errno.EMFILE])
+def test_trouble_of_the_disk_is_told_and_passes(
+    service: Service, monkeypatch: pytest.MonkeyPatch, number: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number), "/srv/secret/place")
+
+    monkeypatch.setattr(tempfile, "mkdtemp", fail)
+    answers = [
+        service.client.post("/api/weights", content=bytes(4)),
+        service.client.post("/api/assets", files={"file": ("a.obj", b"v")}),
+        service.client.post("/api/environments", files={"file": ("a.exr", b"v")}),
+        service.client.get(f"/api/sessions/{service.open_session()}/export?format=ply"),
+    ]
+    for answer in answers:
+        assert answer.status_code == 503 and "retry-after" in answer.headers, answer.text
+        assert "nothing was changed" in answer.json()["detail"] and "secret" not in answer.text
+    assert "Traceback" not in caplog.text
+
+
+def test_a_packed_body_is_not_taken_for_what_it_says(service: Service) -> None:
+    session = service.open_session()
+    edit = gzip.compress(json.dumps({"edit": {"op": "environment"}}).encode())
+    for path, content in ((f"/api/sessions/{session}/edits", edit), ("/api/weights", bytes(8)), ("/api/login", b"{}")):
+        answer = service.client.post(path, content=content, headers={"Content-Encoding": "gzip", "Content-Type": "application/json"})
+        assert answer.status_code == 415 and "Content-Encoding" in answer.json()["detail"]
+    plain = service.client.post("/api/weights", content=bytes(8), headers={"Content-Encoding": "identity"})
+    assert plain.status_code == 201
+
+
+def test_bytes_that_are_no_text_end_a_stream_without_a_stack(tmp_path, caplog: pytest.LogCaptureFixture) -> None:
+    service = Service(tmp_path)
+    session = service.open_session()
+    with served(service) as port:
+        address = f"ws://127.0.0.1:{port}/api/sessions/{session}/stream"
+        with connect(address, additional_headers={"Authorization": f"Bearer {service.token}"}) as stream:
+            stream.send(b"\xff\xfe", text=True)
+            with pytest.raises(ConnectionClosed):
+                stream.recv(timeout=PATIENCE_SECONDS)
+            assert stream.protocol.close_code == 1007
+        with connect(address, additional_headers={"Authorization": f"Bearer {service.token}"}) as stream:
+            stream.send(b"\xff\xfe", text=True)  # and the close right behind it, so that both arrive at once
+        assert service.client.get("/healthz").status_code == 200
+    assert "no text" in caplog.text and "Traceback" not in caplog.text

@@ -1,5 +1,7 @@
-"""How large a body may be: uploads get their own, larger limit, and calls without the token a smaller one. What is larger gets 413 and a sentence."""
+"""How large a body may be: uploads get their own, larger limit, and calls without the token a smaller one. What is larger gets 413 and a sentence,
+and what is packed 415: read as it comes it would be something else."""
 
+from starlette.datastructures import Headers
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -21,6 +23,11 @@ class BodyLimit:
         self._limited = {most: RequestBodyLimitMiddleware(app, most) for most in {self._most, *self._others.values()}}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        packed = Headers(scope=scope).get("content-encoding", "identity").strip().lower() if scope["type"] == "http" else "identity"
+        if packed not in ("", "identity"):
+            sentence = "Bodies are read as they come; send this one without a Content-Encoding."
+            await problem_response(415, sentence)(scope, receive, send)
+            return
         most, refused = self._others.get(scope.get("path", ""), self._most), False
 
         async def send_or_explain(message: Message) -> None:

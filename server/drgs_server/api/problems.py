@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drgs_server.api.rest_records import Problem
 from drgs_server.api.while_connected import CallerLeft
-from drgs_worker.store import disk_full
+from drgs_worker.store import disk_trouble
 from drgs_worker.store.artifact_store import ArtifactError, ArtifactMissing, StoreAway
 
 CLIENT_CLOSED_REQUEST = 499
@@ -101,10 +101,12 @@ def add_problem_handlers(app: FastAPI, told: Callable[[str], str]) -> None:
 
     @app.exception_handler(OSError)
     async def _system(request: Request, error: OSError) -> JSONResponse:
-        logging.getLogger(__name__).error("%s %s failed", request.method, request.url.path, exc_info=error)
-        if not disk_full.is_disk_full(error):
+        sentence = disk_trouble.sentence_of(error)
+        if sentence is None:
+            logging.getLogger(__name__).error("%s %s failed", request.method, request.url.path, exc_info=error)
             return problem_response(500, UNEXPECTED)
-        return problem_response(503, disk_full.SENTENCE, {"retry-after": "30"})
+        logging.getLogger(__name__).error("%s %s failed: %s", request.method, request.url.path, error)
+        return problem_response(503, sentence, {"retry-after": "30"})
 
     @app.exception_handler(ArtifactError)
     async def _artifacts(request: Request, error: ArtifactError) -> JSONResponse:

@@ -48,6 +48,7 @@ from drgs_server.live.messages import (
 from drgs_server.live.outbox import Outbox
 from drgs_server.live.session_store import AssetGone
 from drgs_server.live.viewer import Viewer
+from drgs_worker.store.disk_trouble import sentence_of
 
 HELLO_SECONDS = 20.0
 MAX_WAITING_CHANGES = 256
@@ -293,7 +294,7 @@ class Connection:
             return RejectedMessage(id=0, reason=self._context.directory.told(problem.detail), overtaken=isinstance(problem, Overtaken))
         except (SQLAlchemyError, OSError) as error:
             log.error("an edit could not be stored", exc_info=error)
-            return RejectedMessage(id=0, reason="The edit could not be stored; is the disk full?")
+            return RejectedMessage(id=0, reason=sentence_of(error) or "The edit could not be stored; is the disk full?")
         return AcceptedMessage(id=0, revision=applied.revision)
 
     async def _pick(self, message: PickMessage) -> None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from drgs.maths.constants import MIDDLE_GREY
 from drgs_worker.jobs.start_view import FOV_Y_DEGREES, start_view
-from drgs_worker.store import disk_full
+from drgs_worker.store import disk_trouble
 
 if TYPE_CHECKING:
     from drgs.scene.asset import Asset
@@ -96,7 +96,7 @@ async def run_file_tool(*arguments: str) -> None:
             process.kill()
             await process.wait()
     if process.returncode == FULL_EXIT_CODE:
-        raise OSError(errno.ENOSPC, disk_full.SENTENCE)
+        raise OSError(errno.ENOSPC, disk_trouble.SENTENCE)
     if process.returncode == 2:
         raise FileToolError(errors.decode(errors="replace").strip().splitlines()[-1][:1000])
     if process.returncode != 0:
@@ -214,7 +214,7 @@ def main(arguments: list[str]) -> int:
         return 2
     except Exception as error:
         print(str(error).replace("\n", " "), file=sys.stderr)
-        if disk_full.is_disk_full(error):
+        if disk_trouble.is_disk_full(error):
             return FULL_EXIT_CODE
         if not isinstance(error, ValueError | OSError):
             raise
