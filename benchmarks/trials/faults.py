@@ -4,18 +4,19 @@ Each trial has a server and a folder of its own; the one that all other trials a
 """
 
 import shutil
+import sqlite3
 import subprocess
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 
 from benchmarks.trials.changes import finite_picture
 from benchmarks.trials.shapes import ball, ply
-from benchmarks.trials.site import STOP_SECONDS, Site, Trial, first_line
+from benchmarks.trials.site import STOP_SECONDS, Answer, Site, Trial, first_line
 
 JOB_SECONDS = 240.0
 
@@ -36,6 +37,9 @@ def trials() -> Iterator[Trial]:
     yield Trial("kills", "kill -9 in saves leaves nothing behind", partial(_leftovers, _saving), quick=False)
     yield Trial("kills", "kill -9 in exports leaves nothing behind", partial(_leftovers, _exporting), quick=False)
     yield Trial("owners", "a clip that an edit names cannot be taken away", _clip_in_use, quick=False)
+    yield Trial("owners", "an edit that another version kept is skipped and taken out", _foreign_edit, quick=False)
+    yield Trial("owners", "a damaged log hides no other session and can be deleted", _damaged_log, quick=False)
+    yield Trial("owners", "a database that is locked for 5 s keeps callers waiting and loses nothing", _locked_database, quick=False)
     yield Trial("owners", "an asset that one server deletes is gone for the other", _two_servers, quick=False)
 
 
@@ -227,6 +231,65 @@ def _clip_in_use(site: Site) -> str | None:
         own.start()
         undone = own.request("POST", f"/api/sessions/{session}/undo", b"")
         return None if undone.status == 200 else f"with its clip lost, an undo is answered {undone.status}: {undone.sentence[:200]}"
+
+
+def _kept(own: Site, session: str, edit: str) -> None:
+    """Put another edit in the place of a session's second one, while nobody serves it."""
+    own.stop()
+    with closing(sqlite3.connect(own.data / "app.sqlite")) as database, database:
+        database.execute("UPDATE session_events SET edit = ? WHERE session_id = ? AND revision = 2", (edit, session))
+    own.start()
+
+
+def _rotate(own: Site, session: str, degrees: float) -> Answer:
+    return own.send("POST", f"/api/sessions/{session}/edits", {"edit": {"op": "environment", "rotation": degrees}})
+
+
+def _foreign_edit(site: Site) -> str | None:
+    with _own_site(site) as own:
+        session = own.session()
+        for k in range(3):
+            _rotate(own, session, k)
+        for kept in ('{"op": "explode"}', "5", '{"op": "environment", "intensity": 1e300}'):
+            _kept(own, session, kept)
+            if complaint := finite_picture(own, session):
+                return f"with {kept} in its log {complaint}"
+            found = own.request("GET", f"/api/sessions/{session}").document
+            if [broken["index"] for broken in found["broken"]] != [1] or own.request("GET", "/api/sessions").status != 200:
+                return f"with {kept} in its log broken is {found['broken']}"
+        edits = [found["edits"][0], found["edits"][2]]
+        whole = own.send("PUT", f"/api/sessions/{session}/edits", {"edits": edits})
+        return None if whole.status == 200 and not whole.document["broken"] else f"it cannot be taken out: {whole.status}"
+
+
+def _damaged_log(site: Site) -> str | None:
+    with _own_site(site) as own:
+        damaged, other = own.session(), own.session()
+        for k in range(3):
+            _rotate(own, damaged, k)
+        _kept(own, damaged, "no JSON")
+        if complaint := own.complaint(own.request("GET", f"/api/sessions/{damaged}"), {409}):
+            return complaint
+        listed = own.request("GET", "/api/sessions")
+        if listed.status != 200 or [found["id"] for found in listed.document["sessions"]] != [other]:
+            return f"the list is answered {listed.status}: {listed.sentence[:200]}"
+        deleted = own.request("DELETE", f"/api/sessions/{damaged}")
+        return None if deleted.status == 204 else f"deleting it is answered {deleted.status}: {deleted.sentence[:200]}"
+
+
+def _locked_database(site: Site) -> str | None:
+    with _own_site(site) as own:
+        session = own.session()
+        with closing(sqlite3.connect(own.data / "app.sqlite", isolation_level=None, check_same_thread=False)) as database:
+            database.execute("BEGIN EXCLUSIVE")
+            release = threading.Timer(5.0, database.rollback)
+            release.start()
+            answer = _rotate(own, session, 30.0)
+            well = own.is_well()
+            release.join()
+        if answer.status != 200:
+            return f"an edit is answered {answer.status}: {answer.sentence[:200]}"
+        return well or finite_picture(own, session)
 
 
 def _two_servers(site: Site) -> str | None:

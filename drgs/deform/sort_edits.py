@@ -15,8 +15,20 @@ from weakref import WeakKeyDictionary
 
 from drgs.deform.simulation_scene import mesh_files, parse_simulation_scene
 from drgs.scene.asset import Asset
-from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, SimulateEdit, shared_beginning, split_rig_clip
+from drgs.scene.edits import (
+    DeformEdit,
+    Edit,
+    EnvironmentEdit,
+    MaterialEdit,
+    PoseEdit,
+    SimulateEdit,
+    UnreadableEdit,
+    shared_beginning,
+    split_rig_clip,
+)
 
+MOST_FOUND = 200
+"""Characters of what is shown of an edit that cannot be read."""
 ShapeEdit: TypeAlias = DeformEdit | PoseEdit | SimulateEdit
 """Edits that move things."""
 
@@ -122,9 +134,11 @@ class _SortedList:
     def append(self, edit: Edit, files: EditFiles) -> None:
         """
         Raises:
-            ValueError: a file that the edit names is missing; the list is as before.
+            ValueError: a file that the edit names is missing, or it is none that can be read; the list is as before.
         """
         last = self.sums[-1]
+        if isinstance(edit, UnreadableEdit):
+            raise ValueError(f"an edit that this version does not read: {edit.found[:MOST_FOUND]}")
         if isinstance(edit, EnvironmentEdit):
             named = last.light.files
             if edit.file is not None:
@@ -161,7 +175,7 @@ def sort_edits(asset: Asset, edits: Sequence[Edit], files: EditFiles) -> SortedE
         asset: lists are remembered as long as it lives.
 
     Raises:
-        ValueError: a file that an edit names is missing.
+        ValueError: a file that an edit names is missing, or an edit cannot be read.
     """
     wanted = list(edits)
     with _lock:

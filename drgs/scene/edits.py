@@ -1,5 +1,6 @@
 """Edits as plain data: one schema for file, REST and WebSocket, applied in order, each undoable (design: Edits)."""
 
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -243,7 +244,15 @@ class SimulateEdit(_Plain):
     time: Seconds
 
 
-Edit = Annotated[MaterialEdit | EnvironmentEdit | DeformEdit | PoseEdit | SimulateEdit, Field(discriminator="op")]
+class UnreadableEdit(_Plain):
+    """Stands where an edit was kept that this version does not read, so that those around it keep their places. It never applies."""
+
+    op: Literal["unreadable"]
+    found: str
+    """What was kept, as JSON."""
+
+
+Edit = Annotated[MaterialEdit | EnvironmentEdit | DeformEdit | PoseEdit | SimulateEdit | UnreadableEdit, Field(discriminator="op")]
 _edits = TypeAdapter(list[Edit])
 
 
@@ -258,6 +267,22 @@ def parse_edits(data: list | str | bytes) -> list[Edit]:
     except ValidationError as error:
         first = error.errors()[0]
         raise ValueError(f"edits: {'.'.join(map(str, first['loc'])) or 'document'}: {first['msg']}") from error
+
+
+def parse_kept_edits(kept: object) -> list[Edit]:
+    """Edits of a log that was written before, perhaps by another version: each that cannot be read is an UnreadableEdit, and none is lost."""
+    return [_kept_edit(value) for value in kept] if isinstance(kept, list) else [_unreadable(kept)]
+
+
+def _kept_edit(value: object) -> Edit:
+    try:
+        return _edits.validate_python([value])[0]
+    except ValidationError:
+        return _unreadable(value)
+
+
+def _unreadable(value: object) -> UnreadableEdit:
+    return UnreadableEdit(op="unreadable", found=json.dumps(value))
 
 
 def plain_edit(edit: Edit) -> dict:

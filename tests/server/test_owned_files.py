@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 from conftest import Service
 from painter import PaintedAsset, PaintedPose, Painter
+from sqlalchemy import text
 from sqlalchemy.orm import Session
 from test_edits import material
 from test_rest import is_problem
 from test_stream import talk
 
-from drgs.scene.edits import Edit, EnvironmentEdit, PoseEdit, parse_edits
+from drgs.scene.edits import Edit, EnvironmentEdit, PoseEdit, UnreadableEdit, parse_edits
 from drgs_server.api import routes_assets
 from drgs_server.api.problems import ProblemError
 from drgs_server.live.pose_edits import pose_edits
@@ -36,6 +37,8 @@ class ReadAsset(PaintedAsset):
 
     def pose(self, edits: Sequence[Edit], previous: AbstractPose | None, go_on: Callable[[], None] | None = None) -> PaintedPose:
         for edit in edits:
+            if isinstance(edit, UnreadableEdit):
+                raise ValueError("an edit that is none")
             name = edit.clip if isinstance(edit, PoseEdit) else edit.file if isinstance(edit, EnvironmentEdit) else None
             if name is not None and not (self.files / name).exists():
                 raise ValueError(f"{name}: does not exist")
@@ -185,3 +188,60 @@ def test_what_passes_breaks_no_edit(status: int) -> None:
 
     with pytest.raises(ProblemError, match="again"):
         pose_edits(pose, parse_edits([material(0.1)]), lambda _: False, lambda _: None)
+
+
+def spoil(service: Service, table: str, column: str, value: str, where: str) -> None:
+    """As another version, or a slip of somebody's, may have left it."""
+    with service.context.engine.begin() as connection:
+        connection.execute(text(f"UPDATE {table} SET {column} = :value WHERE {where}"), {"value": value})
+    service.context.sessions._live.clear()
+
+
+UNREAD = ["5", "null", "[1, 2]", '{"op": "explode"}', '{"op": "material", "select": {"all": true}, "set": {"roughness": 7}}', '"x"']
+
+
+@pytest.mark.parametrize("value", UNREAD)
+def test_an_edit_that_this_version_does_not_read_is_skipped_and_taken_out_like_any_other(service: Service, value: str) -> None:
+    session = service.open_session()
+    url = f"/api/sessions/{session}"
+    for roughness in (0.1, 0.2, 0.3):
+        service.client.post(f"{url}/edits", json={"edit": material(roughness)})
+    spoil(service, "session_events", "edit", value, f"session_id = '{session}' AND revision = 2")
+    assert [found["id"] for found in service.client.get("/api/sessions").json()["sessions"]] == [session]
+    assert service.client.get(f"{url}/frame.png?width=16&height=16&spp=4").status_code == 200
+    found = service.client.get(url).json()
+    assert [edit["op"] for edit in found["edits"]] == ["material", "unreadable", "material"] and found["revision"] == 3
+    assert [broken["index"] for broken in found["broken"]] == [1] and "does not read it" in found["broken"][0]["reason"]
+    assert service.client.put(f"{url}/snapshots/odd").status_code == 200
+    taken_out = service.client.put(f"{url}/edits", json={"edits": [found["edits"][0], found["edits"][2]]}).json()
+    assert taken_out["broken"] == [] and len(taken_out["edits"]) == 2
+    assert [broken["index"] for broken in service.client.post(f"{url}/snapshots/odd/restore").json()["broken"]] == [1]
+    is_problem(service.client.post(f"{url}/edits", json={"edit": found["edits"][1] | {"found": "{}"}}), 422)
+    assert service.client.delete(url).status_code == 204
+
+
+def test_a_log_that_is_none_hides_no_other_and_can_be_deleted(service: Service) -> None:
+    whole = service.open_session()
+    asset = service.client.get(f"/api/sessions/{whole}").json()["asset"]
+    damaged = service.client.post("/api/sessions", json={"asset": asset}).json()["id"]
+    for session in (whole, damaged):
+        service.client.post(f"/api/sessions/{session}/edits", json={"edit": material(0.1)})
+    for kind, value in (("redo", "null"), ("splice", '{"start": 5, "remove": 1, "edits": []}'), ("splice", "5"), ("edit", "no JSON")):
+        spoil(service, "session_events", "edit", value, f"session_id = '{damaged}'")
+        spoil(service, "session_events", "kind", kind, f"session_id = '{damaged}'")
+        assert "delete it" in is_problem(service.client.get(f"/api/sessions/{damaged}"), 409)
+        assert [found["id"] for found in service.client.get("/api/sessions").json()["sessions"]] == [whole]
+    assert service.client.delete(f"/api/sessions/{damaged}").status_code == 204
+    is_problem(service.client.delete(f"/api/sessions/{damaged}"), 404)
+
+
+def test_what_was_done_to_an_asset_or_kept_in_a_snapshot_may_be_unreadable(service: Service) -> None:
+    session = service.open_session()
+    service.client.put(f"/api/sessions/{session}/snapshots/a")
+    spoil(service, "session_snapshots", "edits", '[{"op": "explode"}]', "name = 'a'")
+    spoil(service, "assets", "edits", '{"op": "explode"}', "1 = 1")
+    (asset,) = service.client.get("/api/assets").json()["assets"]
+    (snapshot,) = service.client.get(f"/api/sessions/{session}/snapshots").json()["snapshots"]
+    assert [edit["op"] for edit in asset["edits"] + snapshot["edits"]] == ["unreadable"] * 2
+    restored = service.client.post(f"/api/sessions/{session}/snapshots/a/restore").json()
+    assert [broken["index"] for broken in restored["broken"]] == [0]

@@ -7,7 +7,7 @@ from pathlib import Path
 from sqlalchemy import Row, func
 
 from drgs.reconstruct.progress import TOLD
-from drgs.scene.edits import parse_edits
+from drgs.scene.edits import parse_kept_edits
 from drgs_server.api.rest_records import AssetInfo, JobInfo, SessionInfo, SnapshotInfo
 from drgs_server.live.live_session import LiveSession
 from drgs_worker.jobs.capture_report import CaptureReport
@@ -73,13 +73,13 @@ def asset_info(row: AssetRow, folder: Path) -> AssetInfo:
         has_thumbnail=(folder / "thumb.jpg").is_file(),
         version=row.version,
         parent_id=row.parent_id,
-        edits=parse_edits(row.edits),
+        edits=parse_kept_edits(row.edits),
         deleted_at=_time(row.deleted_at) if row.deleted_at is not None else None,
     )
 
 
 def snapshot_info(row: SnapshotRow) -> SnapshotInfo:
-    return SnapshotInfo(name=row.name, created_at=_time(row.created_at), revision=row.revision, edits=parse_edits(row.edits))
+    return SnapshotInfo(name=row.name, created_at=_time(row.created_at), revision=row.revision, edits=parse_kept_edits(row.edits))
 
 
 def session_info(session: LiveSession) -> SessionInfo:

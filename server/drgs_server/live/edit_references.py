@@ -2,7 +2,7 @@
 
 import re
 
-from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit
+from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, UnreadableEdit
 from drgs_server.api.environments import EnvironmentStore
 from drgs_server.api.problems import ProblemError, artifact_problem
 from drgs_server.live.pose_edits import passes
@@ -26,6 +26,8 @@ class EditReferences:
         Raises:
             ProblemError: it does, or the store that machines share is away.
         """
+        if isinstance(edit, UnreadableEdit):
+            raise ProblemError(422, f"This edit was kept by another version, and this one does not read it: {edit.found[:100]}")
         if isinstance(edit, EnvironmentEdit) and edit.file is not None and not self._environments.has(edit.file):
             raise ProblemError(422, f"No environment is called {edit.file[:100]!r}; GET /api/environments lists them.")
         if isinstance(edit, DeformEdit) and edit.vertices is not None:

@@ -11,13 +11,17 @@ from sqlalchemy import Engine, String, cast, delete, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session as DatabaseSession
 
-from drgs.scene.edits import PoseEdit, parse_edits, plain_edit
+from drgs.scene.edits import PoseEdit, parse_kept_edits, plain_edit
 from drgs_server.api.problems import ProblemError
 from drgs_server.live.edit_log import Change, ChangeRequest, EditLog, EventKind, Splice
 from drgs_server.settings import Limits
 from drgs_worker.store.database import AssetRow, SessionEventRow, SessionRow, SnapshotRow, now
 
 LISTED_SESSIONS = 100
+
+
+class LogDamaged(ValueError):
+    """The events of a session make no log."""
 
 
 class AssetGone(ProblemError):
@@ -74,15 +78,25 @@ class SessionStore:
         """Its log is replayed from its events.
 
         Raises:
-            ProblemError: 404, also while its asset is deleted.
+            ProblemError: 404, also while its asset is deleted; 409 where its events make no log.
         """
         with DatabaseSession(self._engine) as database:
-            row = database.get(SessionRow, session_id)
-            asset = database.get(AssetRow, row.asset_id) if row else None
-            if row is None or asset is None or asset.deleted_at is not None:
-                raise ProblemError(404, f"No session has the id {session_id[:64]!r}.")
-            log, keys = _read_log(database, session_id)
+            row, asset = _rows(database, session_id)
+            try:
+                log, keys = _read_log(database, session_id)
+            except LogDamaged as error:
+                raise ProblemError(
+                    409, f"The edits of the session {session_id} are damaged ({error}); delete it and open a new one."
+                ) from error
             return StoredSession(row.id, row.asset_id, asset.name, row.created_at, log, keys)
+
+    def check_there(self, session_id: str) -> None:
+        """
+        Raises:
+            ProblemError: 404, as of `read`.
+        """
+        with DatabaseSession(self._engine) as database:
+            _rows(database, session_id)
 
     def newest_ids(self) -> list[str]:
         """Of at most LISTED_SESSIONS whose asset is there, newest first."""
@@ -114,7 +128,11 @@ class SessionStore:
             of_snapshots = select(SnapshotRow.session_id).where(cast(SnapshotRow.edits, String).contains(clip))
             found = set(database.scalars(of_snapshots.distinct()))
             for session_id in set(database.scalars(of_logs.distinct())) - found:
-                log, _ = _read_log(database, session_id)  # what was undone and then written over is nobody's
+                try:
+                    log, _ = _read_log(database, session_id)  # what was undone and then written over is nobody's
+                except LogDamaged:
+                    found.add(session_id)  # nobody knows what it shows
+                    continue
                 if any(isinstance(edit, PoseEdit) and edit.clip == clip for edit in log.reachable()):
                     found.add(session_id)
         return sorted(found)
@@ -186,14 +204,33 @@ class SessionStore:
             database.delete(row)
 
 
+def _rows(database: DatabaseSession, session_id: str) -> tuple[SessionRow, AssetRow]:
+    """
+    Raises:
+        ProblemError: 404.
+    """
+    row = database.get(SessionRow, session_id)
+    asset = database.get(AssetRow, row.asset_id) if row else None
+    if row is None or asset is None or asset.deleted_at is not None:
+        raise ProblemError(404, f"No session has the id {session_id[:64]!r}.")
+    return row, asset
+
+
 def _read_log(database: DatabaseSession, session_id: str) -> tuple[EditLog, dict[str, int]]:
-    """A session's log by its events, and the revision that each client key was answered with."""
-    events = database.scalars(select(SessionEventRow).where(SessionEventRow.session_id == session_id).order_by(SessionEventRow.revision))
+    """A session's log by its events, and the revision that each client key was answered with.
+
+    Raises:
+        LogDamaged: an event is no JSON, or there is nothing for it to work on.
+    """
+    events = select(SessionEventRow).where(SessionEventRow.session_id == session_id).order_by(SessionEventRow.revision)
     log, keys = EditLog(), {}
-    for event in events:
-        log = log.after(event.kind, _change_of(event))  # type: ignore[arg-type]
-        if event.client_key is not None:
-            keys[event.client_key] = event.revision
+    try:
+        for event in database.scalars(events):
+            log = log.after(event.kind, _change_of(event))  # type: ignore[arg-type]
+            if event.client_key is not None:
+                keys[event.client_key] = event.revision
+    except (ValueError, KeyError, TypeError) as error:
+        raise LogDamaged(f"behind revision {log.revision}: {error}") from error
     return log, keys
 
 
@@ -207,11 +244,16 @@ def _plain_change(change: Change | None) -> dict | list | None:
 
 
 def _change_of(event: SessionEventRow) -> Change | None:
-    values = event.edit
-    if isinstance(values, list):
-        return parse_edits(values)
-    if values is None:
-        return None
-    if "start" in values:
-        return Splice(values["start"], values["remove"], tuple(parse_edits(values["edits"])))
-    return parse_edits([values])[0]
+    """Edits that this version does not read stand in it as such, and are shown as broken."""
+    values: object = event.edit
+    match event.kind:
+        case "undo" | "redo":
+            return None
+        case "splice":
+            if not isinstance(values, dict):
+                raise ValueError("a splice without its edits")
+            return Splice(values["start"], values["remove"], tuple(parse_kept_edits(values["edits"])))
+        case "restore":
+            return parse_kept_edits(values)
+        case _:
+            return parse_kept_edits([values])[0]

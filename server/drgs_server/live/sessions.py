@@ -5,6 +5,7 @@ back from its log the next time somebody looks at it.
 """
 
 import asyncio
+import logging
 from collections import OrderedDict
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Engine
 
-from drgs.scene.edits import Edit, parse_edits
+from drgs.scene.edits import Edit, parse_kept_edits
 from drgs_server.api.environments import EnvironmentStore
 from drgs_server.api.metrics import Metrics
 from drgs_server.api.problems import ProblemError
@@ -106,7 +107,10 @@ class SessionRegistry:
         for session_id in await asyncio.to_thread(self._store.newest_ids):
             live = self._live.get(session_id)
             # Replayed ones are not kept: they may live in another server, whose changes would not arrive here.
-            found.append(live if live is not None else _live(await asyncio.to_thread(self._store.read, session_id)))
+            try:
+                found.append(live if live is not None else _live(await asyncio.to_thread(self._store.read, session_id)))
+            except ProblemError as problem:  # deleted meanwhile, or damaged: no reason to hide the others
+                logging.getLogger(__name__).warning("the session %s is not listed: %s", session_id, problem.detail)
         return found
 
     def any(self) -> bool:
@@ -118,8 +122,10 @@ class SessionRegistry:
         Raises:
             ProblemError: 404, or 409 while somebody looks at it.
         """
-        session = await self.get(session_id)
-        if session.viewers:
+        session = self._live.get(session_id)
+        if session is None:
+            await asyncio.to_thread(self._store.check_there, session_id)  # whatever its log is like
+        elif session.viewers:
             raise ProblemError(409, "Somebody is looking at this session; close the viewer first.")
         self._live.pop(session_id, None)
         self._posed.pop(session_id, None)
@@ -406,7 +412,7 @@ class SessionRegistry:
         """
         await self.get(session.id)  # it may be gone by now
         row = await asyncio.to_thread(self._store.snapshot, session.id, name)
-        return await self.apply(session, ChangeRequest("restore", parse_edits(row.edits), key=key), caller, kept=True)
+        return await self.apply(session, ChangeRequest("restore", parse_kept_edits(row.edits), key=key), caller, kept=True)
 
     async def delete_snapshot(self, session_id: str, name: str) -> None:
         """

@@ -29,6 +29,8 @@ export function describeEdit(edit: Edit): string {
       return `Pose: ${edit.clip} at ${rounded(edit.time)} s`;
     case 'simulate':
       return `Simulation at ${rounded(edit.time)} s`;
+    case 'unreadable':
+      return 'Of another version';
   }
 }
 

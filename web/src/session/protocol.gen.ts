@@ -803,6 +803,12 @@ export interface UndoMessage {
   key?: string | null;
 }
 
+/** Stands where an edit was kept that this version does not read, so that those around it keep their places. It never applies. */
+export interface UnreadableEdit {
+  op: "unreadable";
+  found: string;
+}
+
 /** A hidden page gets no frames. */
 export interface VisibilityMessage {
   type: "visibility";
@@ -846,4 +852,5 @@ export type Edit =
   | EnvironmentEdit
   | DeformEdit
   | PoseEdit
-  | SimulateEdit;
+  | SimulateEdit
+  | UnreadableEdit;
