@@ -18,7 +18,7 @@ from drgs_server.api.metrics import Metrics
 from drgs_server.api.rate_limit import BURST_SECONDS, CallBuckets, RateLimit
 from drgs_server.render.drgs_renderer import DrgsRenderer
 from drgs_server.run import uvicorn_config
-from drgs_worker.store.settings import CONFIG_VARIABLE, ServiceSettings, read_settings
+from drgs_worker.store.settings import CONFIG_VARIABLE, Limits, ServiceSettings, read_settings
 from tests.web.browser import write_ball
 
 
@@ -259,3 +259,9 @@ def test_environments_count_as_loaded_and_leave_memory_with_the_poses_that_they_
         assert used[1] - used[0] == 128 * 256 * 3 * 4 + kept, "each is counted, and its pose as much as the asset"
         assert max(used) <= 1 << 20
         assert service.client.get(f"/api/sessions/{session}/frame.png?width=16&height=16&spp=4").status_code == 200
+
+
+def test_every_limit_is_named_in_the_page_on_security() -> None:
+    page = (Path(__file__).parents[2] / "SECURITY.md").read_text()
+    table = page[page.index("## What is limited") :]
+    assert [name for name in Limits.model_fields if f"`{name}`" not in table] == []
