@@ -22,6 +22,7 @@ from drgs.maths.sampling import (
     sobol_2d,
     world_from_local,
 )
+from drgs.reference.environment_pool import CANDIDATES, Candidates, blocks_of, choose_candidates
 from drgs.reference.mesh_surface import Surfaces
 from drgs.render.integrate.environment_table import EnvironmentTable, environment_pdf, sample_environment
 from drgs.scene.environment import Environment, environment_radiance
@@ -52,13 +53,21 @@ class ScatteredRay:
 
 
 def scatter_hits(
-    x: Surfaces, wo: Tensor, throughput: Tensor, numbers: PathSamples, depth: int, environment: Environment, table: EnvironmentTable
+    x: Surfaces,
+    wo: Tensor,
+    throughput: Tensor,
+    numbers: PathSamples,
+    depth: int,
+    environment: Environment,
+    table: EnvironmentTable,
+    pool: Candidates | None = None,
 ) -> tuple[ScatteredRay, ScatteredRay]:
     """A ray towards the environment and one along the BRDF, of surfaces that a path reaches after `depth` others.
 
     Args:
         wo: (path, 3) from the surface back along the path. throughput: (path, 3) of the path up to here.
         environment, table: unturned.
+        pool: what rays towards the environment choose from at the first hit.
     """
     u_light, u_brdf, u_choice = (_numbers(numbers, stream, depth, wo.dtype) for stream in (LIGHT_STREAM, BRDF_STREAM, CHOICE_STREAM))
     share = specular_share(x, wo)
@@ -78,13 +87,23 @@ def scatter_hits(
         return torch.where((density > 0)[:, None], reflected * incoming / density.clamp(min=1e-37)[:, None], 0.0)
 
     # Direct light: one sample of each, under the balance heuristic.
-    to_light = sample_environment(table, u_light)
+    candidates, factor = 1, torch.ones_like(share)
+    if pool is None or depth > 0:
+        to_light = sample_environment(table, u_light)
+    else:
+        seed = hash_combine(numbers.seed, torch.full_like(numbers.seed, LIGHT_STREAM))
+        blocks, candidates = blocks_of(pool, seed, numbers.index), CANDIDATES
+        scattered = ((wi, *reflect(wi)) for wi in blocks.direction.unbind(1))
+        brought = [light(wi, reflected, own + candidates * of_table) for wi, reflected, own, of_table in scattered]
+        chosen, factor = choose_candidates(torch.stack([b.sum(-1) for b in brought], -1), u_light[:, 0])
+        to_light = blocks.direction[torch.arange(len(chosen)), chosen]
     reflected, own, of_table = reflect(to_light)
-    light_ray = ScatteredRay(to_light, light(to_light, reflected, own + of_table), torch.zeros_like(wo))
+    contribution = factor[:, None] * light(to_light, reflected, own + candidates * of_table)
+    light_ray = ScatteredRay(to_light, contribution, torch.zeros_like(wo))
 
     onward = _sample_brdf(x, wo, u_brdf, u_choice[:, 0] < share)
     reflected, own, of_table = reflect(onward)
-    contribution = light(onward, reflected, own + of_table)
+    contribution = light(onward, reflected, own + candidates * of_table)
 
     # Light from further surfaces: by the BRDF's sample alone. Russian roulette from the second hit on.
     survival = torch.ones_like(share) if depth == 0 else (reflected.amax(-1) / own.clamp(min=1e-37)).clamp(0.05, 1)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from drgs.maths.brdf import evaluate_brdf
+from drgs.reference.environment_pool import AT_SURFACES, choose_directions, draw_pool
 from drgs.reference.mesh_surface import mesh_in, surfaces_at
 from drgs.reference.sample_rays import sample_rays, split_at, strategy_of, strategy_seed
 from drgs.reference.scatter_hits import PathSamples, scatter_hits
@@ -29,6 +30,8 @@ def shade(
 ) -> tuple[Tensor, Tensor]:
     """Diffuse and specular light (point, 3), environment unturned."""
     rays = sample_rays(points, table, settings.counts, settings.seed, samples_round=samples_round, by_material=settings.by_material)
+    if settings.candidates > 1:
+        rays = choose_directions(rays, points, starts, environment, table, settings, samples_round)
     wi = rays.direction_world
     hits = trace_rays(starts.origin_world[:, None].expand_as(wi).reshape(-1, 3), wi.reshape(-1, 3), tracer)
     incoming = environment_radiance(environment, wi).reshape(-1, 3)
@@ -62,6 +65,8 @@ def trace_indirect(
     )
     seed = strategy_seed(points.pixel[:, None], strategy, settings.seed)
 
+    pool = draw_pool(environment, table, settings.seed, samples_round, AT_SURFACES) if settings.candidates > 1 else None
+
     radiance = torch.zeros(hits.hit.shape[0], 3, dtype=wi.dtype)
     ray = torch.nonzero(hits.hit).squeeze(-1)
     face, barycentric, arriving, throughput = (
@@ -73,7 +78,7 @@ def trace_indirect(
     for depth in range(settings.bounces):
         x = surfaces_at(mesh, face, barycentric.to(wi.dtype))
         numbers = PathSamples(seed.reshape(-1)[ray], index.reshape(-1)[ray])
-        towards_light, onward = scatter_hits(x, -arriving, throughput, numbers, depth, environment, table)
+        towards_light, onward = scatter_hits(x, -arriving, throughput, numbers, depth, environment, table, pool)
         origin = x.position + tracer.lift * x.face_normal
         blocked, further = trace_rays(origin, towards_light.direction, tracer).hit, trace_rays(origin, onward.direction, tracer)
         radiance.index_add_(0, ray, torch.where(blocked[:, None], 0.0, towards_light.contribution))

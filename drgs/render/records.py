@@ -116,6 +116,8 @@ class RenderPlan:
     by_material: bool
     bounces: int
     skips: tuple[Skip, ...]
+    candidates: int = 1
+    """Directions that each environment sample chooses among (environment_pool.py)."""
 
 
 # ---- what the camera sees ------------------------------------------------------------------------------------------------

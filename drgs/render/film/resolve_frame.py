@@ -64,6 +64,7 @@ def _metadata(state: FrameState, seconds: dict[str, float]) -> dict:
         "passes": state.passes,
         "bounces": state.inputs.settings.bounces,
         "counts": asdict(state.plan.counts),
+        "candidates": state.plan.candidates,
         "skipped": [asdict(skip) for skip in state.plan.skips],
         "horizons": _horizons(state),
         "made": list(state.computed_parts),

@@ -13,6 +13,7 @@ import torch
 import warp as wp
 
 from drgs.maths.constants import F0, MIN_ROUGHNESS
+from drgs.render.integrate.environment_pool import BLOCK_STREAM, BLOCKS
 from drgs.render.integrate.integrator import AbstractIntegrator, Estimate
 from drgs.render.integrate.path_arrays import PathArrays, path_arrays
 from drgs.render.integrate.ray_scene import RayScene
@@ -53,7 +54,8 @@ class FusedScratch:
 
 def _source(name: str) -> str:
     folder = Path(__file__).parent
-    return native_source(folder / name, EMBREE_RAY, folder / "ray_vector.h", constants={"F0": F0, "MIN_ROUGHNESS": MIN_ROUGHNESS})
+    constants = {"F0": F0, "MIN_ROUGHNESS": MIN_ROUGHNESS, "BLOCKS": BLOCKS, "BLOCK_STREAM": BLOCK_STREAM}
+    return native_source(folder / name, EMBREE_RAY, folder / "ray_vector.h", constants=constants)
 
 
 @wp.func_native(_source("start_rays.h"))

@@ -17,6 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from drgs.render.integrate.environment_pool import candidate_pools
 from drgs.render.integrate.ray_scene import ray_scene
 from drgs.render.integrate.sample_rays import point_arrays, sample_set, start_arrays
 from drgs.render.integrate.sum_samples import LightSums
@@ -42,6 +43,8 @@ class IntegratorSettings:
     """Each point shares its samples out by its material (sample_rays.split_at)."""
     split_indirect: bool = False
     """Say how much of the light comes from other surfaces (ShadedPoints.indirect)."""
+    candidates: int = 1
+    """Directions that each environment sample chooses among: 1 or environment_pool.CANDIDATES."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +113,14 @@ class AbstractIntegrator(ABC):
         if ray_count == 0:
             return result
         rounds, first_round = (samples_round, 0) if isinstance(samples_round, Tensor) else (None, samples_round)
+        last_round = first_round if rounds is None else int(rounds.max())
+        lowest = first_round if rounds is None else int(rounds.min())
+        pools = candidate_pools(light, settings.candidates, settings.seed, lowest, last_round, device)
         estimate = Estimate(
             point_arrays(points, rounds),
             start_arrays(starts),
-            ray_scene(light, self.tracer, horizon),
-            sample_set(settings.counts, settings.seed, first_round, settings.by_material),
+            ray_scene(light, self.tracer, horizon, pools),
+            sample_set(settings.counts, settings.seed, first_round, settings.by_material, settings.candidates),
             rays_a_point,
             settings.bounces,
             usable_rays(memory, ray_count, finds_surfaces),

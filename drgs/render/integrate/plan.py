@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 
 import torch
 
+from drgs.render.integrate.environment_pool import CANDIDATES
 from drgs.render.integrate.sample_rays import sample_counts
 from drgs.render.records import FrameInputs, RenderPlan, SampleCounts, Skip
 from drgs.scene.environment import Environment
@@ -22,6 +23,9 @@ EVEN_SKY = 1e-3
 CONCENTRATED = 0.05
 """Spread of a sky (light_spread) below which half of the samples go to it. Measured at 8 samples a pixel, direct light: a dielectric under
 lamps (spread 0.026) has half the error, under a dawn (0.11) a quarter more."""
+WORTH_CHOOSING = 0.15
+"""Spread of a sky below which environment samples choose among several directions (environment_pool.py). Measured over skies of 0.0001 to 0.37
+(docs/decisions/0004): from 0.2 on it no longer pays everywhere."""
 ROUGH = 0.7
 """From this roughness on the lobe of a dielectric is so broad that cosine samples find it."""
 
@@ -80,6 +84,7 @@ def plan_frame(
     skip: bool,
     facts: SceneFacts | None = None,
     skip_error: float = 0.0,
+    counts_given: bool = False,
 ) -> RenderPlan:
     """The plan for a scene's light and a frame's settings.
 
@@ -88,6 +93,7 @@ def plan_frame(
         skip: False leaves nothing out.
         facts: None: nothing is known of the surfaces.
         skip_error: share of the sky that rays may be spared without proof (RenderSettings).
+        counts_given: `counts` are what somebody asked for by name: each of these samples stays one direction.
     """
     if not skip:
         return RenderPlan(counts, False, bounces, ())
@@ -133,4 +139,11 @@ def plan_frame(
             f"at most {100 * skip_error:g} % of the cosine-weighted sky at a point taken for open",
         )
     )
-    return RenderPlan(counts, by_material, bounces, tuple(skips))
+    candidates = 1
+    if counts.environment > 0 and not counts_given and (spread := light_spread(environment)) < WORTH_CHOOSING:
+        candidates = CANDIDATES
+        why = (
+            f"the light comes from {100 * spread:.2g} % of the sky: an environment sample takes one of {candidates} directions, by its BRDF"
+        )
+        skips.append(Skip("rays to lamps that a point hardly reflects", why, "exact in the mean"))
+    return RenderPlan(counts, by_material, bounces, tuple(skips), candidates)

@@ -155,6 +155,69 @@ const auto lobe_at = [&](const Lobes& l, V3 d, v16 n_dot_l, v16& pdf, v16& dv, v
     const v16 c2 = c * c;
     c5 = c2 * c2 * c;
 };
+// block_of and pool_place of environment_pool.py: where a block's numbers begin
+const auto pool_block = [&](const auto& pools, int round, int pool, unsigned block) -> const float* {
+    return pools.numbers.data + (((long)(round - pools.first_round) * 2 + pool) * BLOCKS + block) * (8 * 16);
+};
+const auto block_of = [&](u16 stream, u16 index) -> u16 { return (hash_combine(stream, u16((unsigned)BLOCK_STREAM)) + index) % (unsigned)BLOCKS; };
+// What choose_candidate reads of 16 places, lane by lane: normal, wo, the surface's normal, diffuse BRDF, reflectance at the normal, alpha^2,
+// n.wo, a factor of the density of visible normals, and the part of Smith's lambda that does not depend on the direction.
+struct Places { float number[19][16]; };
+const auto places_of = [&](const Lobes& l, V3 surface, const v16* albedo, v16 metal) -> Places {
+    Places p;
+    const v16 diffuse = (1.0f - metal) * (1.0f / PI), base = F0 * (1.0f - metal), nv = max16(l.n_dot_v, v16(1e-6f));
+    const v16 all[19] = {l.n.x, l.n.y, l.n.z, l.wo.x, l.wo.y, l.wo.z, surface.x, surface.y, surface.z,
+                         albedo[0] * diffuse, albedo[1] * diffuse, albedo[2] * diffuse,
+                         base + albedo[0] * metal, base + albedo[1] * metal, base + albedo[2] * metal,
+                         l.alpha2, nv, 0.5f / (l.bound * l.n_dot_v + l.stretch), sqrt16(nv * nv * (1.0f - l.alpha2) + l.alpha2)};
+    for (int k = 0; k < 19; ++k) store16(p.number[k], all[k]);
+    return p;
+};
+// choose_candidate of environment_pool.py for one lane's place: the 16 candidates of its block side by side. Which is taken, and the sum of
+// all shares over its own; -1 and 0 if none can bring light. Half of lobe_at's roots and divisions: nothing is normalised that need not be.
+const auto choose_candidate = [&](const float* block, const Places& p, int lane, const float* shares, float floor, float u, float& weight) -> int {
+    const auto at = [&](int k) -> float { return p.number[k][lane]; };
+    const V3 d = {load16(block), load16(block + 16), load16(block + 32)};
+    const v16 n_dot_l = at(0) * d.x + at(1) * d.y + at(2) * d.z, above = at(6) * d.x + at(7) * d.y + at(8) * d.z;
+    const i16 possible = (n_dot_l > 0.0f) & (above > 0.0f);
+    weight = 0.0f;
+    if (!any(possible)) return -1;
+    const float alpha2 = at(15), nv = at(16);
+    const V3 h = {d.x + at(3), d.y + at(4), d.z + at(5)};  // of length 2 h.wo
+    const V3 across = cross3({v16(at(0)), v16(at(1)), v16(at(2))}, h);
+    const v16 length2 = max16(dot3(h, h), v16(1e-30f)), n_dot_h = n_dot_l + nv;
+    const v16 spread = dot3(across, across) + n_dot_h * n_dot_h * alpha2;
+    const v16 ggx = alpha2 * length2 * length2 / max16(PI * spread * spread, v16(1e-30f));
+    const v16 c = max16(1.0f - 0.5f * sqrt16(length2), v16(0.0f)), c2 = c * c, c5 = c2 * c2 * c;
+    const v16 lambda = max16(n_dot_l * at(18) + nv * sqrt16(n_dot_l * n_dot_l * (1.0f - alpha2) + alpha2), v16(1e-12f));
+    const v16 density = shares[0] * n_dot_l * (1.0f / PI) + shares[1] * at(17) * ggx + shares[2] * load16(block + 96);
+    const v16 least = floor * load16(block + 112);
+    v16 diffuse = v16(0.0f), at_normal = v16(0.0f), all = v16(0.0f);
+    for (int k = 0; k < 3; ++k) {
+        const v16 light = load16(block + 48 + 16 * k) + least;
+        diffuse += at(9 + k) * light;
+        at_normal += at(12 + k) * light;
+        all += light;
+    }
+    const v16 brought = diffuse * lambda + 0.5f * ggx * (at_normal + (all - at_normal) * c5);
+    const v16 q = select(possible & (density > 0.0f), brought * n_dot_l / max16(density * lambda, v16(1e-37f)), v16(0.0f));
+    const v16 none = v16(0.0f);
+    v16 sum = q;  // running, by doubling
+    sum += __builtin_shufflevector(none, sum, 0, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30);
+    sum += __builtin_shufflevector(none, sum, 0, 1, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29);
+    sum += __builtin_shufflevector(none, sum, 0, 1, 2, 3, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27);
+    sum += __builtin_shufflevector(none, sum, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+    const v16 before = __builtin_shufflevector(none, sum, 0, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30);
+    const float total = sum[15];
+    const i16 reached = (q > 0.0f) & (before <= u * total);
+    const int chosen = __builtin_reduce_max(reached ? __builtin_bit_cast(i16, LANE_NUMBERS) : i16(-1));
+    if (chosen >= 0) {
+        alignas(64) float own[16];
+        store16(own, q);
+        weight = total / own[chosen];
+    }
+    return chosen;
+};
 // Index of the last of `count` running sums that is at most `target`. `coarse` holds 16 of them, `stride` apart; at(i) loads 16 from i on.
 const auto last_sum_below = [&](v16 coarse, int stride, int count, float target, const auto& at) -> int {
     int low = stride * (-__builtin_reduce_add(coarse <= target) - 1);

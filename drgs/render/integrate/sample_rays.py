@@ -72,6 +72,8 @@ class SampleSet:
     round: int
     """Samples already taken: rounds of the same counts."""
     seed: wp.uint32
+    candidates: int
+    """Directions that each environment sample chooses among (environment_pool.py)."""
 
 
 @wp.kernel
@@ -166,13 +168,15 @@ def sampled_direction(
 
 
 @wp.func
-def balance_weight(split: wp.vec3i, light: EnvironmentLight, wi: wp.vec3, wo: wp.vec3, n: wp.vec3, alpha: float, uv: wp.vec3) -> float:
-    """1 / sum_k n_k p_k of a direction above the horizon."""
+def balance_weight(
+    samples: SampleSet, split: wp.vec3i, light: EnvironmentLight, wi: wp.vec3, wo: wp.vec3, n: wp.vec3, alpha: float, uv: wp.vec3
+) -> float:
+    """1 / sum_k n_k p_k of a direction above the horizon; candidates count as samples."""
     density = float(split[0]) * wp.dot(n, wi) / PI
     if split[1] > 0:
         density += float(split[1]) * ggx_pdf(wi, wo, n, alpha)
     if split[2] > 0:
-        density += float(split[2]) * lookup_pdf(light, uv)
+        density += float(split[2] * samples.candidates) * lookup_pdf(light, uv)
     if density <= 0.0:
         return 0.0
     return 1.0 / density
@@ -200,7 +204,7 @@ def sample_directions(
         split = split_at(samples, points, point)
         wi = sampled_direction(samples, split, light, points.pixel[point], round_at(samples, points, point), i % count, wo, n, alpha)
         if wp.dot(n, wi) > 0.0:
-            w = balance_weight(split, light, wi, wo, n, alpha, uv_from_world_direction(light, wi))
+            w = balance_weight(samples, split, light, wi, wo, n, alpha, uv_from_world_direction(light, wi))
     direction[i] = wi
     weight[i] = w
 
@@ -253,13 +257,14 @@ def shading_points(gbuffer: GBuffer, first_pixel: int = 0) -> ShadingPoints:
     return points
 
 
-def sample_set(counts: SampleCounts, seed: int, samples_round: int = 0, by_material: bool = False) -> Any:
+def sample_set(counts: SampleCounts, seed: int, samples_round: int = 0, by_material: bool = False, candidates: int = 1) -> Any:
     """The struct that kernels read."""
     samples = SampleSet()
     samples.by_material = int(by_material)
     samples.cosine, samples.ggx, samples.environment = counts.cosine, counts.ggx, counts.environment
     samples.round = samples_round
     samples.seed = seed & 0xFFFFFFFF
+    samples.candidates = candidates
     return samples
 
 

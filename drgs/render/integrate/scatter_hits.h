@@ -18,7 +18,7 @@ const float* const normals = (const float*)mesh.normals.data;
 const float* const albedos = (const float*)mesh.albedo.data;
 alignas(64) float corner[3][11][16], uv_lane[2][16], arriving[3][16], carried[3][16];
 alignas(64) unsigned pixel_lane[16], index_lane[16], strategy_lane[16];
-int triangles[16];
+int triangles[16], round_lane[16];
 for (int lane = 0; lane < 16; ++lane) {
     const int path = base + min_int(lane, lanes - 1), triangle = from.face.data[path];
     triangles[lane] = triangle;
@@ -44,6 +44,7 @@ for (int lane = 0; lane < 16; ++lane) {
     split_at(samples, points, point, split);
     const int round = samples.round + (points.round.shape[0] > 0 ? points.round.data[point] : 0);
     strategy_of(split, round, ray % count, strategy_lane[lane], index_lane[lane]);
+    round_lane[lane] = round;
     pixel_lane[lane] = (unsigned)points.pixel.data[point];
 }
 const v16 second = load16(uv_lane[0]), third = load16(uv_lane[1]), one = 1.0f - second - third;
@@ -137,13 +138,43 @@ const auto trace = [&](i16 live, V3 d, const v16* light_there, const v16* carrie
 // 4. Towards the environment.
 v16 u0, u1, reflected[3], incoming[3];
 numbers(16u, u0, u1);
-V3 d = draw_environment(scene.light, u0, u1, outside);
-v16 n_dot_l = dot3(n, d);
-i16 live = outside & (n_dot_l > 0.0f) & (dot3(outward, d) > 0.0f);
-v16 table_pdf = look_up(scene.light, d, live, incoming);
-v16 density = reflect(d, n_dot_l, reflected) + table_pdf;
+const bool chooses = samples.candidates > 1 && depth == 0;
+const float candidates = chooses ? (float)samples.candidates : 1.0f;
+V3 d;
+v16 n_dot_l, table_pdf, chosen_weight = v16(1.0f);
+i16 live;
+if (chooses) {
+    alignas(64) float choice[8][16] = {};  // direction, radiance and density of what was chosen, and the factor of its weight
+    alignas(64) int outside_lane[16];
+    alignas(64) unsigned block_lane[16];
+    alignas(64) float u_lane[16], share_lane[16];
+    *(i16*)outside_lane = outside;
+    *(u16*)block_lane = block_of(hash_combine(stream, u16(16u)), index);
+    store16(u_lane, u0);
+    store16(share_lane, share);
+    const Places places = places_of(lobes, outward, albedo, metallic);
+    for (int lane = 0; lane < lanes; ++lane) {
+        if (outside_lane[lane] == 0) continue;
+        const float* const block = pool_block(scene.pools, round_lane[lane], 1, block_lane[lane]);
+        const float shares[3] = {1.0f - share_lane[lane], share_lane[lane], candidates};
+        const int chosen = choose_candidate(block, places, lane, shares, 0.0f, u_lane[lane], choice[7][lane]);
+        for (int k = 0; k < 7 && chosen >= 0; ++k) choice[k][lane] = block[16 * k + chosen];
+    }
+    d = {load16(choice[0]), load16(choice[1]), load16(choice[2])};
+    n_dot_l = dot3(n, d);
+    chosen_weight = load16(choice[7]);
+    live = outside & (chosen_weight > 0.0f) & (n_dot_l > 0.0f) & (dot3(outward, d) > 0.0f);
+    for (int k = 0; k < 3; ++k) incoming[k] = load16(choice[3 + k]);
+    table_pdf = load16(choice[6]);
+} else {
+    d = draw_environment(scene.light, u0, u1, outside);
+    n_dot_l = dot3(n, d);
+    live = outside & (n_dot_l > 0.0f) & (dot3(outward, d) > 0.0f);
+    table_pdf = look_up(scene.light, d, live, incoming);
+}
+v16 density = reflect(d, n_dot_l, reflected) + candidates * table_pdf;
 live &= density > 0.0f;
-for (int k = 0; k < 3; ++k) incoming[k] *= reflected[k] / max16(density, v16(1e-37f));
+for (int k = 0; k < 3; ++k) incoming[k] *= reflected[k] * chosen_weight / max16(density, v16(1e-37f));
 trace(live, d, incoming, nullptr);
 
 // 5. Along one of the lobes, and on.
@@ -161,7 +192,7 @@ if (depth > 0) {
     survival = min16(max16(max16(reflected[0], max16(reflected[1], reflected[2])) / max16(own, v16(1e-37f)), v16(0.05f)), v16(1.0f));
 }
 for (int k = 0; k < 3; ++k) {
-    incoming[k] *= reflected[k] / max16(own + table_pdf, v16(1e-37f));
+    incoming[k] *= reflected[k] / max16(own + candidates * table_pdf, v16(1e-37f));
     onward[k] = select(chance < survival, reflected[k] / max16(own * survival, v16(1e-37f)), v16(0.0f));
 }
 trace(live, d, incoming, onward);

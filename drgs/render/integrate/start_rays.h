@@ -17,7 +17,7 @@ const float* const triangles = (const float*)starts.surface_normal.data;
 v16 normal_at[3], wo_at[3], triangle_at[3], albedo_at[3], split_there[3], roughness = v16(0.0f), metal = v16(0.0f);
 for (int k = 0; k < 3; ++k) normal_at[k] = wo_at[k] = triangle_at[k] = albedo_at[k] = split_there[k] = v16(0.0f);
 u16 pixel = u16(0u), index = u16(0u), strategy = u16(0u);
-int point_lane[16];
+int point_lane[16], round_lane[16];
 for (int lane = 0; lane < lanes;) {
     const int ray = first + base + lane, point = ray / count, slot = ray - point * count;
     const long at = 3 * (long)point;
@@ -43,19 +43,45 @@ for (int lane = 0; lane < lanes;) {
     }
     roughness = select(here, v16(points.roughness.data[point]), roughness);
     metal = select(here, v16(points.metallic.data[point]), metal);
-    for (const int end = min_int(16, lane + count - slot); lane < end; ++lane) point_lane[lane] = point;
+    for (const int end = min_int(16, lane + count - slot); lane < end; ++lane) {
+        point_lane[lane] = point;
+        round_lane[lane] = round;
+    }
 }
 const V3 n = {normal_at[0], normal_at[1], normal_at[2]}, triangle = {triangle_at[0], triangle_at[1], triangle_at[2]};
 const Lobes lobes = lobes_of(n, {wo_at[0], wo_at[1], wo_at[2]}, roughness);
 
 // 2. Two numbers a ray.
 v16 u0, u1;
-sobol_pair(index, hash_combine(hash_combine(u16(samples.seed), pixel), strategy), u0, u1);
+const u16 stream = hash_combine(hash_combine(u16(samples.seed), pixel), strategy);
+sobol_pair(index, stream, u0, u1);
 
-// 3. Directions: cosine and GGX for all lanes, the environment's table in the lanes that drew it.
+// 3. Directions: cosine and GGX for all lanes, the environment's table in the lanes that drew it, or the best of a block of its pool.
 const i16 is_environment = strategy == 2u;
 V3 d = lobe_direction(lobes, u0, u1, strategy == 0u);
-if (any(is_environment)) {
+const bool chooses = samples.candidates > 1;
+const v16 environment_share = split_there[2] * (float)samples.candidates;
+alignas(64) float choice[8][16] = {};  // direction, radiance and density of what was chosen, and the factor of its weight
+if (chooses && any(is_environment)) {
+    alignas(64) int choosing_lane[16];
+    alignas(64) unsigned block_lane[16];
+    alignas(64) float u_lane[16], share_lane[3][16];
+    *(i16*)choosing_lane = is_environment & (lobes.n_dot_v > 0.0f);
+    *(u16*)block_lane = block_of(stream, index);
+    store16(u_lane, u0);
+    store16(share_lane[0], split_there[0]);
+    store16(share_lane[1], split_there[1]);
+    store16(share_lane[2], environment_share);
+    const Places places = places_of(lobes, triangle, albedo_at, metal);
+    for (int lane = 0; lane < lanes; ++lane) {
+        if (choosing_lane[lane] == 0) continue;
+        const float* const block = pool_block(scene.pools, round_lane[lane], 0, block_lane[lane]);
+        const float shares[3] = {share_lane[0][lane], share_lane[1][lane], share_lane[2][lane]};
+        const int chosen = choose_candidate(block, places, lane, shares, bounces > 0 ? 1.0f : 0.0f, u_lane[lane], choice[7][lane]);
+        for (int k = 0; k < 7 && chosen >= 0; ++k) choice[k][lane] = block[16 * k + chosen];
+    }
+    d = {select(is_environment, load16(choice[0]), d.x), select(is_environment, load16(choice[1]), d.y), select(is_environment, load16(choice[2]), d.z)};
+} else if (any(is_environment)) {
     const V3 drawn = draw_environment(scene.light, u0, u1, is_environment);
     d = {select(is_environment, drawn.x, d.x), select(is_environment, drawn.y, d.y), select(is_environment, drawn.z, d.z)};
 }
@@ -65,15 +91,23 @@ i16 live = (lobes.n_dot_v > 0.0f) & (n_dot_l > 0.0f) & (above > 0.0f);
 
 // 4. The environment there.
 v16 seen[3];
-const v16 table_pdf = look_up(scene.light, d, live, seen);
+v16 table_pdf;
+if (chooses) {
+    live &= ~is_environment | (load16(choice[7]) > 0.0f);
+    table_pdf = select(is_environment, load16(choice[6]), look_up(scene.light, d, live & ~is_environment, seen));
+    for (int k = 0; k < 3; ++k) seen[k] = select(is_environment, load16(choice[3 + k]), seen[k]);
+} else {
+    table_pdf = look_up(scene.light, d, live, seen);
+}
 if (bounces == 0) live &= max16(seen[0], max16(seen[1], seen[2])) > 0.0f;
 
 // 5. Weight and specular reflection.
 v16 ggx_pdf, dv, c5;
 lobe_at(lobes, d, n_dot_l, ggx_pdf, dv, c5);
-const v16 density = split_there[0] * n_dot_l * (1.0f / PI) + split_there[1] * ggx_pdf + split_there[2] * table_pdf;
+const v16 density = split_there[0] * n_dot_l * (1.0f / PI) + split_there[1] * ggx_pdf + environment_share * table_pdf;
 live &= density > 0.0f;
-const v16 w = select(live, n_dot_l / max16(density, v16(1e-37f)), v16(0.0f));
+v16 w = select(live, n_dot_l / max16(density, v16(1e-37f)), v16(0.0f));
+if (chooses) w = select(is_environment, w * load16(choice[7]), w);
 dv *= w;
 alignas(64) int live_lane[16];
 alignas(64) float result[10][16];

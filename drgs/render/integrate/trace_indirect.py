@@ -1,9 +1,10 @@
 """Outgoing light of the surfaces that rays meet: a path traced from each hit.
 
 In: first hits of a batch of rays. Out: radiance that each hit sends back along its ray; 0 for rays without a hit.
-A hit takes material and shading normal from the mesh's vertices. Its direct light is one sample of the environment table
-and one of the BRDF under the balance heuristic, each with its own shadow ray; the BRDF ray carries the path on while
-bounces are left, ended by Russian roulette from the second hit onwards. Nothing is clamped or cached.
+A hit takes material and shading normal from the mesh's vertices. Its direct light is one sample of the environment table (where samples
+choose, one of a block of candidates at the first hit: environment_pool.py) and one of the BRDF under the balance heuristic, each with its
+own shadow ray; the BRDF ray carries the path on while bounces are left, ended by Russian roulette from the second hit onwards. Nothing is
+clamped or cached.
 The back of a triangle sends nothing. Twin of the kernel: drgs/reference/scatter_hits.py.
 """
 
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from drgs.maths.constants import F0, VOID_ORIGIN
 from drgs.render.integrate.brdf_warp import PI, alpha_of, cosine_direction, ggx_direction, ggx_pdf, specular_brdf
+from drgs.render.integrate.environment_pool import AT_SURFACES, block_of, candidate_direction, choose_candidate, pool_place
 from drgs.render.integrate.environment_table import environment_direction, lookup_pdf, lookup_radiance, uv_from_world_direction
 from drgs.render.integrate.integrator import Estimate
 from drgs.render.integrate.path_arrays import PathArrays
@@ -61,6 +63,33 @@ def specular_share(surface: Surface, n_dot_v: float) -> float:
     return wp.clamp(specular / (specular + diffuse), 0.1, 1.0)
 
 
+@wp.func
+def direction_to_light(
+    scene: RayScene,
+    candidates: float,
+    samples_round: int,
+    seed: wp.uint32,
+    index: wp.uint32,
+    u: wp.vec2,
+    share: float,
+    surface: Surface,
+    wo: wp.vec3,
+    alpha: float,
+) -> wp.vec4:
+    """Where a ray towards the environment goes, drawn from the table or chosen among candidates, and a factor of its weight; zeros: nowhere."""
+    if candidates == 1.0:
+        wi = environment_direction(scene.light, u)
+        return wp.vec4(wi[0], wi[1], wi[2], 1.0)
+    block = pool_place(samples_round - scene.pools.first_round, AT_SURFACES, block_of(seed, index))
+    shares = wp.vec3(1.0 - share, share, candidates)
+    n = surface.normal
+    choice = choose_candidate(scene.pools, block, shares, 0.0, u[0], wo, n, surface.face_normal, alpha, surface.albedo, surface.metallic)
+    if choice[0] < 0.0:
+        return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    chosen = candidate_direction(scene.pools, block, int(choice[0]))
+    return wp.vec4(chosen[0], chosen[1], chosen[2], choice[1])
+
+
 @wp.kernel
 def scatter_hits(
     paths: PathArrays,
@@ -94,9 +123,9 @@ def scatter_hits(
     count = samples.cosine + samples.ggx + samples.environment
     ray = int(paths.ray[i])
     point = first_point + ray // count
-    pixel = points.pixel[point]
-    strategy = strategy_of(split_at(samples, points, point), round_at(samples, points, point), ray % count)
-    base = strategy_seed(samples, pixel, strategy[0])
+    round_ = round_at(samples, points, point)
+    strategy = strategy_of(split_at(samples, points, point), round_, ray % count)
+    base = strategy_seed(samples, points.pixel[point], strategy[0])
     index = wp.uint32(strategy[1])
     seed_light = hash_combine(base, wp.uint32(16 + 4 * depth))
     seed_brdf = hash_combine(base, wp.uint32(17 + 4 * depth))
@@ -108,17 +137,19 @@ def scatter_hits(
     start = surface.position + scene.mesh.lift * surface.face_normal
     share = specular_share(surface, n_dot_v)
     carried = paths.throughput[i]
-    wi = environment_direction(scene.light, u_light)
+    candidates = wp.where(depth == 0, float(samples.candidates), 1.0)
+    to_light = direction_to_light(scene, candidates, round_, seed_light, index, u_light, share, surface, wo, alpha)
+    wi = wp.vec3(to_light[0], to_light[1], to_light[2])
     n_dot_l = wp.dot(n, wi)
     if n_dot_l > 0.0 and wp.dot(surface.face_normal, wi) > 0.0:
         uv = uv_from_world_direction(scene.light, wi)
-        density = lookup_pdf(scene.light, uv) + share * ggx_pdf(wi, wo, n, alpha) + (1.0 - share) * n_dot_l / PI
+        density = candidates * lookup_pdf(scene.light, uv) + share * ggx_pdf(wi, wo, n, alpha) + (1.0 - share) * n_dot_l / PI
         if density > 0.0:
             limit = face_limit(scene.mesh, paths.face[i], surface.face_normal, wi)
             scattered.origin[i] = wp.where(wp.dot(surface.face_normal, wi) <= limit, start, far_along(wi))
             scattered.direction[i] = wi
-            incoming = lookup_radiance(scene.light, uv)
-            scattered.contribution[i] = wp.cw_mul(carried, wp.cw_mul(brdf_times_cosine(surface, wi, wo, alpha), incoming)) / density
+            reflected = wp.cw_mul(carried, wp.cw_mul(brdf_times_cosine(surface, wi, wo, alpha), lookup_radiance(scene.light, uv)))
+            scattered.contribution[i] = reflected * to_light[3] / density
 
     if u_choice[0] < share:  # noqa: SIM108 (a Warp expression would evaluate both)
         wi = ggx_direction(u_brdf, wo, n, alpha)
@@ -133,7 +164,8 @@ def scatter_hits(
             limit = face_limit(scene.mesh, paths.face[i], surface.face_normal, wi)
             scattered.origin[j] = wp.where(wp.dot(surface.face_normal, wi) <= limit, start, far_along(wi))
             scattered.direction[j] = wi
-            scattered.contribution[j] = wp.cw_mul(reflected, lookup_radiance(scene.light, uv)) / (own + lookup_pdf(scene.light, uv))
+            density = own + candidates * lookup_pdf(scene.light, uv)
+            scattered.contribution[j] = wp.cw_mul(reflected, lookup_radiance(scene.light, uv)) / density
             survival = wp.float32(1.0)
             if depth > 0:
                 survival = wp.clamp(wp.max(reflected) / own, 0.05, 1.0)

@@ -11,10 +11,22 @@ import warp as wp
 
 from drgs.maths.constants import VOID_ORIGIN
 from drgs.render.integrate.brdf_warp import alpha_of, specular_brdf
+from drgs.render.integrate.environment_pool import AT_POINTS, block_of, candidate_direction, choose_candidate, pool_place
 from drgs.render.integrate.environment_table import lookup_radiance, uv_from_world_direction
 from drgs.render.integrate.integrator import AbstractIntegrator, Estimate
+from drgs.render.integrate.random_warp import sobol_2d
 from drgs.render.integrate.ray_scene import RayScene
-from drgs.render.integrate.sample_rays import PointArrays, SampleSet, StartArrays, balance_weight, round_at, sampled_direction, split_at
+from drgs.render.integrate.sample_rays import (
+    PointArrays,
+    SampleSet,
+    StartArrays,
+    balance_weight,
+    round_at,
+    sampled_direction,
+    split_at,
+    strategy_of,
+    strategy_seed,
+)
 from drgs.render.integrate.sum_samples import RaySamples, ray_samples, sum_samples
 from drgs.render.integrate.trace_indirect import add_contributions, paths_of_hits, scatter_hits, trace_indirect
 from drgs.render.intersect.mesh_surface import face_limit, far_along
@@ -55,10 +67,26 @@ def start_rays(
     seen = wp.vec3(0.0, 0.0, 0.0)
     if wp.dot(n, wo) > 0.0:
         split = split_at(samples, points, point)
-        candidate = sampled_direction(
-            samples, split, scene.light, points.pixel[point], round_at(samples, points, point), (first + i) % count, wo, n, alpha
-        )
+        round_ = round_at(samples, points, point)
+        slot = (first + i) % count
         surface_normal = starts.surface_normal[point]
+        chosen = wp.float32(1.0)
+        candidate = wp.vec3(0.0, 0.0, 0.0)
+        strategy = strategy_of(split, round_, slot)
+        if samples.candidates > 1 and strategy[0] == 2:
+            stream = strategy_seed(samples, points.pixel[point], 2)
+            at = pool_place(round_ - scene.pools.first_round, AT_POINTS, block_of(stream, wp.uint32(strategy[1])))
+            shares = wp.vec3(float(split[0]), float(split[1]), float(split[2] * samples.candidates))
+            floor = wp.where(bounces > 0, 1.0, 0.0)
+            u = sobol_2d(wp.uint32(strategy[1]), stream)
+            choice = choose_candidate(
+                scene.pools, at, shares, floor, u[0], wo, n, surface_normal, alpha, points.albedo[point], points.metallic[point]
+            )
+            chosen = choice[1]
+            if chosen > 0.0:
+                candidate = candidate_direction(scene.pools, at, int(choice[0]))
+        else:
+            candidate = sampled_direction(samples, split, scene.light, points.pixel[point], round_, slot, wo, n, alpha)
         if wp.dot(n, candidate) > 0.0 and wp.dot(surface_normal, candidate) > 0.0:
             uv = uv_from_world_direction(scene.light, candidate)
             seen = lookup_radiance(scene.light, uv)
@@ -68,7 +96,7 @@ def start_rays(
                     limit = face_limit(scene.mesh, starts.face[point], surface_normal, candidate)
                 start = wp.where(wp.dot(surface_normal, candidate) <= limit, starts.origin[point], far_along(candidate))
                 wi = candidate
-                w = balance_weight(split, scene.light, wi, wo, n, alpha, uv) * wp.dot(n, wi)
+                w = balance_weight(samples, split, scene.light, wi, wo, n, alpha, uv) * wp.dot(n, wi) * chosen
                 f = w * specular_brdf(wi, wo, n, alpha, points.albedo[point], points.metallic[point])
     origin[i] = start
     direction[i] = wi

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from drgs.render.integrate.choose_integrator import choose_integrator
+from drgs.render.integrate.environment_pool import ROUNDS_KEPT
 from drgs.render.integrate.integrator import IntegratorSettings
 from drgs.render.intersect.horizon import usable_horizons
 from drgs.render.intersect.ray_memory import RayMemory
@@ -31,6 +32,8 @@ SLICES_A_THREAD = (2, 8)
 cost twice another's; many are worth it where each still holds half of PIXELS_AT_ONCE."""
 PIXELS_AT_ONCE = 32768
 """Camera rays that a thread takes together, of as many passes as that makes: Python's share of the time falls with it."""
+POOLS_AT_ONCE = 16
+"""Passes that a thread takes together at most where samples choose: their pools (environment_pool.py) then take 2 MiB."""
 
 
 def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> FrameState:
@@ -69,6 +72,8 @@ def _passes_at_once(state: FrameState, chosen: Tensor, index: int, passes: int) 
         return 1
     if state.inputs.settings.target_error is not None:
         passes = min(passes, max(MIN_PASSES, 1 << index.bit_length()) - index)  # the next look
+    if state.plan.candidates > 1:
+        passes = min(passes, ROUNDS_KEPT)  # so that all slices find the same pools
     behind = state.tiles.passes[state.tiles.active & ~chosen]
     return min(passes, int(behind.min()) - index) if len(behind) else passes
 
@@ -94,6 +99,7 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
 
     def work(first: int, last: int) -> tuple[int, float, Tensor | None]:
         points, tracing, at_once = 0, 0.0, max(1, PIXELS_AT_ONCE // (last - first))
+        at_once = min(at_once, POOLS_AT_ONCE) if state.plan.candidates > 1 else at_once
         for round_ in range(index, index + count, at_once):
             began = time.perf_counter()
             together = min(at_once, index + count - round_)
@@ -143,7 +149,7 @@ def _shade_and_add(state: FrameState, primary: PrimaryPoints, index: int | Tenso
     """Light of the points of pass `index`, or of several passes, added to the sums of their pixels."""
     plan, settings, traced = state.plan, state.inputs.settings, state.traced
     horizon = usable_horizons(traced.tracer.horizons, settings.skip_error) if settings.skip else None
-    how = IntegratorSettings(plan.counts, plan.bounces, settings.seed, plan.by_material, settings.split_indirect)
+    how = IntegratorSettings(plan.counts, plan.bounces, settings.seed, plan.by_material, settings.split_indirect, plan.candidates)
     integrator = choose_integrator(traced.tracer)
     light = integrator.shade(primary.points, primary.starts, traced.environment_light, how, index, memory, horizon)
     add_estimate(state.sums, primary, light, state.inputs.first_pixel)

@@ -134,9 +134,17 @@ def _trace_scene(inputs: FrameInputs, tracer: AbstractTracer | None, reuse: Reus
     clock.lap("build_tracer")
     before = reuse.keeps("environment_table")
     table = build_environment_table(scene.environment) if before is None else before.traced.environment_table
-    light = environment_light(table, scene.environment_rotation_degrees, scene.environment_intensity)
+    turned_and_bright = _turned_and_bright(scene)
+    if before is not None and turned_and_bright == _turned_and_bright(before.inputs.scene):
+        light = before.traced.environment_light  # and the pools that are kept with it
+    else:
+        light = environment_light(table, *turned_and_bright)
     clock.lap("environment_table")
     return TracedScene(tracer, table, light)
+
+
+def _turned_and_bright(scene: PosedScene) -> tuple[float, float]:
+    return scene.environment_rotation_degrees, scene.environment_intensity
 
 
 def _spend_samples(inputs: FrameInputs, empty_tiles: int, tiles: int, reuse: Reuse) -> RenderPlan:
@@ -152,6 +160,7 @@ def _spend_samples(inputs: FrameInputs, empty_tiles: int, tiles: int, reuse: Reu
         settings.skip,
         scene_facts(scene, empty_tiles, tiles),
         settings.skip_error,
+        counts_given=settings.counts is not None,
     )
 
 

@@ -8,6 +8,7 @@ import torch
 
 from drgs.render.film.resolve_frame import resolve_frame
 from drgs.render.integrate.choose_integrator import choose_integrator
+from drgs.render.integrate.environment_pool import CANDIDATES
 from drgs.render.integrate.environment_table import build_environment_table, environment_light
 from drgs.render.integrate.integrator import IntegratorSettings
 from drgs.render.integrate.plan import SceneFacts, light_spread, plan_frame, scene_facts
@@ -206,3 +207,28 @@ def test_a_black_sky_with_one_bright_texel_is_not_black() -> None:
     sky = constant_sky(0.0).radiance.clone()
     sky[3, 7] = 1e-3
     assert "light rays" not in skipped(PosedScene(None, sphere_mesh(1), Environment(sky)))
+
+
+def test_samples_of_the_environment_choose_where_light_is_not_all_around() -> None:
+    counts = SampleCounts(16, 8, 8)
+    plan = plan_frame(sunny_sky(sun=200.0), 1.0, counts, 1, skip=True)
+    assert plan.candidates == CANDIDATES and "one of 16 directions" in plan.skips[-1].why
+    faint = Environment(1 + 0.1 * sunny_sky(sun=1.0).radiance)
+    plans = [
+        plan_frame(faint, 1.0, counts, 1, skip=True),
+        plan_frame(constant_sky(), 1.0, counts, 1, skip=True),
+        plan_frame(constant_sky(0.0), 1.0, counts, 1, skip=True),
+        plan_frame(sunny_sky(sun=200.0), 1.0, counts, 1, skip=False),
+        plan_frame(sunny_sky(sun=200.0), 1.0, counts, 1, skip=True, counts_given=True),
+        plan_frame(sunny_sky(sun=200.0), 1.0, SampleCounts(16, 16, 0), 1, skip=True),
+    ]
+    assert [plan.candidates for plan in plans] == 6 * [1]
+
+
+def test_a_frame_says_whether_its_samples_chose() -> None:
+    scene = PosedScene(None, sphere_mesh(), sunny_sky())
+    free, given = (
+        render_frame(scene, front_camera(16), RenderSettings(samples_per_pixel=32, counts=counts))
+        for counts in (None, SampleCounts(4, 2, 2))
+    )
+    assert free.metadata["candidates"] == CANDIDATES and given.metadata["candidates"] == 1
