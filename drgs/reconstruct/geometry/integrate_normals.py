@@ -33,7 +33,7 @@ UNFOLDINGS = 8
 class IntegrationSettings:
     """How much each part counts."""
 
-    outline_weight: float = 0.05
+    outline_weight: float = 0.2
     """Of a pixel of outline, squared, against an edge across its normal by a radian."""
     anchor: float = 1e-3
     """Of a mean edge's length moved."""
@@ -82,15 +82,14 @@ def integrate_normals(
     length = across.norm(dim=1).clamp(min=1e-30)
     tilt = (across * normal).sum(1) / length
     by_start, by_end = (direction[start] * normal).sum(1) / length, -(direction[end] * normal).sum(1) / length
-    first, second = edges.vertices[outlines.edge].unbind(1)
-    by_first, by_second = (0.5 * (outlines.gradient * direction[corner]).sum(1) for corner in (first, second))
+    by_corners = outlines.weights * (outlines.gradient[:, None] * direction[outlines.corners]).sum(-1)
 
-    edge_count, outline_count, count = len(tilt), len(outlines.edge), len(vertices)
+    edge_count, outline_count, count = len(tilt), len(outlines.distance), len(vertices)
     row = torch.arange(edge_count, device=vertices.device)
     outline_row = edge_count + torch.arange(outline_count, device=vertices.device)
-    rows = _numpy(torch.cat([row, row, outline_row, outline_row]))
-    columns = _numpy(torch.cat([start, end, first, second]))
-    values = _numpy(torch.cat([by_start, by_end, by_first, by_second]).double())
+    rows = _numpy(torch.cat([row, row, outline_row.repeat_interleave(3)]))
+    columns = _numpy(torch.cat([start, end, outlines.corners.flatten()]))
+    values = _numpy(torch.cat([by_start, by_end, by_corners.flatten()]).double())
     jacobian = csr_matrix((values, (rows, columns)), shape=(edge_count + outline_count, count))
     residual = _numpy(torch.cat([tilt, outlines.distance]).double())
     outline_length = settings.outline_weight * _numpy(outlines.length.double())

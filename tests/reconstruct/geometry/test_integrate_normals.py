@@ -36,7 +36,7 @@ def solved(mesh: TriangleMesh, wanted: torch.Tensor, settings: IntegrationSettin
     cameras, outlines = views_of_a_unit_sphere()
     edges = mesh_edges(mesh.faces)
     for _ in range(rounds):
-        residuals = outline_residuals(edges, build_tracer(mesh), cameras, outlines)
+        residuals = outline_residuals(build_tracer(mesh), cameras, outlines)
         vertices = integrate_normals(mesh.vertices, mesh.faces, wanted, edges, residuals, settings)
         mesh = dataclasses.replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces))
     return mesh.vertices
@@ -67,7 +67,7 @@ def test_what_nothing_holds_goes_home():
     """The same normals everywhere: a sheet may lie at any depth, and lies where it began."""
     true = sphere_mesh(subdivisions=3)
     edges = mesh_edges(true.faces)
-    none = outline_residuals(edges, build_tracer(true), (), [])
+    none = outline_residuals(build_tracer(true), (), [])
     radii = []
     for homeward in (None, -0.03 * true.vertices):
         vertices = true.vertices
@@ -84,7 +84,7 @@ def test_a_mesh_of_any_size_is_moved_in_proportion():
     true = sphere_mesh(subdivisions=3)
     bumpy = true.vertices * (1 + 0.02 * torch.sin(9 * true.vertices).prod(1, keepdim=True))
     edges = mesh_edges(true.faces)
-    none = outline_residuals(edges, build_tracer(true), (), [])
+    none = outline_residuals(build_tracer(true), (), [])
     results = [
         integrate_normals(scale * bumpy, true.faces, true.normals, edges, none, IntegrationSettings()) / scale for scale in (1.0, 1e3)
     ]

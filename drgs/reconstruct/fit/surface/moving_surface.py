@@ -72,7 +72,7 @@ class MovingSurface:
         parameters = self._state.parameters
         normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
         for _ in range(settings.solves):
-            residuals = outline_residuals(self.edges, self.tracer, self._cameras, self._outlines)
+            residuals = outline_residuals(self.tracer, self._cameras, self._outlines)
             vertices, homeward = parameters["vertices"], parameters["homeward"]
             # Of metal mirrors say where it lies.
             homes = Homes(homeward, (-parameters["metal"]).clamp(0, 1))
