@@ -83,7 +83,7 @@ def choose_directions(
     n, wo, albedo = (v[:, None].expand_as(blocks.direction) for v in (of_sample.normal_world, of_sample.wo_world, of_sample.albedo))
     roughness, metallic = (v[:, None].expand_as(weight) for v in (of_sample.roughness, of_sample.metallic))
     brdf = torch.add(*evaluate_brdf(blocks.direction, wo, n, albedo, roughness, metallic))
-    light = blocks.radiance + (blocks.floor if settings.bounces > 0 else torch.zeros_like(blocks.floor))[..., None]
+    light = blocks.radiance + blocks.floor[..., None]
     cosine = (n * blocks.direction).sum(-1).clamp(min=0)
     is_above = (blocks.direction * starts.surface_normal_world[point, None]).sum(-1) > 0
     u = sobol_2d(index[point, slot], stream[point, slot], weight.dtype)[:, 0]

@@ -77,7 +77,8 @@ if (chooses && any(is_environment)) {
         if (choosing_lane[lane] == 0) continue;
         const float* const block = pool_block(scene.pools, round_lane[lane], 0, block_lane[lane]);
         const float shares[3] = {share_lane[0][lane], share_lane[1][lane], share_lane[2][lane]};
-        const int chosen = choose_candidate(block, places, lane, shares, bounces > 0 ? 1.0f : 0.0f, u_lane[lane], choice[7][lane]);
+        // With the floor even where no bounces follow: the same rays with and without them say what they add.
+        const int chosen = choose_candidate(block, places, lane, shares, 1.0f, u_lane[lane], choice[7][lane]);
         for (int k = 0; k < 7 && chosen >= 0; ++k) choice[k][lane] = block[16 * k + chosen];
     }
     d = {select(is_environment, load16(choice[0]), d.x), select(is_environment, load16(choice[1]), d.y), select(is_environment, load16(choice[2]), d.z)};

@@ -77,7 +77,7 @@ def start_rays(
             stream = strategy_seed(samples, points.pixel[point], 2)
             at = pool_place(round_ - scene.pools.first_round, AT_POINTS, block_of(stream, wp.uint32(strategy[1])))
             shares = wp.vec3(float(split[0]), float(split[1]), float(split[2] * samples.candidates))
-            floor = wp.where(bounces > 0, 1.0, 0.0)
+            floor = 1.0  # without bounces too: the same rays with and without them say what they add
             u = sobol_2d(wp.uint32(strategy[1]), stream)
             choice = choose_candidate(
                 scene.pools, at, shares, floor, u[0], wo, n, surface_normal, alpha, points.albedo[point], points.metallic[point]
