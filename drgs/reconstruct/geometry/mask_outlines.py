@@ -6,7 +6,7 @@ are used as such, instead of through the blurred rim that surfels draw.
 
 The mesh's outline is looked for by rays, from each place of the mask's outline along its normal: where they begin to miss. Edges between a face
 that looks here and one that looks away are no measure of it: on a mesh whose faces tilt by a degree or two they zigzag within the outline, on the
-very truth by 0.1 to 0.3 pixels, and a surface that is held to them is that much too large.
+very truth, meshed anew, by 0.1 to 0.2 pixels, and a surface that is held to them is that much too large.
 """
 
 from dataclasses import dataclass

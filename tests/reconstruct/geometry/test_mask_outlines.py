@@ -115,3 +115,11 @@ def test_a_mask_that_ends_with_the_picture_says_nothing_there():
     found = residuals(dataclasses.replace(ball, vertices=ball.vertices + beside * right), mask)
     place = (ball.vertices[found.corners] * found.weights[..., None]).sum(1) @ right
     assert float(place.max()) < 0.5
+
+
+def test_a_mesh_that_ends_nowhere_near_the_mask_says_nothing():
+    far = residuals(sphere_mesh(radius=0.3), disc_mask(outline_radius()))
+    cut = torch.zeros(SIZE, SIZE)
+    cut[:, :1] = 1.0  # its outline lies within the margin, all of it
+    for nothing in (far, residuals(sphere_mesh(), cut)):
+        assert nothing.corners.shape == nothing.gradient.shape == (0, 3) and len(nothing.distance) == len(nothing.length) == 0
