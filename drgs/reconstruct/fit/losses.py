@@ -119,3 +119,21 @@ def texel_areas(environment_radiance: Float[Tensor, "rows columns 3"]) -> Float[
     height, width, _ = environment_radiance.shape
     edges = torch.cos(torch.linspace(0, torch.pi, height + 1, device=environment_radiance.device))
     return ((edges[:-1] - edges[1:]) / (2 * width))[:, None, None]
+
+
+def crossed_halves(
+    first: Float[Tensor, "*pixels 3"], second: Float[Tensor, "*pixels 3"], photo: Float[Tensor, "*pixels 3"]
+) -> Float[Tensor, ""]:
+    """Scalar: the mean absolute error of the mean of two independent estimates; its gradient takes the sign from one and the derivative from
+    the other, in turn (Nicolet et al. 2023; docs/sources.md: nicolet2023). With one estimate for both it leans towards low variance."""
+    crossed = 0.5 * (torch.sign(first.detach() - photo) * second + torch.sign(second.detach() - photo) * first)
+    value = (0.5 * (first + second).detach() - photo).abs().mean()
+    return value + (crossed - crossed.detach()).mean()
+
+
+def crossed_squares(
+    first: Float[Tensor, "*pixels 3"], second: Float[Tensor, "*pixels 3"], photo: Float[Tensor, "*pixels 3"]
+) -> Float[Tensor, "*pixels"]:
+    """(...) squared error of what two independent estimates are of, in the mean over draws; may be negative. The square of one estimate
+    counts its noise as well."""
+    return ((first - photo) * (second - photo)).mean(-1)

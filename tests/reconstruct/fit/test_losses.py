@@ -10,6 +10,8 @@ from skimage.metrics import structural_similarity
 from drgs.maths.color import linear_from_srgb
 from drgs.reconstruct.fit.losses import (
     SSIM_RADIUS,
+    crossed_halves,
+    crossed_squares,
     display_image,
     edge_aware_smoothness,
     mask_loss,
@@ -177,3 +179,31 @@ def test_even_light_is_not_rough_and_a_step_counts_the_same_at_the_seam_and_at_a
     assert float(rough_light(middle)) > 0
     assert float(rough_light(seam)) == pytest.approx(float(rough_light(middle)))
     assert float(rough_light(100 * middle)) == pytest.approx(float(rough_light(middle)), rel=1e-4)
+
+
+def test_the_gradient_of_crossed_halves_does_not_lean_towards_low_variance():
+    # An estimate of 1 with noise in proportion to its parameter: with one set for value and derivative the gradient of |estimate - 1| is
+    # the noise's mean size; with crossed sets it is 0 in the mean.
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(2, 200_000, 3, generator=generator)
+    spread = torch.tensor(0.3, requires_grad=True)
+    photo = torch.ones(200_000, 3)
+    halves = [1 + spread * noise[k] for k in (0, 1)]
+    (crossed,) = torch.autograd.grad(crossed_halves(*halves, photo), spread, retain_graph=True)
+    (plain,) = torch.autograd.grad((halves[0] - photo).abs().mean(), spread)
+    assert abs(float(crossed)) < 0.01 < 0.7 < float(plain)
+
+
+def test_the_value_of_crossed_halves_is_the_error_of_their_mean():
+    halves = [torch.full((4, 3), value, requires_grad=True) for value in (0.2, 0.6)]
+    loss = crossed_halves(*halves, torch.full((4, 3), 0.5)).detach()
+    assert abs(float(loss) - 0.1) < 1e-6
+
+
+def test_crossed_squares_do_not_count_noise():
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.3 * torch.randn(2, 200_000, 3, generator=generator)
+    photo = torch.full((200_000, 3), 0.5)
+    first, second = (0.6 + noise[k] for k in (0, 1))
+    assert abs(float(crossed_squares(first, second, photo).mean()) - 0.01) < 1e-3
+    assert float((first - photo).square().mean()) > 0.09

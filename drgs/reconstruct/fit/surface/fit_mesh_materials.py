@@ -25,7 +25,7 @@ from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, radiance_along
 from drgs.reconstruct.fit.light.split_sum import filter_environment
-from drgs.reconstruct.fit.losses import display_image
+from drgs.reconstruct.fit.losses import crossed_halves, display_image
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.shade_surface import SOLID
@@ -85,14 +85,6 @@ def fit_mesh_materials(
     return run_fit(
         FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, after_step=steps.end_round), report, should_stop
     )
-
-
-def crossed_halves(first: Tensor, second: Tensor, photo: Tensor) -> Tensor:
-    """Scalar: the mean absolute error of the mean of two independent estimates; its gradient takes the sign from one and the derivative from
-    the other, in turn."""
-    crossed = 0.5 * (torch.sign(first.detach() - photo) * second + torch.sign(second.detach() - photo) * first)
-    value = (0.5 * (first + second).detach() - photo).abs().mean()
-    return value + (crossed - crossed.detach()).mean()
 
 
 def traced_light(tracer: AbstractTracer, light: MeshLight, points: ShadingPoints, face_normal: Tensor, rays: Rays) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ from torch import Tensor
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
-from drgs.reconstruct.fit.losses import rough_light, white_light
+from drgs.reconstruct.fit.losses import crossed_halves, rough_light, white_light
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, not_grazing, seen_places, shade_places
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
@@ -162,12 +162,12 @@ class _Steps:
         normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
         materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
         terms: dict[str, Tensor] = {}
-        pixels, shown = self._shown(target, environment, normals, materials)
+        pixels, first, second = self._shown(target, environment, normals, materials)
         squared_error = None
         if len(pixels):
             photo = target.saturation.reshape(-1, 3)[pixels]
-            terms["shaded"] = (shown - photo).abs().mean()
-            squared_error = float((shown.detach().clamp(0, 1) - photo).square().mean())
+            terms["shaded"] = crossed_halves(first, second, photo)
+            squared_error = float((first.detach().clamp(0, 1) - photo).square().mean())
         settings, progress = self.settings, iteration / self.settings.iterations
         bend = settings.weight_bend ** (1 - progress) * settings.weight_bend_end**progress
         smooth = settings.weight_smooth ** (1 - progress) * settings.weight_smooth_end**progress
@@ -177,8 +177,10 @@ class _Steps:
         )  # fmt: skip
         return StepLoss(terms, target.camera, squared_error)
 
-    def _shown(self, target: ViewTarget, environment: Tensor, normals: Tensor, materials: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Flat indices of the pixels that mask and mesh fill, and their shaded colours (pixel, 3) in display space."""
+    def _shown(
+        self, target: ViewTarget, environment: Tensor, normals: Tensor, materials: dict[str, Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Flat indices of the pixels that mask and mesh fill, and two estimates of their colours (pixel, 3) in display space."""
         solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
         if len(solid) > self.settings.pixels_a_step:
             drawn = torch.randperm(len(solid), generator=self.state.generator)[: self.settings.pixels_a_step]
@@ -186,7 +188,8 @@ class _Steps:
         seen = not_grazing(seen_places(target, solid, self.surface.tracer), normals)
         tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
         light = self.surface.light_of(filter_environment(environment))(target)
-        return seen.pixels, shade_places(seen, target, tracer, normals, materials, light, self.state.generator)
+        first, second = (shade_places(seen, target, tracer, normals, materials, light, self.state.generator) for _ in range(2))
+        return seen.pixels, first, second
 
 
 def prior_terms(

@@ -26,6 +26,7 @@ from torch import Tensor
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.losses import crossed_halves, crossed_squares
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, not_grazing, seen_places, shade_places
@@ -155,7 +156,7 @@ def try_depths(
         moved = trials.settled(_sunk(first.parameters, depth, inward, faces), here, only)
         there, before = smoothed(moved.errors), smoothed(here.errors)
         known = torch.minimum(there[:, 1], before[:, 1]) > FEWEST
-        error, base = (sums[:, 0] / sums[:, 1].clamp(min=1e-9) + NOISE for sums in (there, before))
+        error, base = ((sums[:, 0] / sums[:, 1].clamp(min=1e-9)).clamp(min=0) + NOISE for sums in (there, before))
         return moved.parameters, torch.where(known, error / base, torch.full_like(error, math.nan))
 
     def reached(share: float, where: Tensor) -> Tensor:
@@ -170,7 +171,13 @@ def try_depths(
     ratios = torch.stack([tried(reached(share, loose.to(most)), only)[1] for share in settings.depths], 1)
 
     depth = torch.minimum(
-        _agreed_depth(ratios, loose, settings, lambda weight, wish: agree_along_edges(edges, weight, wish, settings.together * rings))
+        agreed_depth(
+            ratios,
+            loose,
+            parameters["metal"] > 0,
+            settings,
+            lambda weight, wish: agree_along_edges(edges, weight, wish, settings.together * rings),
+        )
         * radius,
         most,
     )
@@ -206,14 +213,21 @@ def preferred_depth(
     return best, torch.where(known, curvature, torch.zeros_like(curvature))
 
 
-def _agreed_depth(ratios: Tensor, loose: Tensor, settings: TrialSettings, agree: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """(vertex,) how far each place should sink [of the radius], in agreement with its surroundings."""
+def agreed_depth(
+    ratios: Tensor, loose: Tensor, metal: Tensor, settings: TrialSettings, agree: Callable[[Tensor, Tensor], Tensor]
+) -> Tensor:
+    """(vertex,) how far each place should sink [of the radius], in agreement with its surroundings.
+
+    Where metal is explained best at the end of what was tried, it mirrors other things from there, and nothing says that it lies there: of the
+    teapot's places 22 % got better, of those explained best in between 93 to 98 %. (The bunny's paint: 68 and 83 to 88 %.)
+    """
     depths, order = torch.tensor((0.0, *settings.depths)).to(ratios).sort()
     with_here = torch.cat([torch.ones_like(ratios[:, :1]), ratios], 1)[:, order]
     wish, curvature = preferred_depth(depths, with_here)
     left = with_here.nan_to_num(nan=1.0).amin(1)
     curvature = torch.maximum(curvature, 1 - left / settings.decisive)
-    wishes = loose & (left < settings.wish)
+    at_end = (with_here.nan_to_num(nan=1.0).argmin(1) - (len(depths) - 1) / 2).abs() == (len(depths) - 1) / 2
+    wishes = loose & (left < settings.wish) & ~(metal & at_end)
     wish = torch.where(wishes, wish, torch.zeros_like(wish))
     certain = torch.where(loose, curvature.clamp(max=settings.most_curved), torch.full_like(curvature, settings.right))
     agreed = agree(certain + settings.hold, wish * certain / (certain + settings.hold))
@@ -302,7 +316,7 @@ class _Trials:
             _, colours, photo = shown(index, normals, materials)
             squared_error = None
             if len(colours):
-                terms["shaded"] = (colours - photo).abs().mean()
+                terms["shaded"] = crossed_halves(colours, shown(index, normals, materials)[1], photo)
                 squared_error = float((colours.detach().clamp(0, 1) - photo).square().mean())
             return StepLoss(terms, self._targets[index].camera, squared_error)
 
@@ -320,7 +334,8 @@ class _Trials:
                 if self.stopped:
                     break
                 vertex, colours, photo = shown(index, normals, materials)
-                error = (colours.clamp(0, 1) - photo).square().mean(-1)
+                # A square would count the noise of mirrored rays, which hollows have and what fills them has not.
+                error = crossed_squares(colours, shown(index, normals, materials)[1], photo)
                 errors.index_add_(0, vertex, torch.stack([error, torch.ones_like(error)], 1))
                 foreign = seen_places(target, self._bare[index], surface.tracer).nearest
                 wrong = torch.tensor([FOREIGN_ERROR, 1.0], device=errors.device)

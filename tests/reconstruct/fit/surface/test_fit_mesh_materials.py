@@ -1,4 +1,4 @@
-"""Stage 2 on the mesh: rays on a convex object, gradients of crossed halves, a fit that finds colours, repeats itself and resumes."""
+"""Stage 2 on the mesh: rays on a convex object, a fit that finds colours, repeats itself and resumes."""
 
 from pathlib import Path
 
@@ -11,7 +11,6 @@ from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface.fit_mesh_materials import (
     MeshMaterialSettings,
-    crossed_halves,
     fit_mesh_materials,
     start_mesh_materials,
     traced_light,
@@ -33,25 +32,6 @@ def test_on_a_convex_surface_rays_above_it_see_the_sky_and_others_bring_nothing(
     points, rays = rays_of_convex(mesh)
     light = MeshLight(filter_environment(torch.ones(128, 256, 3)), torch.ones_like(mesh.vertices))
     assert_only_the_sky_is_seen(points, rays, *traced_light(build_tracer(mesh), light, points, points.normal_world, rays))
-
-
-def test_the_gradient_of_crossed_halves_does_not_lean_towards_low_variance():
-    # An estimate of 1 with noise in proportion to its parameter: with one set for value and derivative the gradient of |estimate - 1| is
-    # the noise's mean size; with crossed sets it is 0 in the mean.
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(2, 200_000, 3, generator=generator)
-    spread = torch.tensor(0.3, requires_grad=True)
-    photo = torch.ones(200_000, 3)
-    halves = [1 + spread * noise[k] for k in (0, 1)]
-    (crossed,) = torch.autograd.grad(crossed_halves(*halves, photo), spread, retain_graph=True)
-    (plain,) = torch.autograd.grad((halves[0] - photo).abs().mean(), spread)
-    assert abs(float(crossed)) < 0.01 < 0.7 < float(plain)
-
-
-def test_the_value_of_crossed_halves_is_the_error_of_their_mean():
-    halves = [torch.full((4, 3), value, requires_grad=True) for value in (0.2, 0.6)]
-    loss = crossed_halves(*halves, torch.full((4, 3), 0.5)).detach()
-    assert abs(float(loss) - 0.1) < 1e-6
 
 
 @pytest.fixture(scope="module")

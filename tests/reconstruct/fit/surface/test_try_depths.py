@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings, start_surface
-from drgs.reconstruct.fit.surface.try_depths import TrialSettings, TriedDepths, preferred_depth, try_depths
+from drgs.reconstruct.fit.surface.try_depths import TrialSettings, TriedDepths, agreed_depth, preferred_depth, try_depths
 from drgs.scene.mesh import TriangleMesh, vertex_normals
 from drgs.scene.views import Views
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
@@ -96,3 +96,14 @@ def test_the_preferred_depth_is_the_parabolas_and_what_is_not_known_weighs_nothi
     assert float(best[2]) == pytest.approx(0.035)  # no deeper than was tried
     torch.testing.assert_close(curvature[:2], torch.tensor([0.25, 0.25]))
     assert float(curvature[3]) == 0
+
+
+def test_metal_follows_only_minima_that_lie_between_what_was_tried():
+    settings = TrialSettings(depths=(-0.02, 0.02, 0.04))
+    inside, at_deepest, at_shallowest = [2.0, 0.5, 1.5], [2.0, 0.8, 0.4], [0.4, 1.5, 2.0]
+    ratios = torch.tensor([inside, at_deepest, at_shallowest] * 2)
+    metal = torch.tensor([True] * 3 + [False] * 3)
+    depth = agreed_depth(ratios, torch.ones(6, dtype=torch.bool), metal, settings, lambda weight, wish: wish)
+    assert depth[0] == depth[3] > 0.01
+    assert depth[1] == depth[2] == 0
+    assert depth[4] > 0.03 and depth[5] < -0.01
