@@ -108,17 +108,12 @@ def _residuals_of_view(tracer: AbstractTracer, camera: Camera, outline: MaskOutl
     within = ((points > MARGIN) & (points < size - MARGIN)).all(1)
     points, normals, lengths = points[within], normals[within], lengths[within]
 
-    def met(distance: Tensor, of: Tensor | slice = slice(None)) -> Hits:
-        """By rays through places so many pixels (point, place) outside the mask's outline, at its points `of`."""
-        place = points[of][:, None] + distance[..., None] * normals[of][:, None]
-        return _hits(camera, tracer, place.reshape(-1, 2))
-
     # Nearly everywhere the mesh ends within a pixel; only the other places are looked at farther off.
     inside, outside = -torch.ones_like(lengths), torch.ones_like(lengths)
-    ends = met(torch.stack([inside, outside], 1)).hit.view(-1, 2)
+    ends = _hits(camera, tracer, _outside(points, normals, torch.stack([inside, outside], 1))).hit.view(-1, 2)
     other = (~(ends[:, 0] & ~ends[:, 1])).nonzero().squeeze(1)
     offsets = torch.arange(-FARTHEST, FARTHEST + 1).to(points)
-    hit = met(offsets.expand(len(other), -1), other).hit.view(-1, len(offsets))
+    hit = _hits(camera, tracer, _outside(points[other], normals[other], offsets.expand(len(other), -1))).hit.view(-1, len(offsets))
     far = torch.where(hit[:, :-1] & ~hit[:, 1:], (offsets[:-1] + 0.5).abs(), torch.inf)
     inside[other] = offsets[far.argmin(1)]
     outside[other] = inside[other] + 1
@@ -127,9 +122,9 @@ def _residuals_of_view(tracer: AbstractTracer, camera: Camera, outline: MaskOutl
     points, normals, lengths, inside, outside = (values[found] for values in (points, normals, lengths, inside, outside))
     for _ in range(HALVINGS):
         middle = 0.5 * (inside + outside)
-        hit = met(middle[:, None]).hit
+        hit = _hits(camera, tracer, _outside(points, normals, middle[:, None])).hit
         inside, outside = torch.where(hit, middle, inside), torch.where(hit, outside, middle)
-    last = met(inside[:, None])
+    last = _hits(camera, tracer, _outside(points, normals, inside[:, None]))
     corners = mesh.faces[last.face.long()].long()
     weights = torch.cat([1 - last.barycentric.sum(-1, keepdim=True), last.barycentric], -1)
     rotation, translation = (values.to(points) for values in (camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]))
@@ -138,6 +133,13 @@ def _residuals_of_view(tracer: AbstractTracer, camera: Camera, outline: MaskOutl
     across, down = fx * normals[:, 0], fy * normals[:, 1]
     by_camera = torch.stack([across / z, down / z, -(across * x + down * y) / z**2], 1)
     return OutlineResiduals(corners, weights, 0.5 * (inside + outside), by_camera @ rotation, lengths)
+
+
+def _outside(
+    points: Float[Tensor, "point 2"], normals: Float[Tensor, "point 2"], distance: Float[Tensor, "point place"]
+) -> Float[Tensor, "all 2"]:
+    """Places so many pixels outside the mask's outline, those of one point after another."""
+    return (points[:, None] + distance[..., None] * normals[:, None]).reshape(-1, 2)
 
 
 def _hits(camera: Camera, tracer: AbstractTracer, places: Tensor) -> Hits:

@@ -223,18 +223,28 @@ def _launch_slices(
     out = warp_array(radiance, wp.vec3)
     load_kernel(split_sum_kernel, device)
 
-    def run(k: int) -> None:
-        first, last = count * k // GRADIENT_SLICES, count * (k + 1) // GRADIENT_SLICES
-        if point_gradients is None or table_gradients is None:
-            wp.launch(split_sum_kernel, dim=last - first, inputs=[first, *arrays], outputs=[out], device=device)
-            return
-        adjoints = [warp_array(x, dtype) for x, dtype in zip(point_gradients, _DTYPES, strict=False)]
-        wp.launch(
-            split_sum_kernel, dim=last - first, inputs=[first, *arrays], outputs=[out], device=device, adjoint=True,
-            adj_inputs=[0, *adjoints, None, None, None, None, warp_array(table_gradients[k], wp.vec3), None], adj_outputs=[out],
-        )  # fmt: skip
+    # No function within this one: under test each call would check its definition anew.
+    in_gradient_slices(lambda k: _launch_slice(k, count, arrays, out, point_gradients, table_gradients), device)
 
-    in_gradient_slices(run, device)
+
+def _launch_slice(
+    k: int,
+    count: int,
+    arrays: list[wp.array],
+    out: wp.array,
+    point_gradients: list[Tensor] | None,
+    table_gradients: Float[Tensor, "slice texel 3"] | None,
+) -> None:
+    """One of GRADIENT_SLICES parts of the points; with gradients, into that slice of the tables'."""
+    first, last = count * k // GRADIENT_SLICES, count * (k + 1) // GRADIENT_SLICES
+    if point_gradients is None or table_gradients is None:
+        wp.launch(split_sum_kernel, dim=last - first, inputs=[first, *arrays], outputs=[out], device=out.device)
+        return
+    adjoints = [warp_array(x, dtype) for x, dtype in zip(point_gradients, _DTYPES, strict=False)]
+    wp.launch(
+        split_sum_kernel, dim=last - first, inputs=[first, *arrays], outputs=[out], device=out.device, adjoint=True,
+        adj_inputs=[0, *adjoints, None, None, None, None, warp_array(table_gradients[k], wp.vec3), None], adj_outputs=[out],
+    )  # fmt: skip
 
 
 def shade_split_sum(
