@@ -38,7 +38,7 @@ from drgs.scene.asset import Asset, load_asset, load_photographs
 from drgs.scene.lens import Lens
 from drgs.scene.views import Views
 from tests.reconstruct.surfel_spheres import joined, surfel_sphere
-from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
+from tests.reconstruct.tiny_capture import FEW_VIEWS, SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
 from tests.render.closed_form_scenes import front_camera
 
 TINY = Preset(
@@ -68,7 +68,7 @@ def _tiny_preset(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_nerf_synthetic(tmp_path_factory.mktemp("capture"))
+    return write_nerf_synthetic(tmp_path_factory.mktemp("capture"), sphere_views(FEW_VIEWS, square=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +104,14 @@ def test_a_build_makes_an_asset_that_loads_with_the_same_numbers(build: Build):
     for name, value in asset_tensors(build.asset).items():
         assert torch.equal(loaded[name], value), name
     assert (build.path / "thumb.jpg").read_bytes()[:2] == b"\xff\xd8"
-    assert len(load_asset(build.path).cameras) == len(sphere_views())
+    assert len(load_asset(build.path).cameras) == FEW_VIEWS
 
 
 def test_the_photographs_of_the_capture_are_kept_with_the_asset(build: Build):
     photographs = load_photographs(build.path)
     assert photographs is not None
     check_photographs(photographs, len(build.asset.cameras), "the asset")
-    for number, view in enumerate(sphere_views(square=True)):
+    for number, view in enumerate(sphere_views(FEW_VIEWS, square=True)):
         kept = Image.open(io.BytesIO(read_photograph(build.path / PHOTOGRAPHS, number)))
         reduced = np.asarray(Image.fromarray(view.rgba).resize(kept.size, Image.Resampling.BOX), float)
         difference = np.abs(np.asarray(kept.convert("RGBA"), float) - reduced)
@@ -300,7 +300,7 @@ def test_the_checkpoint_of_another_build_is_refused(capture: Path, stopped: Path
 
 @pytest.mark.slow
 def test_the_checkpoint_of_another_capture_is_refused(stopped: Path, tmp_path: Path):
-    fewer = write_nerf_synthetic(tmp_path / "fewer", sphere_views(20, square=True))
+    fewer = write_nerf_synthetic(tmp_path / "fewer", sphere_views(FEW_VIEWS - 4, square=True))
     with pytest.raises(ValueError, match="is of another build"):
         build_asset(fewer, copy_of(stopped, tmp_path), replace(SETTINGS, resume=True))
 

@@ -23,9 +23,9 @@ from tests.reconstruct.test_build_asset import TINY, asset_tensors
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
 LONGER = replace(
     TINY,
-    fit=replace(TINY.fit, iterations=200),
-    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=100), TINY.surface.mesh),
-    materials=MeshMaterialSettings(iterations=100, points_a_step=256, samples=TINY.materials.samples),
+    fit=replace(TINY.fit, iterations=80),
+    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=40), TINY.surface.mesh),
+    materials=MeshMaterialSettings(iterations=40, points_a_step=256, samples=TINY.materials.samples),
 )
 
 
@@ -40,11 +40,27 @@ def turntable(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_turntable(tmp_path_factory.mktemp("turntable"), lamp_on_camera=True, same_around=True)
 
 
-def test_light_that_turns_is_found_out_kept_and_goes_on_where_it_stopped(turntable: Path, tmp_path: Path) -> None:
-    through = build_asset(turntable, tmp_path / "a", SETTINGS)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of `through`."""
+    return tmp_path_factory.mktemp("through") / "asset"
+
+
+@pytest.fixture(scope="module")
+def through(turntable: Path, folder: Path) -> Asset:
+    """Built of the turntable without a word about its light, and never stopped."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", TINY)
+        return build_asset(turntable, folder, SETTINGS)
+
+
+@pytest.mark.slow
+def test_light_that_turns_is_found_out_kept_and_goes_on_where_it_stopped(
+    through: Asset, folder: Path, turntable: Path, tmp_path: Path
+) -> None:
     assert through.light_frame == "camera" and through.provenance["light"]["frame"] == "camera"
     assert "what is around the object stays the same" in through.provenance["light"]["why"]
-    assert load_asset(tmp_path / "a").light_frame == "camera"
+    assert load_asset(folder).light_frame == "camera"
     told: list[str] = []
     said = replace(SETTINGS, light="camera")
     with pytest.raises(BuildStopped):
@@ -56,6 +72,7 @@ def test_light_that_turns_is_found_out_kept_and_goes_on_where_it_stopped(turntab
         build_asset(turntable, tmp_path / "b", replace(SETTINGS, light="object", resume=True))
 
 
+@pytest.mark.slow
 def test_what_was_built_without_a_turn_does_not_go_on_with_one(turntable: Path, tmp_path: Path) -> None:
     told: list[str] = []
     with pytest.raises(BuildStopped):
@@ -89,19 +106,19 @@ def test_with_the_right_frame_pictures_are_explained_and_with_the_wrong_one_not(
     assert errors[0] < 0.05 and errors[0] < 0.7 * errors[1], errors
 
 
-def test_another_light_stands_still_with_the_object(turntable: Path, tmp_path: Path) -> None:
-    asset = build_asset(turntable, tmp_path / "a", SETTINGS)
-    camera = asset.cameras[3]
-    turn = light_from_world(asset, [EnvironmentEdit(op="environment", rotation=30.0)])(camera)
+@pytest.mark.slow
+def test_another_light_stands_still_with_the_object(through: Asset) -> None:
+    camera = through.cameras[3]
+    turn = light_from_world(through, [EnvironmentEdit(op="environment", rotation=30.0)])(camera)
     assert turn is not None and not torch.allclose(turn, torch.eye(3), atol=0.1)
-    assert light_from_world(asset, [EnvironmentEdit(op="environment", file="sky.exr")])(camera) is None
-    assert light_from_world(replace(asset, light_frame="object"), [])(camera) is None
+    assert light_from_world(through, [EnvironmentEdit(op="environment", file="sky.exr")])(camera) is None
+    assert light_from_world(replace(through, light_frame="object"), [])(camera) is None
 
 
-def test_an_asset_without_cameras_cannot_have_light_that_stands_still_with_them(turntable: Path, tmp_path: Path) -> None:
-    asset = build_asset(turntable, tmp_path / "a", SETTINGS)
+@pytest.mark.slow
+def test_an_asset_without_cameras_cannot_have_light_that_stands_still_with_them(through: Asset, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="it has no cameras"):
-        save_asset(replace(asset, cameras=()), tmp_path / "none")
+        save_asset(replace(through, cameras=()), tmp_path / "none")
 
 
 def test_an_unknown_frame_is_refused(turntable: Path, tmp_path: Path) -> None:

@@ -19,6 +19,8 @@ FX, FY, CX, CY = 90.0, 84.0, 38.5, 26.0
 SPHERE_CENTER = np.array([0.1, -0.15, 0.2])
 SPHERE_RADIUS = 0.55
 VIEWS = 24
+FEW_VIEWS = 16
+"""Enough for builds of which only is asked that they go through, stop and resume: their time is that of their views."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,10 @@ def plane_from_pixels(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     """Directions (x, y, 1) that a lens shows there, by fixed-point iteration, for lenses that bend moderately."""
     plane = (pixels - lens.principal_point) / lens.focal_lengths
     for _ in range(200):
-        plane = plane + 0.7 * (pixels - pixels_from_plane(lens, plane)) / lens.focal_lengths
+        step = 0.7 * (pixels - pixels_from_plane(lens, plane)) / lens.focal_lengths
+        plane = plane + step
+        if np.abs(step).max() < 1e-9:
+            break
     return plane
 
 

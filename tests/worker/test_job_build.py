@@ -28,7 +28,7 @@ from drgs_worker.jobs.steps.build import BuildRun, RedecoupleRun
 from drgs_worker.jobs.steps.job_run import JobContext
 from drgs_worker.store.data_directory import DataDirectory, open_data_directory
 from drgs_worker.store.database import AssetRow, open_database
-from tests.reconstruct.tiny_capture import write_nerf_synthetic
+from tests.reconstruct.tiny_capture import FEW_VIEWS, sphere_views, write_nerf_synthetic
 
 TINY = Preset(
     points=600,
@@ -50,7 +50,7 @@ MORE = replace(TINY, materials=MeshMaterialSettings(iterations=8, points_a_step=
 def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DataDirectory]:
     monkeypatch.setitem(PRESETS, "tiny", TINY)
     monkeypatch.setitem(PRESETS, "more", MORE)
-    write_nerf_synthetic(tmp_path)
+    write_nerf_synthetic(tmp_path, sphere_views(FEW_VIEWS, square=True))
     yield open_data_directory(tmp_path / "data")
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
-from drgs.reconstruct.capture.visual_hull import visual_hull
+from drgs.reconstruct.capture.visual_hull import VisualHull, visual_hull
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.camera import Camera, pixel_rays_world
@@ -22,7 +22,7 @@ from tests.reconstruct.tiny_capture import camera_positions, look_at
 
 SIDE = 72
 CPU = torch.device("cpu")
-SETTINGS = HollowSettings(RadianceGridSettings(levels=((24, 120), (40, 150)), rays_a_step=512))
+SETTINGS = HollowSettings(RadianceGridSettings(levels=((24, 60), (40, 70)), rays_a_step=512))
 RIM, FLOOR = 0.35, -0.05
 """Heights; the bowl's inner radius is 0.45."""
 BALL = (0.9, 0.0, 0.0)
@@ -88,14 +88,20 @@ def painted() -> Views:
     return photographed(bowl_and_ball(), paint)
 
 
-@pytest.mark.slow
-def test_a_painted_hollow_is_found_and_points_start_in_it(painted: Views) -> None:
+@pytest.fixture(scope="module")
+def drum(painted: Views) -> VisualHull:
+    """The hull of what is painted."""
     hull = visual_hull(painted)
     assert hull is not None
-    filled = height_inside(hull.vertices_world, hull.faces)
+    return hull
+
+
+@pytest.mark.slow
+def test_a_painted_hollow_is_found_and_points_start_in_it(painted: Views, drum: VisualHull) -> None:
+    filled = height_inside(drum.vertices_world, drum.faces)
     assert filled > RIM - 0.1
     told: list[float] = []
-    found = find_hollows(painted, hull, SETTINGS, 0, CPU, told.append)
+    found = find_hollows(painted, drum, SETTINGS, 0, CPU, told.append)
     assert found is not None
     assert told and told == sorted(told) and told[-1] <= 1
     emptied = height_inside(found.vertices_world, found.faces)
@@ -116,16 +122,12 @@ def test_a_mirror_keeps_its_hull() -> None:
     assert find_hollows(ball, hull, SETTINGS, 0, CPU) is hull
 
 
-def test_a_search_that_is_stopped_finds_nothing(painted: Views) -> None:
-    hull = visual_hull(painted)
-    assert hull is not None
-    assert find_hollows(painted, hull, SETTINGS, 0, CPU, should_stop=lambda: True) is None
+def test_a_search_that_is_stopped_finds_nothing(painted: Views, drum: VisualHull) -> None:
+    assert find_hollows(painted, drum, SETTINGS, 0, CPU, should_stop=lambda: True) is None
 
 
-def test_photographs_in_which_nothing_is_solid_keep_the_hull(painted: Views) -> None:
-    hull = visual_hull(painted)
-    assert hull is not None
-    assert find_hollows(replace(painted, coverage=tuple(mask // 2 for mask in painted.coverage)), hull, SETTINGS, 0, CPU) is hull
+def test_photographs_in_which_nothing_is_solid_keep_the_hull(painted: Views, drum: VisualHull) -> None:
+    assert find_hollows(replace(painted, coverage=tuple(mask // 2 for mask in painted.coverage)), drum, SETTINGS, 0, CPU) is drum
 
 
 def constant_grid(density: float, inside: float = 1.0) -> RadianceGrid:

@@ -19,7 +19,7 @@ from drgs.scene.camera import pixel_rays_world
 from drgs.scene.environment import uv_from_direction
 from drgs.scene.views import Views
 from tests.reconstruct.test_build_asset import TINY, asset_tensors
-from tests.reconstruct.tiny_capture import HEIGHT, WIDTH, TinyView, sphere_views, write_nerf_synthetic
+from tests.reconstruct.tiny_capture import FEW_VIEWS, HEIGHT, WIDTH, TinyView, sphere_views, write_nerf_synthetic
 
 CPU = torch.device("cpu")
 
@@ -93,7 +93,8 @@ def test_smaller_views_keep_the_mean_and_the_rays(unmasked: Views) -> None:
 
 
 @pytest.mark.slow
-def test_a_build_without_masks_stops_while_it_looks_and_resumes(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_without_masks_stops_while_it_looks_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_nerf_synthetic(tmp_path / "unmasked", [before_surroundings(view) for view in sphere_views(FEW_VIEWS, square=True)])
     monkeypatch.setitem(PRESETS, "tiny", TINY)
     monkeypatch.setattr(find_masks_module, "ITERATIONS", 40)
     settings, heard = BuildSettings(preset="tiny", device="cpu"), []

@@ -115,6 +115,7 @@ def test_pictures_of_several_sizes_carve_the_same_hull(sphere: Views) -> None:
     assert radii[0].min() > 0.93
 
 
+@pytest.mark.slow
 def test_what_few_close_views_alone_see_is_not_the_object(sphere: Views) -> None:
     def zoomed(camera: Camera, factor: float) -> Camera:
         center = torch.tensor(tiny.SPHERE_CENTER).float() @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]

@@ -58,6 +58,7 @@ def found_in(folder: Path) -> LightFound:
     return light_found(capture, views, initial_points(views, 4000, 0))
 
 
+@pytest.mark.slow
 def test_a_turntable_is_told_by_what_stays_and_what_changes(tmp_path: Path) -> None:
     found = found_in(write_turntable(tmp_path / "a", lamp_on_camera=True, same_around=True))
     assert found.frame == "camera" and found.surroundings_differ is not None and found.surroundings_differ < 0.01
@@ -73,6 +74,7 @@ def test_masks_that_are_cut_outs_count_by_their_alpha(tmp_path: Path) -> None:
     assert found_in(tmp_path).frame == "camera"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "why"),
     [

@@ -71,6 +71,7 @@ def smooth_pattern(plane: np.ndarray) -> np.ndarray:
     return np.round(127.5 + 90 * waves).astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", COEFFICIENTS)
 def test_a_pattern_seen_through_a_lens_becomes_the_one_seen_through_the_pinhole(model: str) -> None:
     lens = lens_of(model)
@@ -82,6 +83,7 @@ def test_a_pattern_seen_through_a_lens_becomes_the_one_seen_through_the_pinhole(
     assert error.mean() < 0.7 and error.max() <= 4  # of 255: rounding twice, and bilinear interpolation of the waves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["OPENCV", "FOV", "DIVISION", "THIN_PRISM_FISHEYE"])
 def test_masks_stay_aligned_to_a_fraction_of_a_pixel(model: str) -> None:
     lens = lens_of(model)

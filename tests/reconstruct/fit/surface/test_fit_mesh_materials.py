@@ -78,6 +78,7 @@ def test_between_rounds_the_surface_follows_and_keeps_its_outline(views: Views):
     assert float(moved.max()) > 0.001 * SPHERE_RADIUS and float(moved.mean()) < 0.02 * SPHERE_RADIUS
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits(views: Views):
     results = [fitted(views, short(3, seed=5))[0].parameters for _ in range(2)]
     other = fitted(views, short(3, seed=6))[0].parameters
@@ -85,6 +86,7 @@ def test_the_same_seed_gives_the_same_bits(views: Views):
     assert not torch.equal(results[0]["albedo_logits"], other["albedo_logits"])
 
 
+@pytest.mark.slow
 def test_a_resumed_fit_ends_with_the_same_numbers(views: Views, tmp_path: Path):
     settings = short(7)
     whole, _ = fitted(views, settings)

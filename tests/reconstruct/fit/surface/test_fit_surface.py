@@ -76,6 +76,7 @@ def test_a_fit_resumed_inside_a_round_or_between_two_ends_with_the_same_numbers(
         assert torch.equal(resumed.parameters[name], value), name
 
 
+@pytest.mark.slow
 def test_of_large_photographs_some_pixels_are_looked_at(views: Views):
     few = short(rounds=1, pixels_a_step=200)
     (some, reports), (same, _), (all_, _) = fitted(views, few), fitted(views, few), fitted(views, short(rounds=1))

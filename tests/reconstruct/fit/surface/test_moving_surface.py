@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 
 from drgs.reconstruct.fit.fit_loop import FitState
@@ -39,6 +40,7 @@ def two_spheres() -> tuple[FitState, torch.Tensor]:
     return FitState(parameters, optimizer, torch.Generator().manual_seed(1)), torch.cat([one.faces, one.faces + len(one.vertices)])
 
 
+@pytest.mark.slow
 def test_shares_of_a_few_rays_are_as_good_as_those_of_many(tmp_path: Path) -> None:
     state, faces = two_spheres()
     radiance = environment_table(state.parameters).detach()

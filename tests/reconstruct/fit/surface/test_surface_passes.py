@@ -59,6 +59,7 @@ def test_a_sphere_that_is_too_small_is_as_large_as_its_photographs_after_two_pas
     assert not torch.equal(fit.faces, start.faces) and told == list(range(3, 13))
 
 
+@pytest.mark.slow
 def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tmp_path, monkeypatch: pytest.MonkeyPatch):
     settings = PassSettings(
         2,
