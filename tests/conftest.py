@@ -33,8 +33,12 @@ HALF_WAY = "tests/web/test_s"
 """Tests of the browser before and behind this name take about equally long."""
 
 
-WAITING = ("tests/benchmarks/", "tests/worker/", "tests/server/")
-"""Folders whose tests wait for processes that they start about as long as they compute."""
+WAITING = ("tests/benchmarks/", "tests/worker/", "tests/server/", "tests/test_wheel.py", "tests/test_cli.py", "tests/test_site.py")
+"""Tests that wait for processes that they start about as long as they compute."""
+
+
+LONG = "tests/reconstruct/"
+"""Files below it take up to most of a minute of a core: of those that compute they come first, lest one begun late keep the others waiting."""
 
 
 def is_in_browser(nodeid: str) -> bool:
@@ -42,12 +46,12 @@ def is_in_browser(nodeid: str) -> bool:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the browser's tests as slow; where processes share the tests, those that wait come before those that compute."""
+    """Mark the browser's tests as slow; where processes share the tests, those that wait come first, and then the long ones."""
     for item in items:
         if is_in_browser(item.nodeid):
             item.add_marker(pytest.mark.slow)
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: (not is_in_browser(item.nodeid), not item.nodeid.startswith(WAITING)))
+        items.sort(key=lambda item: (not is_in_browser(item.nodeid), not item.nodeid.startswith(WAITING), not item.nodeid.startswith(LONG)))
 
 
 @pytest.hookimpl(optionalhook=True)
