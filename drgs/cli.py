@@ -283,6 +283,10 @@ def export(
     asset: AssetPath,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write.")],
     format: Annotated[ExportFormat | None, typer.Option(help=EXPORT_HELP, show_default="by OUT's suffix")] = None,
+    faces: Annotated[
+        int | None,
+        typer.Option(help="The most that a textured mesh (glb, mesh, usdz, usd) has.", show_default="30000", min=4),
+    ] = None,
 ) -> None:
     """Write an asset as a file that other programs read."""
     try:
@@ -293,7 +297,7 @@ def export(
     from drgs.convert.export_asset import export_asset
     from drgs.scene.asset import load_asset
 
-    left_out = export_asset(load_asset(asset), out, chosen)
+    left_out = export_asset(load_asset(asset), out, chosen, faces)
     print(f"Wrote {out}: {out.stat().st_size / 1e6:.1f} MB{', ' if left_out else ''}{left_out}", file=sys.stderr)
 
 

@@ -3,8 +3,8 @@
 ply   2D Gaussians, two scales, `SplatRenderMode: 2dgs` (SuperSplat, splat-transform)
 ply3  the same with a flat third scale, for viewers of 3D Gaussians
 spz   the Gaussians in a seventh of the bytes, without materials, y up and in metres, thin as far as the format goes
-glb   mesh with base colour and metallic-roughness textures (Blender, three.js, Unreal, Unity), and in a second scene the Gaussians
-      as splats by KHR_gaussian_splatting, flat like those of ply3
+glb   mesh with textures (bake_textures: base colour, occlusion-roughness-metallic, normals; Blender, three.js, Unreal, Unity), and in a
+      second scene the Gaussians as splats by KHR_gaussian_splatting, flat like those of ply3
 mesh  the same without the Gaussians
 html  a page: mesh, lights and the program that draws them in a browser, in one file (page/)
 usdz  the textured mesh for viewers of augmented reality, upright and in metres
@@ -24,6 +24,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from drgs.convert.bake_textures import DEFAULT_FACES, TexturedMesh, bake_textures
 from drgs.convert.page.encode_page import encode_page
 from drgs.exchange.export_formats import EXPORT_FORMATS, ExportFormat
 from drgs.exchange.exr import encode_environment
@@ -31,27 +32,34 @@ from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
 from drgs.exchange.glb import GlbMesh, GlbPoints, encode_glb
 from drgs.exchange.gltf_splats import GltfSplats, points_from_splats
 from drgs.exchange.spz import SMALLEST_SCALE, encode_spz
-from drgs.exchange.texture_atlas import Atlas, paint, unwrap
-from drgs.exchange.usd import BASE_COLOR, SURFACE, UsdScene, write_ar_usdz, write_usd
+from drgs.exchange.usd import BASE_COLOR, NORMAL, SURFACE, UsdScene, refuse_unwritable, write_ar_usdz, write_usd
 from drgs.maths.color import srgb_from_linear
 from drgs.maths.frames import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import map_radiance, rotate_sh
 from drgs.scene.asset import Asset
 from drgs.scene.gaussians import Gaussians
-from drgs.scene.mesh import TriangleMesh
+from drgs.scene.mesh import on_cpu
 
 _UPRIGHT_FROM_WORLD = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
 """z up to y up."""
+TEXTURED_FORMATS: tuple[ExportFormat, ...] = ("glb", "mesh", "usdz", "usd")
+"""Those whose number of faces can be chosen."""
+FEWEST_FACES = 4
+"""Of a tetrahedron."""
 
 
-def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> str:
+def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int | None = None) -> str:
     """Write one file; an existing one is replaced at once.
+
+    Args:
+        faces: the most that a textured mesh has; the detail of those left out goes into its textures. None: DEFAULT_FACES.
 
     Returns:
         What the file leaves out or shows otherwise, in words; empty where it has all that its format can hold.
 
     Raises:
-        ValueError: unknown format, Gaussians asked of an asset that has none, usd-core is missing, or no page can be made of it.
+        ValueError: unknown format, Gaussians asked of an asset that has none, usd-core is missing, no page can be made of it,
+            or a number of faces that is too small or that the format has no use for.
         OSError: the file cannot be written.
     """
     out = Path(out)
@@ -61,16 +69,30 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> str:
         raise ValueError(f"{out}: is a folder; expected the name of a file")
     if format in ("ply", "ply3", "spz") and asset.gaussians is None:
         raise ValueError(f"format {format!r} needs Gaussians, and this asset has only a mesh; export it as glb")
+    if faces is not None and format not in TEXTURED_FORMATS:
+        raise ValueError(
+            f"{faces} faces were asked for of format {format!r}, which has no textures; expected {', '.join(TEXTURED_FORMATS)}"
+        )
+    if faces is not None and faces < FEWEST_FACES:
+        raise ValueError(f"{faces} faces were asked for; expected at least {FEWEST_FACES}")
+    if format in ("usd", "usdz"):
+        refuse_unwritable(out, for_ar=format == "usdz")
     out.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{out.stem}.", suffix=out.suffix, dir=out.parent)
     os.close(handle)
     temporary = Path(name)
     left_out = ""
     try:
-        if format == "usd":
-            write_usd(temporary, _usd_scene(asset), beside=out)
-        elif format == "usdz":
-            write_ar_usdz(temporary, _usd_scene(asset))
+        if format in TEXTURED_FORMATS:
+            textured = bake_textures(on_cpu(asset.mesh), faces or DEFAULT_FACES)
+            kept, all_faces = len(textured.mesh.faces), len(asset.mesh.faces)
+            left_out = "" if kept == all_faces else f"{kept} of the mesh's {all_faces} faces, the detail of the others in its textures"
+            if format == "usd":
+                write_usd(temporary, _usd_scene(asset, textured), beside=out)
+            elif format == "usdz":
+                write_ar_usdz(temporary, _usd_scene(asset, textured))
+            else:
+                temporary.write_bytes(_textured_glb(asset, textured, with_splats=format == "glb"))
         elif format == "spz":
             splats = _upright_splats(asset)
             wide = int((splats["scales"][:, :2].min(1) < SMALLEST_SCALE).sum())
@@ -92,8 +114,6 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat) -> str:
 def _file_bytes(asset: Asset, format: str) -> bytes:
     if format == "env":
         return encode_environment(_array(asset.environment.radiance))
-    if format in ("glb", "mesh"):
-        return encode_textured_glb(asset, with_splats=format == "glb")
     gaussians = asset.gaussians
     assert gaussians is not None
     arrays = {key: _array(values) for key, values in vars(gaussians).items()}
@@ -103,38 +123,36 @@ def _file_bytes(asset: Asset, format: str) -> bytes:
     return encode_gaussian_ply(arrays, normals, third_scale=format == "ply3", comments=(note,))
 
 
-def encode_textured_glb(asset: Asset, with_splats: bool = True) -> bytes:
-    """Bytes of a GLB whose textures hold the vertex materials: base colour in sRGB; roughness in green, metallic in blue.
-
+def _textured_glb(asset: Asset, textured: TexturedMesh, with_splats: bool) -> bytes:
+    """
     Args:
         with_splats: the Gaussians too, where there are some: 260 bytes each.
     """
-    mesh = asset.mesh
-    atlas, images = _painted(mesh)
+    mesh, atlas = textured.mesh, textured.atlas
     normals = torch.nn.functional.normalize(mesh.normals, dim=-1)
     attributes = {"POSITION": _array(mesh.vertices)[atlas.vertex_of], "NORMAL": _array(normals)[atlas.vertex_of], "TEXCOORD_0": atlas.uv}
+    images = [_png(textured.base_color), _png(textured.surface)]
+    textures = {"occlusionTexture": {"index": 1}}
+    if textured.normal is not None and textured.tangents is not None:
+        attributes["TANGENT"] = textured.tangents
+        textures["normalTexture"] = {"index": len(images)}
+        images.append(_png(textured.normal))
     material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
     points = _splat_points(asset.gaussians) if with_splats and asset.gaussians is not None and len(asset.gaussians.centers) else None
-    return encode_glb(GlbMesh(attributes, atlas.faces, material, images), asset.meters_per_unit, points)
+    return encode_glb(GlbMesh(attributes, atlas.faces, material, textures, tuple(images)), asset.meters_per_unit, points)
 
 
-def _painted(mesh: TriangleMesh) -> tuple[Atlas, tuple[bytes, bytes]]:
-    """PNG files of base colour in sRGB, and of roughness in green and metallic in blue."""
-    atlas = unwrap(_array(mesh.vertices), _array(mesh.faces))
-    values = torch.cat([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], -1)
-    picture = paint(atlas, _array(values), _material_texels)
-    return atlas, (_png(picture[..., :3]), _png(picture[..., 3:]))
-
-
-def _usd_scene(asset: Asset) -> UsdScene:
-    atlas, (base_color, surface) = _painted(asset.mesh)
-    mesh = {key: _array(values) for key, values in vars(asset.mesh).items()}
-    mesh["normals"] = _array(torch.nn.functional.normalize(asset.mesh.normals, dim=-1))
+def _usd_scene(asset: Asset, textured: TexturedMesh) -> UsdScene:
+    mesh = {key: _array(values) for key, values in vars(textured.mesh).items()}
+    mesh["normals"] = _array(torch.nn.functional.normalize(textured.mesh.normals, dim=-1))
+    textures = {BASE_COLOR: _png(textured.base_color), SURFACE: _png(textured.surface)}
+    if textured.normal is not None:
+        textures[NORMAL] = _png(textured.normal)
     return UsdScene(
         mesh,
-        atlas.uv,
-        atlas.faces,
-        {BASE_COLOR: base_color, SURFACE: surface},
+        textured.atlas.uv,
+        textured.atlas.faces,
+        textures,
         _splat_arrays(asset.gaussians) if asset.gaussians is not None and len(asset.gaussians.centers) else None,
         encode_environment(_array(asset.environment.radiance)),
         asset.meters_per_unit,
@@ -193,13 +211,6 @@ def _upright_splats(asset: Asset) -> dict[str, np.ndarray]:
         "sh": rotate_sh(torch.from_numpy(arrays["sh"]), upright),
     }
     return arrays | {key: _array(values) for key, values in turned.items()} | {"scales": asset.meters_per_unit * arrays["scales"]}
-
-
-def _material_texels(values: np.ndarray) -> np.ndarray:
-    """(n, 6) uint8 of base colour, roughness and metallic (n, 5): the first texture's three channels and the second's, whose red is occlusion."""
-    values_in = torch.from_numpy(values).clamp(0, 1)
-    surface = torch.cat([torch.ones_like(values_in[:, :1]), values_in[:, 3:]], -1)
-    return _array((torch.cat([srgb_from_linear(values_in[:, :3]), surface], -1) * 255).round().to(torch.uint8))
 
 
 def _png(texels: np.ndarray) -> bytes:

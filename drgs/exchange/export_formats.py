@@ -31,7 +31,7 @@ FILE_KINDS: dict[DownloadFormat, FileKind] = {
     "glb": FileKind(
         ".glb",
         "Mesh and Gaussians (GLB)",
-        "Mesh with metallic-roughness textures: Blender, three.js, Unreal, Unity; in a second scene the Gaussians (KHR_gaussian_splatting)",
+        "Mesh with textures, occlusion and normals among them: Blender, three.js, Unreal, Unity; in a second scene the Gaussians (KHR_gaussian_splatting)",
     ),
     "mesh": FileKind(".glb", "Mesh (GLB)", "The same mesh alone, in a smaller file"),
     "html": FileKind(

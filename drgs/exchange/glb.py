@@ -33,6 +33,8 @@ class GlbMesh:
     """(face, 3) int32."""
     material: dict = field(default_factory=dict)
     """glTF `pbrMetallicRoughness`; texture indices count `images`."""
+    textures: dict = field(default_factory=dict)
+    """What else the material reads: glTF `occlusionTexture`, `normalTexture`."""
     images: tuple[bytes, ...] = ()
     """PNG files."""
 
@@ -91,7 +93,7 @@ def encode_glb(mesh: GlbMesh, meters_per_unit: float = 1.0, points: GlbPoints | 
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "object", "mesh": 0, "matrix": matrix}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": len(accessors) - 1, "material": 0}]}],
-        "materials": [{"name": "object", "pbrMetallicRoughness": mesh.material, "doubleSided": False}],
+        "materials": [{"name": "object", "pbrMetallicRoughness": mesh.material, **mesh.textures, "doubleSided": False}],
         "accessors": accessors,
     }
     if points is not None:

@@ -20,10 +20,14 @@ import numpy as np
 from drgs.installation import missing_package
 
 LAYERS = (".usd", ".usda", ".usdc")
-BASE_COLOR, SURFACE, ENVIRONMENT = "base_color.png", "roughness_metallic.png", "environment.exr"
+BASE_COLOR, SURFACE, NORMAL, ENVIRONMENT = "base_color.png", "occlusion_roughness_metallic.png", "normal.png", "environment.exr"
 _ROOT = "/object"
-_TEXTURED = {"diffuseColor": (BASE_COLOR, "rgb", "sRGB"), "roughness": (SURFACE, "g", "raw"), "metallic": (SURFACE, "b", "raw")}
-"""Input of the preview surface: the picture it reads, which channels, and their colour space."""
+_TEXTURED = (
+    (BASE_COLOR, "sRGB", {"diffuseColor": "rgb"}),
+    (SURFACE, "raw", {"occlusion": "r", "roughness": "g", "metallic": "b"}),
+    (NORMAL, "raw", {"normal": "rgb"}),
+)
+"""A picture, its colour space, and which inputs of the preview surface read which of its channels."""
 _REACH = 3.0
 """Standard deviations of a splat that count for its extent."""
 WORLD_FROM_DOME = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -41,7 +45,8 @@ class UsdScene:
     uv_faces: np.ndarray
     """(f, 3) into uv."""
     textures: dict[str, bytes]
-    """BASE_COLOR: sRGB; SURFACE: roughness in green, metallic in blue."""
+    """BASE_COLOR: sRGB; SURFACE: occlusion in red, roughness in green, metallic in blue; NORMAL, where there is one: 255 (n + 1) / 2 along
+    s, along t and outwards."""
     splats: dict[str, np.ndarray] | None
     """centers (n, 3), scales (n, 3), quats_wxyz (n, 4), opacities (n), sh (n, 16, 3) of sRGB colours, albedo (n, 3), roughness (n), metallic (n)."""
     environment: bytes
@@ -59,9 +64,7 @@ def write_usd(path: Path, scene: UsdScene, beside: Path | None = None) -> None:
         ValueError: usd-core is not installed or too old, or the name does not end in .usd, .usda, .usdc or .usdz.
         OSError: a file cannot be written, such as on a full disk.
     """
-    if path.suffix not in (*LAYERS, ".usdz"):
-        raise ValueError(f"{path}: expected a name ending in {', '.join(LAYERS)} or .usdz")
-    _refuse_without_particle_fields()
+    refuse_unwritable(path, for_ar=False)
     pictures = scene.textures | {ENVIRONMENT: scene.environment}
     if path.suffix == ".usdz":
         _write_package(path, lambda folder: _scene_stage(scene, folder), pictures)
@@ -83,10 +86,23 @@ def write_ar_usdz(path: Path, scene: UsdScene) -> None:
         ValueError: usd-core is not installed, or the name does not end in .usdz.
         OSError: the file cannot be written, such as on a full disk.
     """
-    if path.suffix != ".usdz":
-        raise ValueError(f"{path}: expected a name ending in .usdz")
-    _refuse_without_usd()
+    refuse_unwritable(path, for_ar=True)
     _write_package(path, lambda folder: _ar_stage(scene, folder), scene.textures)
+
+
+def refuse_unwritable(path: Path, for_ar: bool) -> None:
+    """What writing would refuse of a name and of this machine, before anything is made ready for it.
+
+    Raises:
+        ValueError: as write_ar_usdz and write_usd.
+    """
+    endings = (".usdz",) if for_ar else (*LAYERS, ".usdz")
+    if path.suffix not in endings:
+        raise ValueError(f"{path}: expected a name ending in {', '.join(endings)}")
+    if for_ar:
+        _refuse_without_usd()
+    else:
+        _refuse_without_particle_fields()
 
 
 def _refuse_without_usd() -> None:
@@ -203,7 +219,7 @@ def _define_mesh(stage: Any, scene: UsdScene, vertices: np.ndarray, normals: np.
     upwards = np.stack([scene.uv[:, 0], 1 - scene.uv[:, 1]], -1)
     st.Set(Vt.Vec2fArray.FromNumpy(_floats(upwards)))
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(scene.uv_faces.reshape(-1), np.int32)))
-    UsdShade.MaterialBindingAPI.Apply(surface.GetPrim()).Bind(_define_material(stage, folder))
+    UsdShade.MaterialBindingAPI.Apply(surface.GetPrim()).Bind(_define_material(stage, folder, set(scene.textures)))
     return surface
 
 
@@ -219,9 +235,9 @@ def _set_materials(prim: Any, values: dict[str, np.ndarray], albedo: str) -> Non
         primvar.Set(Vt.FloatArray.FromNumpy(_floats(values[name])))
 
 
-def _define_material(stage: Any, folder: str) -> Any:
+def _define_material(stage: Any, folder: str, pictures: set[str]) -> Any:
     """A preview surface that reads the textures."""
-    from pxr import Sdf, UsdShade
+    from pxr import Gf, Sdf, UsdShade
 
     types = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, f"{_ROOT}/material")
@@ -231,7 +247,10 @@ def _define_material(stage: Any, folder: str) -> Any:
     corners.CreateIdAttr("UsdPrimvarReader_float2")
     corners.CreateInput("varname", types.String).Set("st")
     place = corners.CreateOutput("result", types.Float2)
-    for target, (picture, channels, space) in _TEXTURED.items():
+    kinds = {"diffuseColor": types.Color3f, "normal": types.Normal3f}
+    for picture, space, targets in _TEXTURED:
+        if picture not in pictures:
+            continue
         texture = UsdShade.Shader.Define(stage, f"{_ROOT}/material/{Path(picture).stem}")
         texture.CreateIdAttr("UsdUVTexture")
         texture.CreateInput("file", types.Asset).Set(f"./{folder}/{picture}")
@@ -239,8 +258,12 @@ def _define_material(stage: Any, folder: str) -> Any:
         texture.CreateInput("st", types.Float2).ConnectToSource(place)
         for axis in "ST":
             texture.CreateInput(f"wrap{axis}", types.Token).Set("clamp")
-        output = texture.CreateOutput(channels, types.Float3 if channels == "rgb" else types.Float)
-        surface.CreateInput(target, types.Color3f if channels == "rgb" else types.Float).ConnectToSource(output)
+        if picture == NORMAL:
+            texture.CreateInput("scale", types.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
+            texture.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
+        for target, channels in targets.items():
+            output = texture.CreateOutput(channels, types.Float3 if channels == "rgb" else types.Float)
+            surface.CreateInput(target, kinds.get(target, types.Float)).ConnectToSource(output)
     material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     return material
 

@@ -27,6 +27,11 @@ class TriangleMesh:
     metallic: Float[Tensor, "vertex"]
 
 
+def on_cpu(mesh: TriangleMesh) -> TriangleMesh:
+    """The same on the CPU, without gradients."""
+    return TriangleMesh(**{key: values.detach().cpu() for key, values in vars(mesh).items()})
+
+
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """(vertex, 3) unit normals: sum of face normals weighted by area."""
     corners = vertices[faces.long()]

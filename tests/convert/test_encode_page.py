@@ -13,11 +13,12 @@ import pytest
 import torch
 import trimesh
 
+from drgs.convert import bake_transfer
 from drgs.convert.export_asset import export_asset
-from drgs.convert.page import bake_transfer, encode_page
+from drgs.convert.page import encode_page
 from drgs.convert.page.pack_arrays import in_order_of_use, pack_arrays, rgbe, steps_from_newest
 from drgs.convert.page.page_lights import page_lights
-from drgs.convert.page.shrink_mesh import shrink_mesh
+from drgs.convert.shrink_mesh import shrink_mesh
 from drgs.maths.color import luminance
 from drgs.maths.spherical_harmonics import sh_basis
 from drgs.scene.asset import Asset

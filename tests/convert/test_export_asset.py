@@ -52,6 +52,19 @@ def test_an_exported_glb_comes_back_with_its_materials_upright_and_in_metres(tmp
         assert (getattr(mesh, name) - getattr(asset.mesh, name)[original]).abs().max() < 0.03, name
 
 
+def test_a_glb_with_fewer_faces_says_so_and_comes_back_as_the_same_ball(tmp_path):
+    asset = ball_asset()
+    said = export_asset(asset, tmp_path / "a.glb", "mesh", faces=400)
+    mesh = import_mesh(tmp_path / "a.glb").mesh
+    assert said == f"{len(mesh.faces)} of the mesh's 1280 faces, the detail of the others in its textures"
+    assert 300 < len(mesh.faces) <= 400
+    outwards = mesh.vertices / 0.5 - torch.tensor([0, 0, 2.0])
+    assert (outwards.norm(dim=-1) - 1).abs().max() < 0.03 and (mesh.normals * outwards).sum(-1).min() > 0.97
+    height = (outwards[:, 2] + 1) / 2
+    assert (mesh.roughness - height).abs().max() < 0.05 and (mesh.metallic + mesh.roughness - 1).abs().max() < 0.02
+    assert (mesh.albedo - (0.1 + 0.4 * (outwards + 1))).abs().max() < 0.05
+
+
 def test_a_gaussian_ply_keeps_shape_and_materials_and_shows_srgb_colours(tmp_path):
     asset = ball_asset()
     export_asset(asset, tmp_path / "a.ply", "ply")
@@ -125,6 +138,10 @@ def test_what_cannot_be_exported_is_refused_with_a_sentence_and_leaves_nothing(t
         export_asset(replace(asset, gaussians=None), tmp_path / "a.ply", "ply")
     with pytest.raises(ValueError, match="format 'fbx' is unknown; expected glb, mesh, html, ply, ply3, spz, usdz, usd, env"):
         export_asset(asset, tmp_path / "a.fbx", "fbx")  # pyright: ignore
+    with pytest.raises(ValueError, match="100 faces were asked for of format 'ply', which has no textures; expected glb, mesh, usdz, usd"):
+        export_asset(asset, tmp_path / "a.ply", "ply", faces=100)
+    with pytest.raises(ValueError, match="3 faces were asked for; expected at least 4"):
+        export_asset(asset, tmp_path / "a.glb", "glb", faces=3)
     with pytest.raises(ValueError, match="is a folder"):
         export_asset(asset, tmp_path, "glb")
     assert [entry.name for entry in tmp_path.iterdir()] == ["old.usd"] and (tmp_path / "old.usd").read_text() == "kept"

@@ -61,17 +61,18 @@ def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("usd")
     asset = ball_asset()
     export_asset(asset, folder / "ar.usdz", "usdz")
+    export_asset(asset, folder / "small.usdz", "usd", faces=300)
     for name in ("scene.usdz", "scene.usda", "scene.usdc"):
         export_asset(asset, folder / name, "usd")
     return folder
 
 
 def test_files_beside_a_layer_are_its_pictures_and_nothing_else_is_left(folder):
-    assert {path.name for path in folder.iterdir()} == {"ar.usdz", "scene.usdz", "scene.usda", "scene.usdc", "scene_textures"}
+    assert {path.name for path in folder.iterdir()} == {"ar.usdz", "small.usdz", "scene.usdz", "scene.usda", "scene.usdc", "scene_textures"}
     assert {path.name for path in (folder / "scene_textures").iterdir()} == {BASE_COLOR, SURFACE, ENVIRONMENT}
 
 
-@pytest.mark.parametrize("name", ["ar.usdz", "scene.usdz", "scene.usda", "scene.usdc"])
+@pytest.mark.parametrize("name", ["ar.usdz", "small.usdz", "scene.usdz", "scene.usda", "scene.usdc"])
 def test_no_validator_finds_a_fault(folder, name):
     assert findings(folder / name) == []
 
@@ -127,24 +128,43 @@ def test_the_textures_are_bound_with_their_colour_spaces_and_hold_the_materials(
         material = UsdShade.MaterialBindingAPI(surface).ComputeBoundMaterial()[0]
         shader = material.ComputeSurfaceSource()[0]
         sources = {}
-        for target in ("diffuseColor", "roughness", "metallic"):
+        for target in ("diffuseColor", "occlusion", "roughness", "metallic"):
             source = shader.GetInput(target).GetConnectedSources()[0][0]
             texture = UsdShade.Shader(source.source.GetPrim())
             sources[target] = (texture.GetPath().name, source.sourceName, texture.GetInput("sourceColorSpace").Get())
         assert sources == {
             "diffuseColor": ("base_color", "rgb", "sRGB"),
-            "roughness": ("roughness_metallic", "g", "raw"),
-            "metallic": ("roughness_metallic", "b", "raw"),
+            "occlusion": ("occlusion_roughness_metallic", "r", "raw"),
+            "roughness": ("occlusion_roughness_metallic", "g", "raw"),
+            "metallic": ("occlusion_roughness_metallic", "b", "raw"),
         }
+        assert not shader.GetInput("normal"), "no face was left out"
         st = UsdGeom.PrimvarsAPI(surface).GetPrimvar("st")
         assert st.GetInterpolation() == UsdGeom.Tokens.faceVarying
         corners = np.array(st.ComputeFlattened())
-        pictures = {reader: np.asarray(Image.open(io.BytesIO(picture(stage, reader)))) for reader in ("base_color", "roughness_metallic")}
+        pictures = {
+            reader: np.asarray(Image.open(io.BytesIO(picture(stage, reader)))) for reader in ("base_color", "occlusion_roughness_metallic")
+        }
         faces = asset.mesh.faces.long()
         colors = srgb_from_linear(asset.mesh.albedo)[faces].reshape(-1, 3).numpy()
         others = torch.stack([asset.mesh.roughness, asset.mesh.metallic], -1)[faces].reshape(-1, 2).numpy()
         assert np.abs(lookup(pictures["base_color"], corners) - colors).max() < 0.05
-        assert np.abs(lookup(pictures["roughness_metallic"], corners)[:, 1:] - others).max() < 0.05
+        found = lookup(pictures["occlusion_roughness_metallic"], corners)
+        assert np.abs(found[:, 1:] - others).max() < 0.05 and found[:, 0].min() > 0.98, "and a ball is open"
+
+
+def test_a_smaller_mesh_has_a_picture_of_normals_that_readers_bring_to_signed_numbers(folder):
+    from pxr import UsdGeom, UsdShade
+
+    stage = opened(folder / "small.usdz")
+    assert 100 < len(UsdGeom.Mesh.Get(stage, "/object/mesh").GetFaceVertexCountsAttr().Get()) <= 300
+    material = UsdShade.Material.Get(stage, "/object/material")
+    source = material.ComputeSurfaceSource()[0].GetInput("normal").GetConnectedSources()[0][0]
+    texture = UsdShade.Shader(source.source.GetPrim())
+    scale, bias = (np.array(texture.GetInput(name).Get())[:3] for name in ("scale", "bias"))
+    assert (source.sourceName, texture.GetInput("sourceColorSpace").Get()) == ("rgb", "raw")
+    normals = np.asarray(Image.open(io.BytesIO(picture(stage, "normal")))) / 255 * scale + bias
+    assert np.abs(np.linalg.norm(normals, axis=-1) - 1).max() < 0.02 and normals[..., 2].mean() > 0.98
 
 
 def lookup(pixels: np.ndarray, st: np.ndarray) -> np.ndarray:

@@ -14,16 +14,15 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from torch import Tensor
 
-from drgs.convert.page.bake_transfer import bake_transfer
+from drgs.convert.bake_transfer import bake_transfer
 from drgs.convert.page.pack_arrays import in_order_of_use, pack_arrays, rgbe, steps_from_newest
 from drgs.convert.page.page_lights import PageLight, page_lights
-from drgs.convert.page.shrink_mesh import shrink_mesh
+from drgs.convert.shrink_mesh import shrink_mesh
 from drgs.reconstruct.fit.light.split_sum import LEVELS, brdf_table
 from drgs.reconstruct.geometry.extract_mesh.clean_mesh import is_watertight
 from drgs.scene.asset import Asset
-from drgs.scene.mesh import TriangleMesh
+from drgs.scene.mesh import TriangleMesh, on_cpu
 
 PROGRAM = Path(__file__).with_name("page.html")
 """Built by web/build.py, with a place for the title and one for the object."""
@@ -56,7 +55,7 @@ def encode_page(asset: Asset) -> Page:
     program = _program()
     if not len(asset.mesh.faces):
         raise ValueError("the asset's mesh has no faces; a page needs some to show")
-    mesh = _on_cpu(asset.mesh)
+    mesh = on_cpu(asset.mesh)
     coarse = shrink_mesh(mesh, COARSE_FACES)
     lights, factors = page_lights(asset.environment), _brdf_bytes()
     most = MOST_FACES
@@ -155,8 +154,3 @@ def _title(asset: Asset) -> str:
     source = asset.provenance.get("source")
     name = asset.provenance.get("dataset") or (source.get("file") if isinstance(source, dict) else None)
     return Path(str(name)).stem.replace("_", " ") if name else "Object"
-
-
-def _on_cpu(mesh: TriangleMesh) -> TriangleMesh:
-    cpu: dict[str, Tensor] = {key: values.detach().cpu() for key, values in vars(mesh).items()}
-    return TriangleMesh(**cpu)

@@ -17,7 +17,7 @@ export type DownloadFormat = "glb" | "mesh" | "html" | "ply" | "ply3" | "spz" | 
 
 /** In the order in which they are offered. */
 export const FILE_KINDS: { format: DownloadFormat; suffix: string; title: string; description: string }[] = [
-  { format: "glb", suffix: ".glb", title: "Mesh and Gaussians (GLB)", description: "Mesh with metallic-roughness textures: Blender, three.js, Unreal, Unity; in a second scene the Gaussians (KHR_gaussian_splatting)" },
+  { format: "glb", suffix: ".glb", title: "Mesh and Gaussians (GLB)", description: "Mesh with textures, occlusion and normals among them: Blender, three.js, Unreal, Unity; in a second scene the Gaussians (KHR_gaussian_splatting)" },
   { format: "mesh", suffix: ".glb", title: "Mesh (GLB)", description: "The same mesh alone, in a smaller file" },
   { format: "html", suffix: ".html", title: "Page (HTML)", description: "One file that any browser opens, without a server: the object to turn, relight and recolour" },
   { format: "ply", suffix: ".ply", title: "Gaussians (2DGS PLY)", description: "2D Gaussians with the field names of 2DGS: SuperSplat" },

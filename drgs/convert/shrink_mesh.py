@@ -1,4 +1,4 @@
-"""A mesh with fewer faces for a page: shape by quadric edge collapse, materials and normals as means of what they stand for.
+"""A mesh with fewer faces: shape by quadric edge collapse, materials and normals as means of what they stand for.
 
 In and out: a TriangleMesh. Corners at one place are joined first, so that faces which share none can shrink too.
 """
