@@ -16,6 +16,7 @@ from drgs.installation import missing_package
 if TYPE_CHECKING:  # what a type checker knows of the names that come late; a test compares the two lists
     from drgs.convert.export_asset import export_asset as export_asset
     from drgs.convert.import_mesh import import_mesh as import_mesh
+    from drgs.convert.page.view import view as view
     from drgs.deform.pose_scene import pose_scene as pose_scene
     from drgs.reconstruct.build_asset import BuildSettings as BuildSettings
     from drgs.reconstruct.build_asset import build_asset as build_asset
@@ -39,6 +40,7 @@ _modules = {
     "build_asset": "drgs.reconstruct.build_asset",
     "import_mesh": "drgs.convert.import_mesh",
     "export_asset": "drgs.convert.export_asset",
+    "view": "drgs.convert.page.view",
     "parse_edits": "drgs.scene.edits",
     "pose_scene": "drgs.deform.pose_scene",
     "RenderSettings": "drgs.render.records",

@@ -13,7 +13,6 @@ env   the recovered light, lat-long EXR, linear
 Viewers of Gaussians show colours as they stand in the file, so there the linear radiance is turned to sRGB.
 """
 
-import io
 import os
 import tempfile
 from pathlib import Path
@@ -21,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from drgs.convert.bake_textures import DEFAULT_FACES, TexturedMesh, bake_textures
@@ -31,6 +29,7 @@ from drgs.exchange.exr import encode_environment
 from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
 from drgs.exchange.glb import GlbMesh, GlbPoints, encode_glb
 from drgs.exchange.gltf_splats import GltfSplats, points_from_splats
+from drgs.exchange.pictures import encode_png
 from drgs.exchange.spz import SMALLEST_SCALE, encode_spz
 from drgs.exchange.usd import BASE_COLOR, NORMAL, SURFACE, UsdScene, refuse_unwritable, write_ar_usdz, write_usd
 from drgs.maths.color import srgb_from_linear
@@ -131,12 +130,12 @@ def _textured_glb(asset: Asset, textured: TexturedMesh, with_splats: bool) -> by
     mesh, atlas = textured.mesh, textured.atlas
     normals = torch.nn.functional.normalize(mesh.normals, dim=-1)
     attributes = {"POSITION": _array(mesh.vertices)[atlas.vertex_of], "NORMAL": _array(normals)[atlas.vertex_of], "TEXCOORD_0": atlas.uv}
-    images = [_png(textured.base_color), _png(textured.surface)]
+    images = [encode_png(textured.base_color), encode_png(textured.surface)]
     textures = {"occlusionTexture": {"index": 1}}
     if textured.normal is not None and textured.tangents is not None:
         attributes["TANGENT"] = textured.tangents
         textures["normalTexture"] = {"index": len(images)}
-        images.append(_png(textured.normal))
+        images.append(encode_png(textured.normal))
     material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
     points = _splat_points(asset.gaussians) if with_splats and asset.gaussians is not None and len(asset.gaussians.centers) else None
     return encode_glb(GlbMesh(attributes, atlas.faces, material, textures, tuple(images)), asset.meters_per_unit, points)
@@ -145,9 +144,9 @@ def _textured_glb(asset: Asset, textured: TexturedMesh, with_splats: bool) -> by
 def _usd_scene(asset: Asset, textured: TexturedMesh) -> UsdScene:
     mesh = {key: _array(values) for key, values in vars(textured.mesh).items()}
     mesh["normals"] = _array(torch.nn.functional.normalize(textured.mesh.normals, dim=-1))
-    textures = {BASE_COLOR: _png(textured.base_color), SURFACE: _png(textured.surface)}
+    textures = {BASE_COLOR: encode_png(textured.base_color), SURFACE: encode_png(textured.surface)}
     if textured.normal is not None:
-        textures[NORMAL] = _png(textured.normal)
+        textures[NORMAL] = encode_png(textured.normal)
     return UsdScene(
         mesh,
         textured.atlas.uv,
@@ -211,13 +210,6 @@ def _upright_splats(asset: Asset) -> dict[str, np.ndarray]:
         "sh": rotate_sh(torch.from_numpy(arrays["sh"]), upright),
     }
     return arrays | {key: _array(values) for key, values in turned.items()} | {"scales": asset.meters_per_unit * arrays["scales"]}
-
-
-def _png(texels: np.ndarray) -> bytes:
-    """Of (height, width, 3) uint8."""
-    stream = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(texels)).save(stream, "PNG", compress_level=4)
-    return stream.getvalue()
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -4,9 +4,12 @@ Pillow's own `convert` cuts 16-bit grey off at 255, so that all but the darkest 
 `as_eight_bits` before it. Colour of 16 bits needs nothing, since Pillow keeps the high byte of each channel as it reads.
 """
 
+import io
 import math
 
 import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
 from PIL import ExifTags, Image
 
 _MOST = 65535
@@ -53,6 +56,13 @@ def upright(image: Image.Image) -> Image.Image:
     """The picture turned as EXIF's orientation says."""
     turn = _TURNS.get(orientation_of(image))
     return image if turn is None else image.transpose(turn)
+
+
+def encode_png(texels: UInt8[ndarray, "height width channel"]) -> bytes:
+    """A PNG file of sRGB colours, with straight alpha where there are four channels."""
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(texels)).save(stream, "PNG", compress_level=4)
+    return stream.getvalue()
 
 
 def as_eight_bits(image: Image.Image) -> Image.Image:

@@ -11,6 +11,7 @@ from typing import Literal
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from drgs.exchange.pictures import encode_png
 from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedScene, PrimarySurface
 from drgs.scene.tone_curve import ToneCurve
@@ -308,3 +309,10 @@ class Frame:
     radiance: Radiance
     metadata: dict = field(default_factory=dict)
     """Plain JSON: samples, seconds per step, what was skipped and why."""
+
+    def __repr__(self) -> str:
+        return f"Frame of {self.rgba_srgb.shape[1]}x{self.rgba_srgb.shape[0]} pixels"
+
+    def _repr_png_(self) -> bytes:
+        """What notebooks show of it: the picture alone."""
+        return encode_png((self.rgba_srgb.clamp(0, 1) * 255).round().byte().cpu().numpy())

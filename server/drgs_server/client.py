@@ -43,6 +43,7 @@ from drgs_server.api.rest_records import (
 )
 from drgs_server.client_stream import ServerError, Stream
 from drgs_server.live.messages import EditLog, Settings
+from drgs_server.picture import Picture
 from drgs_worker.jobs.requests import BindingName, ExportRequest, LightName, RedecoupleRequest, RenderRequest, SimulateRequest
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -335,8 +336,8 @@ class RemoteSession:
         fov_y_degrees: float | None = None,
         format: Literal["png", "jpg", "exr"] = "png",
         **settings: Any,
-    ) -> bytes:
-        """One finished picture.
+    ) -> Picture:
+        """One finished picture: the bytes of its file, which notebooks show.
 
         Args:
             format: exr holds linear radiance.
@@ -348,7 +349,7 @@ class RemoteSession:
             query["world_from_camera"] = ",".join(repr(float(value)) for row in world_from_camera for value in row)
         if fov_y_degrees is not None:
             query["fov_y_degrees"] = fov_y_degrees
-        return self._client._bytes(f"/api/sessions/{self.id}/frame.{format}", params=query, timeout=600)
+        return Picture(self._client._bytes(f"/api/sessions/{self.id}/frame.{format}", params=query, timeout=600))
 
     def delete(self) -> None:
         self._client._request("DELETE", f"/api/sessions/{self.id}")
