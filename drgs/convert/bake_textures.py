@@ -32,7 +32,7 @@ DEFAULT_FACES = 30_000
 """Charts of so many take some ten seconds of a core, of twice as many a minute."""
 TEXELS_PER_VERTEX = 16
 """Of the large mesh: four from one to the next along either side."""
-LEAST_CORNERS = 20_000
+LEAST_CORNERS = 5_000
 """Coarser meshes are divided before their occlusion is traced at vertices."""
 REACH = 0.01
 """How far the large surface is looked for from the small one, as a share of the mesh's extent."""

@@ -34,6 +34,7 @@ def face_middles(textured: TexturedMesh, picture: np.ndarray) -> np.ndarray:
     return picture[at[:, 1], at[:, 0]].astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [trimesh.creation.icosphere(3), trimesh.creation.box()], ids=["ball", "box"])
 def test_nothing_is_darker_on_what_sees_no_part_of_itself(shape):
     corners = shape.vertices[shape.faces].reshape(-1, 3)  # a box with sharp edges
