@@ -36,6 +36,8 @@ LEAST_CORNERS = 5_000
 """Coarser meshes are divided before their occlusion is traced at vertices."""
 REACH = 0.01
 """How far the large surface is looked for from the small one, as a share of the mesh's extent."""
+TEXELS_AT_ONCE = 1 << 16
+"""That look at the large mesh; more would only take memory."""
 LEAST_FACING = 0.05
 """Of a normal along the small surface's: no program shows one that looks away."""
 
@@ -108,6 +110,10 @@ class _LargeSurface:
 
     def texels(self, places: Float[ndarray, "texel 10"]) -> UInt8[ndarray, "texel 9"]:
         """Base colour, surface and normal of texels at these positions with these normals and tangents."""
+        parts = max(-(-len(places) // TEXELS_AT_ONCE), 1)
+        return np.concatenate([self._look(part) for part in np.array_split(places, parts)])
+
+    def _look(self, places: Float[ndarray, "texel 10"]) -> UInt8[ndarray, "texel 9"]:
         given = torch.from_numpy(np.ascontiguousarray(places))
         normals = torch.nn.functional.normalize(given[:, 3:6], dim=-1)
         face, weights = self._meet(given[:, :3].contiguous(), normals)
