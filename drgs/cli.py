@@ -173,6 +173,10 @@ def build(
         LightKind,
         typer.Option(help="What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."),
     ] = LightKind.auto,
+    up: Annotated[
+        tuple[float, float, float],
+        typer.Option(metavar="X Y Z", help="Direction of the capture's world that points up; the asset's world is turned so that it is z."),
+    ] = (0.0, 0.0, 1.0),
     device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
     seed: Annotated[int, typer.Option()] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint that a stopped build left.")] = False,
@@ -183,13 +187,16 @@ def build(
     from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
     from drgs.reconstruct.outline_agreement import complaint
 
-    settings = BuildSettings(preset=preset.value, binding=binding.value, device=device.value, seed=seed, resume=resume, light=light.value)
+    settings = BuildSettings(
+        preset=preset.value, binding=binding.value, device=device.value, seed=seed, resume=resume, light=light.value, up=up
+    )
     with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
         try:
             asset = build_asset(dataset, out, settings, progress=report, should_stop=interrupt.is_set)
         except BuildStopped:
             chosen = "" if binding == BindingKind.particles else f" --binding {binding.value}"
             chosen += "" if light == LightKind.auto else f" --light {light.value}"
+            chosen += "" if up == (0.0, 0.0, 1.0) else f" --up {up[0]:g} {up[1]:g} {up[2]:g}"
             print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value}{chosen} --resume", file=sys.stderr)
             raise typer.Exit(130) from None
     if json_progress:

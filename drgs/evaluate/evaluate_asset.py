@@ -49,6 +49,11 @@ def evaluate_asset(
     cameras_path = capture / "transforms_test.json"
     if not cameras_path.exists():
         raise ValueError(f"{capture} has no transforms_test.json; eval expects a capture with test cameras and pictures")
+    if "up" in asset.provenance:
+        raise ValueError(
+            f"this asset's world is {capture}'s turned (up {asset.provenance['up']}), and its test cameras and lights are those of the unturned one; "
+            "evaluate a build without --up"
+        )
     with tempfile.TemporaryDirectory() as temporary:
         renders = out or Path(temporary)
         _render_all(asset, capture, renders, load_cameras(cameras_path), settings, done)

@@ -24,6 +24,7 @@ from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
+from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
 from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings, albedo_detail, divisions
@@ -97,6 +98,8 @@ class BuildSettings:
     resume: bool = False
     light: LightChoice = "auto"
     """What the lamps stood still with while the photographs were taken."""
+    up: Direction = UP
+    """Direction of the capture's world that points up. The asset's world is the capture's, turned so that it is z (turn_up.rotation_to_up)."""
     materials: str | None = None
     """Preset of the stage `materials` alone: None is `preset`. It is how material and light are separated anew on kept geometry."""
 
@@ -217,7 +220,7 @@ def build_stages(
     with timed("read"):
         reporter.report("read", 0.0, "reading the capture")
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
-        found, views, points = open_capture(capture, preset.image_side, preset.points, settings.seed)
+        found, views, points = open_capture(capture, preset.image_side, preset.points, settings.seed, settings.up)
         photographs = views
         views = with_gains_of_points(views, points)
         identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
@@ -431,6 +434,7 @@ def _check(settings: BuildSettings) -> None:
         raise ValueError("light 'camera' needs materials that are fitted on the mesh; expected a preset that does so")
     if settings.binding not in BINDINGS:
         raise ValueError(f"binding {settings.binding!r} is unknown; expected one of {', '.join(BINDINGS)}")
+    rotation_to_up(settings.up)
 
 
 def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMesh, seconds: dict[str, float]) -> dict[str, Any]:
@@ -441,6 +445,7 @@ def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMes
         "materials": settings.materials or settings.preset,
         "materials_on": PRESETS[settings.preset].materials_on,
         "seed": settings.seed,
+        **({"up": list(settings.up)} if settings.up != UP else {}),
         "device": str(device),
         "torch": torch.__version__,
         "mesh": asdict(mesh_report(mesh.vertices, mesh.faces)),

@@ -17,6 +17,7 @@ from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.mask_agreement import mask_agreement
+from drgs.reconstruct.capture.turn_up import UP, Direction, turn_up
 from drgs.reconstruct.capture.visual_hull import axes_meeting_point
 from drgs.scene.views import Views
 
@@ -35,13 +36,18 @@ INVERT = (
 )
 
 
-def open_capture(folder: Path, max_side: int | None, point_count: int, seed: int) -> tuple[Capture, Views, InitialPoints]:
+def open_capture(
+    folder: Path, max_side: int | None, point_count: int, seed: int, up: Direction = UP
+) -> tuple[Capture, Views, InitialPoints]:
     """The capture, its pictures of at most `max_side` pixels a side, and points to begin with.
+
+    Args:
+        up: the direction of the capture's own world that is to point up: all is given in the world that is turned so.
 
     Raises:
         ValueError: one sentence why there is nothing to build from; a CaptureFault where what to do about it is known, too.
     """
-    capture = read_capture(folder)
+    capture = turn_up(read_capture(folder), up)
     _check_cameras(capture, folder)
     views = read_pictures(capture, max_side)
     _check_pictures(views, folder)

@@ -36,6 +36,8 @@ class BuildRequest:
     binding: str = "particles"
     """particles or mesh."""
     light: LightName = "auto"
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Of the capture's world."""
 
 
 Builder = Callable[[BuildRequest, Tell, Callable[[], bool]], Iterator[str]]
@@ -60,7 +62,14 @@ def build_with_drgs(request: BuildRequest, tell: Tell, should_stop: Callable[[],
     from drgs.reconstruct import build_asset as build
 
     settings = build.BuildSettings(
-        request.preset, request.binding, request.device, request.seed, resume=True, light=request.light, materials=request.materials
+        request.preset,
+        request.binding,
+        request.device,
+        request.seed,
+        resume=True,
+        light=request.light,
+        up=request.up,
+        materials=request.materials,
     )
 
     if request.materials is None:  # else the capture was examined by the build whose geometry this one takes

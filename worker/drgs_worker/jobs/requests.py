@@ -26,6 +26,8 @@ FILM_FPS = 24
 """Of moving pictures, where a request does not say."""
 MAX_PICTURE_SAMPLES = 4096 * 4096 * 64
 """Pixels times samples of one picture."""
+SHORTEST_UP = 1e-6
+"""Of a direction that says something."""
 OWN_LIGHT = "own"
 """Names the environment that was recovered with the asset."""
 
@@ -84,7 +86,15 @@ class BuildRequest(_Job):
     """particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face."""
     light: LightName = "auto"
     """What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."""
+    up: Triple = (0.0, 0.0, 1.0)
+    """Direction of the capture's world that points up; the asset's world is turned so that it is z. Not of multipart bodies."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
+
+    @model_validator(mode="after")
+    def _up_is_a_direction(self) -> "BuildRequest":
+        if math.hypot(*self.up) < SHORTEST_UP:
+            raise ValueError(f"up: expected a direction, three numbers that are not all 0; found {self.up}")
+        return self
 
 
 class RedecoupleRequest(_Job):

@@ -28,6 +28,8 @@ class BuildRun(AbstractJobRun):
         self._stages: Iterator[str] | None = None
         self._binding: str = job.parameters.get("binding", "particles")
         self._light: LightName = job.parameters.get("light", "auto")
+        x, y, z = job.parameters.get("up", (0.0, 0.0, 1.0))
+        self._up: tuple[float, float, float] = (x, y, z)
         self.steps: tuple[str, ...] = (*STAGE_SHARES[self._binding], "register")
 
     def run(self, step: str) -> None:
@@ -52,7 +54,9 @@ class BuildRun(AbstractJobRun):
         assert job.dataset is not None
         given = job.parameters
         out = job.folder / "asset"
-        return BuildRequest(job.dataset, out, given["preset"], given["seed"], job.device, binding=self._binding, light=self._light)
+        return BuildRequest(
+            job.dataset, out, given["preset"], given["seed"], job.device, binding=self._binding, light=self._light, up=self._up
+        )
 
     def _register(self) -> None:
         """Does nothing that was already done."""
@@ -106,4 +110,4 @@ class RedecoupleRun(BuildRun):
         assert job.dataset is not None
         out = job.folder / "asset"
         preset, seed = given["built_preset"], given["built_seed"]
-        return BuildRequest(job.dataset, out, preset, seed, job.device, given["preset"], self._binding, self._light)
+        return BuildRequest(job.dataset, out, preset, seed, job.device, given["preset"], self._binding, self._light, self._up)
