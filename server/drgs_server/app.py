@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from copy import deepcopy
@@ -16,11 +17,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.staticfiles import StaticFiles
 
 from drgs import __version__
-from drgs_server.api import routes_assets, routes_jobs, routes_sessions, routes_views, routes_weights
+from drgs_server.api import routes_assets, routes_captures, routes_jobs, routes_sessions, routes_uploads, routes_views, routes_weights
 from drgs_server.api.body_limit import BodyLimit
 from drgs_server.api.context import ServerContext
 from drgs_server.api.docs_page import docs_page
 from drgs_server.api.environments import EnvironmentStore
+from drgs_server.api.incoming import IncomingUploads
 from drgs_server.api.metrics import CONTENT_TYPE, Metrics, MetricsMiddleware
 from drgs_server.api.openapi_document import complete_document
 from drgs_server.api.problems import ProblemError, UnexpectedErrors, add_problem_handlers
@@ -40,7 +42,7 @@ from drgs_worker.store.artifact_store import ArtifactError
 from drgs_worker.store.backups import back_up_databases
 from drgs_worker.store.data_directory import open_data_directory, read_token
 from drgs_worker.store.database import open_database
-from drgs_worker.store.remove_unused import remove_unused_poses, remove_unused_weights
+from drgs_worker.store.remove_unused import remove_unused_captures, remove_unused_poses, remove_unused_weights
 from drgs_worker.store.scratch import claim_scratch
 
 LIVENESS_SECONDS = 5.0
@@ -82,6 +84,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
         engine=engine,
         queue=JobQueue(directory, engine),
         environments=environments,
+        incoming=IncomingUploads(directory.incoming, settings.limits),
         render_thread=thread,
         sessions=SessionRegistry(directory, engine, renderer, thread, environments, settings.limits, metrics, admission),
         gatekeeper=Gatekeeper(settings.token.get_secret_value() if settings.token else read_token(directory), settings.host_names),
@@ -112,7 +115,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     derive = app.openapi
     app.openapi = cache(lambda: complete_document(deepcopy(derive())))  # type: ignore[method-assign]
     add_problem_handlers(app, directory.told)
-    for routes in (routes_jobs, routes_assets, routes_views, routes_sessions, routes_weights, stream):
+    for routes in (routes_uploads, routes_captures, routes_jobs, routes_assets, routes_views, routes_sessions, routes_weights, stream):
         app.include_router(routes.router)
     _add_small_routes(app, context)
     _add_pages(app, settings)
@@ -144,6 +147,9 @@ async def _remove_unused(context: ServerContext) -> None:
             await asyncio.to_thread(routes_assets.remove_deleted_assets, context)
             await asyncio.to_thread(remove_unused_weights, context.directory, context.engine)
             await asyncio.to_thread(remove_unused_poses, context.directory, context.engine)
+            keep_seconds = context.settings.limits.keep_upload_seconds
+            await asyncio.to_thread(context.incoming.remove_before, time.time() - keep_seconds)
+            await asyncio.to_thread(remove_unused_captures, context.directory, context.engine, keep_seconds)
         except (SQLAlchemyError, ArtifactError, OSError) as error:
             logging.getLogger(__name__).warning("what is deleted or unused was not removed: %s", error)
         await asyncio.sleep(REMOVAL_SECONDS)

@@ -11,14 +11,12 @@ Speaks only HTTP and WebSocket; imports neither torch nor the renderer. Final st
 the server does not know is an error, never done.
 """
 
-import tempfile
 import time
-import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 from urllib.parse import quote, urlsplit
 
 import httpx
@@ -26,10 +24,12 @@ from pydantic import BaseModel, TypeAdapter
 from websockets.sync.client import ClientConnection, connect
 
 from drgs.exchange.export_formats import DownloadFormat
-from drgs.scene.edits import Edit
+from drgs.scene.edits import Edit, Triple
 from drgs_server.api.rest_records import (
     AssetInfo,
     AssetList,
+    CaptureInfo,
+    CaptureList,
     EnvironmentInfo,
     EnvironmentList,
     JobFile,
@@ -42,6 +42,7 @@ from drgs_server.api.rest_records import (
     SnapshotList,
 )
 from drgs_server.client_stream import ServerError, Stream
+from drgs_server.client_upload import as_zip, send_in_parts, server_error
 from drgs_server.live.messages import EditLog, Settings
 from drgs_server.picture import Picture
 from drgs_worker.jobs.requests import BindingName, ExportRequest, LightName, RedecoupleRequest, RenderRequest, SimulateRequest
@@ -90,25 +91,47 @@ class Client:
         idempotency_key: str | None = None,
         binding: BindingName = "particles",
         light: LightName = "auto",
+        up: Triple = (0.0, 0.0, 1.0),
     ) -> JobInfo:
         """Start a build.
 
         Args:
-            dataset: `sample`, a folder or zip of this machine (uploaded), or `server:PATH`, a folder that the server may read.
+            dataset: `sample`, a folder or zip of this machine (uploaded), `capture:ID`, which was uploaded before, or `server:PATH`, a folder that
+                the server may read.
             binding: particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh.
             light: what the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures.
+            up: direction of the capture's world that points up; the asset's world is turned so that it is z.
             idempotency_key: the same key gives the same job, however often this is called.
         """
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
-        if isinstance(dataset, str) and (dataset == "sample" or dataset.startswith("server:")):
-            chosen = {"preset": preset, "binding": binding, "light": light, "seed": seed, "name": name}
-            body = {"dataset": dataset.removeprefix("server:")} | chosen
-            return self._call("POST", "/api/jobs", JobInfo, json=body, headers=headers)
-        path = Path(dataset)
-        fields = {"preset": preset, "binding": binding, "light": light, "seed": str(seed), "name": name or path.stem}
-        with _as_zip(path) as file:
-            upload = {"file": (path.stem + ".zip", file, "application/zip")}
-            return self._call("POST", "/api/jobs", JobInfo, data=fields, files=upload, headers=headers)
+        if not (isinstance(dataset, str) and (dataset == "sample" or dataset.startswith(("server:", "capture:")))):
+            dataset = f"capture:{self.upload_capture(Path(dataset), name).id}"
+        body = {
+            "dataset": dataset.removeprefix("server:"),
+            "preset": preset,
+            "binding": binding,
+            "light": light,
+            "up": up,
+            "seed": seed,
+            "name": name,
+        }
+        return self._call("POST", "/api/jobs", JobInfo, json=body, headers=headers)
+
+    def upload_capture(self, path: Path, name: str | None = None, progress: Callable[[float], None] = lambda _: None) -> CaptureInfo:
+        """Send a folder or a zip, for builds to read. It goes on by itself after a lost connection or a restart of the server.
+
+        Args:
+            progress: is told the share that has arrived, 0..1.
+        """
+        with as_zip(path) as file:
+            upload = send_in_parts(self._http, file, f"{path.stem}.zip", progress)
+        return self._call("POST", "/api/captures", CaptureInfo, json={"upload": upload, "name": name}, timeout=600)
+
+    def captures(self, limit: int = 50, offset: int = 0) -> CaptureList:
+        return self._call("GET", "/api/captures", CaptureList, params={"limit": limit, "offset": offset})
+
+    def delete_capture(self, capture_id: str) -> None:
+        self._request("DELETE", f"/api/captures/{capture_id}")
 
     def submit(
         self,
@@ -243,7 +266,7 @@ class Client:
     def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
         response = self._http.request(method, path, **options)
         if response.is_error:
-            raise _error(response)
+            raise server_error(response)
         return response
 
     def _call(self, method: str, path: str, model: type[Model], **options: Any) -> Model:
@@ -256,7 +279,7 @@ class Client:
         with self._http.stream("GET", path, timeout=600, **options) as response:
             if response.is_error:
                 response.read()
-                raise _error(response)
+                raise server_error(response)
             with out.open("wb") as file:
                 for chunk in response.iter_bytes():
                     file.write(chunk)
@@ -362,29 +385,3 @@ class RemoteSession:
             if settings is not None:
                 stream.send(type="settings", settings=settings.model_dump())
             yield stream
-
-
-def _error(response: httpx.Response) -> ServerError:
-    try:
-        detail = response.json()["detail"]
-    except (ValueError, KeyError, TypeError):
-        detail = response.text[:200] or response.reason_phrase
-    return ServerError(response.status_code, str(detail))
-
-
-@contextmanager
-def _as_zip(path: Path) -> Iterator[IO[bytes]]:
-    """The file itself, or a temporary zip of the folder (stored: pictures do not get smaller)."""
-    if path.is_file():
-        with path.open("rb") as file:
-            yield file
-        return
-    if not path.is_dir():
-        raise ValueError(f"{path}: expected the folder or zip of a capture")
-    with tempfile.TemporaryFile() as file:
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for entry in sorted(path.rglob("*")):
-                if entry.is_file():
-                    archive.write(entry, entry.relative_to(path))
-        file.seek(0)
-        yield file

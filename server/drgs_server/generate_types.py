@@ -61,6 +61,7 @@ _FRAME_CONSTANTS = (
 )
 
 _REQUESTS: tuple[type[BaseModel], ...] = (
+    rest_records.CaptureRequest,
     rest_records.BuildRequest,
     rest_records.RedecoupleRequest,
     rest_records.SimulateRequest,
@@ -73,6 +74,9 @@ _REQUESTS: tuple[type[BaseModel], ...] = (
     rest_records.TokenRequest,
 )
 _ANSWERS: tuple[type[BaseModel], ...] = (
+    rest_records.CaptureInfo,
+    rest_records.CaptureList,
+    rest_records.CaptureLook,
     rest_records.JobInfo,
     rest_records.JobList,
     rest_records.JobFileList,

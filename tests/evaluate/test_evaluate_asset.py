@@ -1,6 +1,7 @@
 """An asset whose own renders are the truth gets perfect figures: every light and deformation is rendered as the capture asks."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -82,3 +83,9 @@ def test_a_wrong_albedo_is_seen_and_scaled_away_under_a_new_light(capture: Path)
 def test_a_capture_without_test_views_is_one_sentence(tmp_path: Path):
     with pytest.raises(ValueError, match=r"has no transforms_test.json"):
         evaluate_asset(box_asset(), tmp_path)
+
+
+def test_an_asset_of_a_turned_world_is_refused(capture: Path):
+    turned = replace(box_asset(), provenance={"up": [0.0, 1.0, 0.0]})
+    with pytest.raises(ValueError, match="turned"):
+        evaluate_asset(turned, capture)

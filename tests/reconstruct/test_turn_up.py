@@ -9,7 +9,8 @@ import torch
 from drgs.reconstruct.build_asset import BuildSettings, build_asset
 from drgs.reconstruct.capture.load_views import read_capture
 from drgs.reconstruct.capture.open_capture import open_capture
-from drgs.reconstruct.capture.turn_up import UP, rotation_to_up, turn_up
+from drgs.reconstruct.capture.turn_up import UP, rotation_to_up, turn_up, up_of_cameras
+from drgs.scene.camera import opengl_from_camera
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, write_colmap, write_nerf_synthetic
 
 DIRECTIONS = [(0, 0, 1), (0, 0, -1), (0, 1, 0), (-1, 0, 0), (0.3, -0.5, 0.2), (1e-7, 0, -1), (1e-4, 1e-4, -1), (0, 0, 5)]
@@ -45,6 +46,14 @@ def test_pixels_see_the_same_points_of_the_turned_world(tmp_path: Path) -> None:
         assert still == pytest.approx(seen, abs=1e-9)
     assert turned.points_world == pytest.approx(capture.points_world @ rotation.T, abs=1e-5)
     assert turn_up(capture, UP) is capture
+
+
+def test_cameras_that_are_held_level_tell_which_way_is_up(tmp_path: Path) -> None:
+    folder = write_nerf_synthetic(tmp_path / "capture")
+    _, views, _ = open_capture(folder, None, 100, 0, (0.0, 1.0, 0.0))
+    poses = np.stack([opengl_from_camera(camera).numpy() for camera in views.cameras])
+    # They were level before, with z up; that is now where the turn took it.
+    assert up_of_cameras(poses) == pytest.approx(rotation_to_up((0.0, 1.0, 0.0)) @ [0, 0, 1], abs=0.2)
 
 
 def test_the_hull_of_a_turned_capture_is_turned(tmp_path: Path) -> None:

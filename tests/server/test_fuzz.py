@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 from starlette.websockets import WebSocketDisconnect
 from test_stream import Talk, camera, material
 
+from drgs_server.api.routes_uploads import PART_TYPE
 from drgs_server.live.messages import ClientMessage
 
 QUIET = settings(
@@ -48,6 +49,7 @@ def send(service: Service, case: Any) -> Any:
 def test_no_request_that_the_openapi_document_allows_ends_in_a_server_error(service: Service) -> None:
     # Here, and not above: it takes as long to import as all of the service, and processes that share the tests import every file.
     schemathesis = pytest.importorskip("schemathesis", reason="needs the package schemathesis: pip install -e '.[dev]'")
+    schemathesis.serializer.alias(PART_TYPE, "application/octet-stream")
     document = json.loads(json.dumps(service.app.openapi()))
     schema = schemathesis.openapi.from_dict(document)
     session = service.open_session()
@@ -74,7 +76,8 @@ def test_no_request_that_the_openapi_document_allows_ends_in_a_server_error(serv
             assert response.status_code < 500, f"{case.method} {case.formatted_path} {case.body!r}: {response.text}"
             if response.status_code >= 400:
                 assert response.headers["content-type"] == "application/problem+json", (case.formatted_path, response.text)
-                assert " " in response.json()["detail"]
+                if case.method.upper() != "HEAD":  # whose answers have no body
+                    assert " " in response.json()["detail"]
 
         ask()
     assert sum(seen.values()) > 300 and seen.get(200, 0) > 80 and seen.get(422, 0) > 10, seen

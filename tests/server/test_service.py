@@ -21,7 +21,7 @@ from examples import turntable, variants_sheet
 from tests.patience import PATIENCE_SECONDS
 
 REPOSITORY = Path(__file__).parents[2]
-PROGRAM = "import sys; from pathlib import Path; from drgs_server.run import serve; sys.exit(serve(Path(sys.argv[1]), port=0, ready=lambda a: print(a, flush=True)))"
+PROGRAM = "import sys; from pathlib import Path; from drgs_server.run import serve; sys.exit(serve(Path(sys.argv[1]), port=int(sys.argv[2]), ready=lambda a: print(a, flush=True)))"
 
 
 class ServeProcess:
@@ -31,11 +31,15 @@ class ServeProcess:
         self.root = root
         self.process: subprocess.Popen | None = None
 
-    def start(self) -> Client:
+    def start(self, port: int = 0) -> Client:
         paths = os.pathsep.join(str(REPOSITORY / folder) for folder in ("tests/worker", ".", "worker", "server"))
         environment = {**os.environ, BUILDER_VARIABLE: "tiny_builder:build", "PYTHONPATH": paths}
         self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, str(self.root / "data")], env=environment, cwd=self.root, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", PROGRAM, str(self.root / "data"), str(port)],
+            env=environment,
+            cwd=self.root,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         lines: queue.Queue[str] = queue.Queue()
         stdout = self.process.stdout

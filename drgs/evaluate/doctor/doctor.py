@@ -1,8 +1,10 @@
 """Check a capture before time is spent on it: what was found, what will hurt the result, what to do about it.
 
-In: a folder. Out: plain JSON data. A folder that cannot be read is a finding, not an exception.
+In: a folder. Out: plain JSON data, and to those who show it also the cameras and points that it is about. A folder that cannot be read is a finding, not
+an exception.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,11 @@ from drgs.evaluate.doctor.photographs import photographs
 from drgs.evaluate.doctor.picture_looks import files_of_capture, picture_looks
 from drgs.evaluate.doctor.pictures import files, looks, sizes
 from drgs.evaluate.doctor.places import places
+from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.pose.posed_dataset import needs_poses
+from drgs.scene.views import Views
 
 EXAMINED_SIDE = 400
 """Pictures are examined at this size [pixels]; what it hides does not matter here."""
@@ -31,20 +35,37 @@ WHAT_TO_TAKE = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """A capture and what is said of it."""
+
+    report: dict[str, Any]
+    """As `doctor` gives it."""
+    views: Views | None = None
+    """Shrunken to EXAMINED_SIDE; None where there are no cameras yet, or the capture cannot be read."""
+    points: InitialPoints | None = None
+    """At most EXAMINED_POINTS; None where there are no views."""
+
+
 def doctor(folder: Path) -> dict[str, Any]:
     """Report on a capture; `ok` says whether a build can start. Keys: see docs of `drgs doctor`."""
+    return examine(folder).report
+
+
+def examine(folder: Path) -> Examined:
+    """The same, with what was read of the capture."""
     folder = Path(folder)
     if needs_poses(folder):
         try:
             report, of_photographs = photographs(folder, WHAT_TO_TAKE)
         except (ValueError, OSError) as error:
-            return _refusal(folder, error, WHAT_TO_TAKE)
+            return Examined(_refusal(folder, error, WHAT_TO_TAKE))
         ok = not any(finding.level == "error" for finding in of_photographs)
-        return {"ok": ok, "folder": str(folder), **report, **told(of_photographs)}
+        return Examined({"ok": ok, "folder": str(folder), **report, **told(of_photographs)})
     try:
         capture, views, points = open_capture(folder, EXAMINED_SIDE, EXAMINED_POINTS, seed=0)
     except (ValueError, OSError) as error:
-        return _refusal(folder, error, WHAT_IS_READ)
+        return Examined(_refusal(folder, error, WHAT_IS_READ))
 
     report = {"ok": True, "folder": str(folder), "source": capture.source, "views": len(capture.photographs)}
     findings: list[Finding] = []
@@ -69,7 +90,7 @@ def doctor(folder: Path) -> dict[str, Any]:
     add("initial_points", first_points(views, points))
     add("light", light(capture, views, points))
     report |= report.pop("pictures")
-    return {**report, "summary": _summary(report), **told(findings)}
+    return Examined({**report, "summary": _summary(report), **told(findings)}, views, points)
 
 
 def _refusal(folder: Path, error: ValueError | OSError, advice: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from numpy import ndarray
 
 from drgs.reconstruct.capture.load_views.capture import Capture
@@ -47,6 +47,17 @@ def rotation_to_up(up: Direction) -> Float64[ndarray, "3 3"]:
     if not (math.isfinite(length) and length > SHORTEST):
         raise ValueError(f"up: {tuple(up)} is no direction, expected three finite numbers that are not all 0.")
     return _rotation_to_z(np.array(up) / length)
+
+
+def up_of_cameras(capture_from_camera: Float[ndarray, "camera 4 4"]) -> Float64[ndarray, "3"]:
+    """The mean of the cameras' own up, of unit length; z where they have none in common.
+
+    Args:
+        capture_from_camera: OpenGL axes.
+    """
+    mean = np.asarray(capture_from_camera, np.float64)[:, :3, 1].mean(0)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > SHORTEST else np.array(UP)
 
 
 def _rotation_to_z(up: Float64[ndarray, "3"]) -> Float64[ndarray, "3 3"]:

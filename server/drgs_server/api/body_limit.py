@@ -12,6 +12,13 @@ from drgs_server.settings import Limits
 OPEN_BODY_BYTES = 4096
 """Of a call without the token: a login."""
 UPLOAD_PATHS = ("/api/jobs", "/api/assets", "/api/environments")
+OWN_PATH = "/api/uploads"
+PART_PATHS = f"{OWN_PATH}/"
+"""Below it parts of an upload are sent, the last of which may be all of it."""
+
+
+def _is_problem(start: Message) -> bool:
+    return Headers(raw=start["headers"]).get("content-type") == "application/problem+json"
 
 
 class BodyLimit:
@@ -28,12 +35,17 @@ class BodyLimit:
             sentence = "Bodies are read as they come; send this one without a Content-Encoding."
             await problem_response(415, sentence)(scope, receive, send)
             return
-        most, refused = self._others.get(scope.get("path", ""), self._most), False
+        path = scope.get("path", "")
+        most, refused = self._others.get(UPLOAD_PATHS[0] if path.startswith(PART_PATHS) else path, self._most), False
 
         async def send_or_explain(message: Message) -> None:
-            """Starlette's own answer is the two words of the status."""
+            """Starlette's own answer is the words of the status; uploads in parts have bounds of their own, and say so."""
             nonlocal refused
-            if message["type"] == "http.response.start" and message["status"] == 413:
+            if (
+                message["type"] == "http.response.start"
+                and message["status"] == 413
+                and not (path.startswith(OWN_PATH) and _is_problem(message))
+            ):
                 refused = True
                 sentence = f"The body is larger than the {most} bytes that this call takes; send less, or in parts."
                 await problem_response(413, sentence)(scope, receive, send)

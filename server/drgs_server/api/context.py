@@ -7,6 +7,7 @@ from sqlalchemy import Engine
 from starlette.requests import HTTPConnection
 
 from drgs_server.api.environments import EnvironmentStore
+from drgs_server.api.incoming import IncomingUploads
 from drgs_server.api.metrics import Metrics
 from drgs_server.api.security import Gatekeeper
 from drgs_server.live.admission import Admission, Caller
@@ -28,6 +29,7 @@ class ServerContext:
     engine: Engine
     queue: JobQueue
     environments: EnvironmentStore
+    incoming: IncomingUploads
     render_thread: RenderThread
     sessions: SessionRegistry
     gatekeeper: Gatekeeper

@@ -9,11 +9,11 @@ from typing import Any
 
 from drgs_server.api.rest_records import Problem
 
-ASSET, JOB, SESSION = "5c0ffee0" * 4, "b01dface" * 4, "feedbead" * 4
+ASSET, JOB, SESSION, CAPTURE = "5c0ffee0" * 4, "b01dface" * 4, "feedbead" * 4, "decade50" * 4
 _MATERIAL = {"op": "material", "select": {"all": True}, "set": {"roughness": 0.1, "metallic": 1.0}, "mode": "absolute"}
 _LIGHT = {"op": "environment", "file": "studio.exr", "rotation": 30.0, "intensity": 1.0}
 _LOG = {"revision": 3, "edits": [_MATERIAL, _LIGHT], "can_undo": True, "can_redo": False, "appended": 2, "undone": [], "broken": []}
-_JOB = {
+_JOB: dict[str, Any] = {
     "id": JOB,
     "kind": "build",
     "name": "Mug",
@@ -46,6 +46,7 @@ _JOB = {
     },
     "preview_version": 12,
 }
+_CAPTURE = {"id": CAPTURE, "name": "Mug", "created_at": "2026-11-20T09:58:00Z", "jobs": [JOB]}
 _ASSET = {
     "id": ASSET,
     "name": "Mug",
@@ -81,6 +82,25 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "version": _ASSET | {"id": "5eed" * 8, "source": "session", "version": 2, "parent_id": ASSET, "edits": [_MATERIAL]},
     },
     "AssetList": {"one": {"assets": [_ASSET], "total": 1}},
+    "CaptureInfo": {"built": _CAPTURE},
+    "CaptureList": {"one": {"captures": [_CAPTURE], "total": 1}},
+    "CaptureLook": {
+        "with masks": {
+            "ok": True,
+            "summary": _JOB["capture"]["summary"],
+            "findings": _JOB["capture"]["findings"],
+            "has_sheet": True,
+            "camera_count": 64,
+            "cameras": [_VIEW],
+            "up": [0.0, 0.0, 1.0],
+            "box_low": [-0.6, -0.4, -0.5],
+            "box_high": [0.6, 0.4, 0.5],
+            "box_origin": "masks",
+            "points": [0.1, 0.2, 0.3],
+            "colors": [0.8, 0.1, 0.1],
+        }
+    },
+    "CaptureRequest": {"complete upload": {"upload": CAPTURE, "name": "Mug"}},
     "EditLog": {"two edits": _LOG | {"digest": "9f86d081884c7d65"}},
     "EditRequest": {
         "material": {"edit": _MATERIAL},
@@ -132,6 +152,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
 
 _BINARY = {"type": "string", "format": "binary"}
 FILES: dict[str, tuple[str, ...]] = {
+    "/api/captures/{capture_id}/sheet.jpg": ("image/jpeg",),
     "/api/jobs/{job_id}/preview.jpg": ("image/jpeg",),
     "/api/jobs/{job_id}/files/{name}": ("application/octet-stream", "image/png", "video/mp4", "model/gltf-binary"),
     "/api/assets/{asset_id}/thumb.jpg": ("image/jpeg",),

@@ -31,13 +31,15 @@ class ProblemError(Exception):
 
     Args:
         retry_after: seconds after which the same request may succeed; every 429 and 503 says some.
+        headers: what else the answer says.
     """
 
-    def __init__(self, status: int, detail: str, retry_after: float | None = None) -> None:
+    def __init__(self, status: int, detail: str, retry_after: float | None = None, headers: dict[str, str] | None = None) -> None:
         # The library's own sentences come without a full stop, as texts of exceptions do.
         self.detail = detail if detail.endswith((".", "?", "!")) else detail + "."
         self.status = status
         self.retry_after = RETRY_SECONDS if retry_after is None and status in (429, 503) else retry_after
+        self.headers = headers or {}
         super().__init__(self.detail)
 
 
@@ -61,8 +63,8 @@ def add_problem_handlers(app: FastAPI, told: Callable[[str], str]) -> None:
 
     @app.exception_handler(ProblemError)
     async def _problem(_: Request, error: ProblemError) -> JSONResponse:
-        wait = None if error.retry_after is None else {"retry-after": str(math.ceil(error.retry_after))}
-        return problem_response(error.status, told(error.detail), wait)
+        wait = {} if error.retry_after is None else {"retry-after": str(math.ceil(error.retry_after))}
+        return problem_response(error.status, told(error.detail), error.headers | wait)
 
     @app.exception_handler(CallerLeft)
     async def _left(_: Request, __: CallerLeft) -> Response:
@@ -81,6 +83,8 @@ def add_problem_handlers(app: FastAPI, told: Callable[[str], str]) -> None:
             detail = f"There is nothing at {request.url.path}; the calls are listed at /api/docs."
         elif error.status_code == 405:
             detail = f"{request.method} is not possible at {request.url.path}; the calls are listed at /api/docs."
+        elif error.status_code == 413:
+            detail = "The body is larger than this call takes; send less, or in parts."
         return problem_response(error.status_code, told(detail), dict(error.headers or {}))
 
     @app.exception_handler(OperationalError)

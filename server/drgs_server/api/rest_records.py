@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drgs.scene.edits import Edit
+from drgs.scene.edits import Edit, Triple
 from drgs_server.live.messages import BrokenEdit, Row
-from drgs_worker.jobs.capture_report import CaptureReport
+from drgs_worker.jobs.capture_report import CaptureFinding, CaptureReport
 from drgs_worker.jobs.requests import (
     BuildRequest,
     ExportRequest,
@@ -27,6 +27,73 @@ JobState = Literal["queued", "running", "stalled", "done", "failed", "cancelled"
 
 class _Body(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class CaptureRequest(_Body):
+    upload: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
+    """Id of a complete upload: a zip of a capture."""
+    name: UserName | None = None
+    """That of the uploaded file when absent."""
+
+
+class CaptureInfo(_Body):
+    id: str
+    """A build says `capture:ID` to read it."""
+    name: str
+    created_at: datetime
+    jobs: list[str]
+    """Ids of builds, and of re-decouplings of what they made, that read it. Without any, it is removed a day after it came."""
+
+
+class CaptureList(_Body):
+    captures: list[CaptureInfo]
+    """Newest first."""
+    total: int
+
+
+class TrainingView(_Body):
+    """One camera of the capture that an asset was built from."""
+
+    name: str
+    """Of the photograph's file, without its ending."""
+    width: int
+    """Pixels of the photograph as the build saw it."""
+    height: int
+    world_from_camera: tuple[Row, Row, Row, Row]
+    """OpenGL camera-to-world, rows, as of a camera message."""
+    left: float
+    """This and the next three: edges of the picture on the plane at distance 1 before the camera, x to the right and y up. The picture's
+    middle need not lie on the axis."""
+    right: float
+    bottom: float
+    top: float
+
+
+class CaptureLook(_Body):
+    """What can be seen of a capture before a build."""
+
+    ok: bool
+    """Whether a build can start."""
+    summary: str
+    """How many pictures of what size and with what around them; empty where the capture cannot be read."""
+    findings: list[CaptureFinding]
+    has_sheet: bool
+    """Whether there are pictures to show (GET .../sheet.jpg)."""
+    camera_count: int
+    """0 where a build finds them first, or the capture cannot be read."""
+    cameras: list[TrainingView]
+    """All, or 400 evenly chosen."""
+    up: Triple | None
+    """The mean of the cameras' own up, in the capture's world; None without cameras."""
+    box_low: Triple | None
+    """This and the next: corners of the object's box [world units]; None without cameras."""
+    box_high: Triple | None
+    box_origin: Literal["masks", "cameras"] | None
+    """Whether the box is what all masks allow, or a guess by what all cameras see."""
+    points: list[float]
+    """Three numbers for each point on or about the object [world units]; 3000 points at most, none where nothing is known of them."""
+    colors: list[float]
+    """Three for each point, sRGB 0..1."""
 
 
 class JobInfo(_Body):
@@ -109,24 +176,6 @@ class AssetList(_Body):
     assets: list[AssetInfo]
     """Newest first."""
     total: int
-
-
-class TrainingView(_Body):
-    """One camera of the capture that an asset was built from."""
-
-    name: str
-    """Of the photograph's file, without its ending."""
-    width: int
-    """Pixels of the photograph as the build saw it."""
-    height: int
-    world_from_camera: tuple[Row, Row, Row, Row]
-    """OpenGL camera-to-world, rows, as of a camera message."""
-    left: float
-    """This and the next three: edges of the picture on the plane at distance 1 before the camera, x to the right and y up. The picture's
-    middle need not lie on the axis."""
-    right: float
-    bottom: float
-    top: float
 
 
 class TrainingViewList(_Body):

@@ -21,6 +21,7 @@ from drgs_server.api.answers import JOB_LIST_COLUMNS, job_info, job_infos
 from drgs_server.api.context import ServerContext, context_of
 from drgs_server.api.problems import ProblemError
 from drgs_server.api.rest_records import BuildRequest, JobFile, JobFileList, JobInfo, JobList
+from drgs_server.api.routes_captures import CAPTURE_PREFIX, folder_of_capture
 from drgs_server.api.uploads import receive_upload
 from drgs_server.api.zip_guard import single_folder, unpack_zip
 from drgs_worker.jobs.queue import JobNotInState, is_alive
@@ -95,8 +96,8 @@ _BODY: dict[str, Any] = {
 
 @router.post("", status_code=202, openapi_extra=_BODY)
 async def start_job(request: Request, context: Context, idempotency_key: IdempotencyKey = None) -> JobInfo:
-    """Build an asset from a capture (a zip as multipart, the bundled sample, or a folder below an allowed root); re-decouple, simulate,
-    render or export one. Without `kind` it is a build. The same Idempotency-Key gives the same job, whatever else the request says."""
+    """Build an asset from a capture (an uploaded one, a zip as multipart, the bundled sample, or a folder below an allowed root); re-decouple,
+    simulate, render or export one. Without `kind` it is a build. The same Idempotency-Key gives the same job, whatever else the request says."""
     known = await run_in_threadpool(_job_of_key, context, idempotency_key)
     if known is not None:
         return await run_in_threadpool(_read_job, context, known)
@@ -157,6 +158,9 @@ def _plain_row(job_id: str, asked: JobRequest, name: str) -> JobRow:
 def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
     """The job of a request that was not an upload, with all that it names looked up."""
     if isinstance(asked, BuildRequest):
+        if asked.dataset.startswith(CAPTURE_PREFIX):
+            folder, name = folder_of_capture(context, asked.dataset.removeprefix(CAPTURE_PREFIX))
+            return _build_row(job_id, asked.model_copy(update={"name": asked.name or name}), folder)
         return _build_row(job_id, asked, _find_capture(context, asked.dataset))
     with Session(context.engine) as session:
         asset = session.get(AssetRow, asked.asset)
@@ -324,7 +328,7 @@ def _media_type(name: str) -> str:
 
 @router.delete("/{job_id}", status_code=204)
 def delete_job(job_id: str, context: Context) -> None:
-    """Forgets a job that is over, with its files, clip, capture and checkpoint; an asset that it made stays."""
+    """Forgets a job that is over, with its files, clip, checkpoint and the capture that came with it; an asset that it made stays."""
     row = _read_row(context, job_id)
     state = context.queue.statuses([job_id])[job_id].state
     if state not in ("done", "failed", "cancelled", "unknown"):

@@ -109,7 +109,7 @@ export interface BrokenEdit {
   reason: string;
 }
 
-/** A build of a capture that the server can already see. A zip is uploaded as multipart instead, with the same fields. */
+/** A build of a capture that the server can already see. A zip may be uploaded as multipart instead, with the same fields. */
 export interface BuildRequest {
   /** Shown in lists. */
   name?: string | null;
@@ -117,7 +117,10 @@ export interface BuildRequest {
   priority?: number;
   limits?: JobLimits;
   kind?: "build";
-  /** `sample` for the bundled capture, or a folder below a root that was allowed when the server started. */
+  /**
+   * `capture:ID` for an uploaded one (POST /api/captures), `sample` for the bundled one, or a folder below a root that was allowed when the
+   * server started.
+   */
   dataset: string;
   preset?: "draft" | "fast" | "full";
   /** particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face. */
@@ -177,11 +180,59 @@ export interface CaptureFinding {
   advice: string;
 }
 
+export interface CaptureInfo {
+  /** A build says `capture:ID` to read it. */
+  id: string;
+  name: string;
+  created_at: string;
+  /** Ids of builds, and of re-decouplings of what they made, that read it. Without any, it is removed a day after it came. */
+  jobs: string[];
+}
+
+export interface CaptureList {
+  /** Newest first. */
+  captures: CaptureInfo[];
+  total: number;
+}
+
+/** What can be seen of a capture before a build. */
+export interface CaptureLook {
+  /** Whether a build can start. */
+  ok: boolean;
+  /** How many pictures of what size and with what around them; empty where the capture cannot be read. */
+  summary: string;
+  findings: CaptureFinding[];
+  /** Whether there are pictures to show (GET .../sheet.jpg). */
+  has_sheet: boolean;
+  /** 0 where a build finds them first, or the capture cannot be read. */
+  camera_count: number;
+  /** All, or 400 evenly chosen. */
+  cameras: TrainingView[];
+  /** The mean of the cameras' own up, in the capture's world; None without cameras. */
+  up: [number, number, number] | null;
+  /** This and the next: corners of the object's box [world units]; None without cameras. */
+  box_low: [number, number, number] | null;
+  box_high: [number, number, number] | null;
+  /** Whether the box is what all masks allow, or a guess by what all cameras see. */
+  box_origin: "masks" | "cameras" | null;
+  /** Three numbers for each point on or about the object [world units]; 3000 points at most, none where nothing is known of them. */
+  points: number[];
+  /** Three for each point, sRGB 0..1. */
+  colors: number[];
+}
+
 /** Of `drgs doctor`. */
 export interface CaptureReport {
   /** How many pictures of what size and with what around them; empty where the capture cannot be read. */
   summary: string;
   findings: CaptureFinding[];
+}
+
+export interface CaptureRequest {
+  /** Id of a complete upload: a zip of a capture. */
+  upload: string;
+  /** That of the uploaded file when absent. */
+  name?: string | null;
 }
 
 /** First message of a client; nothing else is answered before it. */

@@ -4,12 +4,14 @@ The server calls it (`run_file_tool`), so that a decoder that crashes or swallow
 Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full. Commands:
     asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
     environment SOURCE OUT      EXR or Radiance HDR -> EXR
+    look CAPTURE OUT            folder of a capture -> folder with look.json and, where it has pictures, sheet.jpg (drgs/evaluate/look_at_capture.py)
     export ASSET OUT FORMAT [EDITS ENVIRONMENTS N]      asset folder, with the edits put into it -> a format of drgs/exchange/export_formats.py, or zip (the asset itself)
     version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
 """
 
 import asyncio
 import errno
+import json
 import resource
 import sys
 from collections.abc import Callable
@@ -40,6 +42,11 @@ PIXEL_BYTES = 36
 """Of a pixel of an environment: read, looked at, and written."""
 CHANNEL_BYTES = 8
 """Of a pixel in each channel more than its three, which are read and thrown away."""
+LOOK_BYTES = 320 << 20
+"""Beside TOOL_BYTES, of looking at a capture: the picture that is being read, the sheet, masks and points."""
+LOOK_PICTURE_BYTES = 512 << 10
+"""Of each of its files: a picture shrunken to 400 pixels a side, or a mask."""
+LOOK_NAME, SHEET_NAME = "look.json", "sheet.jpg"
 MOST_ENVIRONMENT_SIDES = (8192, 4096)
 """Of an environment that a service takes: 1.2 GiB while it is read, and 400 MB in memory while something is lit by it."""
 MOST_CHANNEL_BYTES = 512 << 20
@@ -69,6 +76,11 @@ def _pixel_bytes(picture: Path) -> int:
     width, height = MOST_ENVIRONMENT_SIDES
     most = width * height * PIXEL_BYTES
     return most if claim is None else min(most, claim.width * claim.height * (PIXEL_BYTES + CHANNEL_BYTES * max(claim.channels - 3, 0)))
+
+
+def look_bytes(capture: Path) -> int:
+    """Memory that the tool takes to look at a capture, estimated: pictures are shrunken one by one."""
+    return TOOL_BYTES + LOOK_BYTES + LOOK_PICTURE_BYTES * sum(1 for path in capture.rglob("*") if path.is_file())
 
 
 async def run_file_tool(*arguments: str) -> None:
@@ -156,6 +168,17 @@ def edited_asset(asset_folder: Path, edits: Path, environments: Path, version: i
     return bake_edits(load_asset(asset_folder), load_edits(edits), environments, version)
 
 
+def make_look(capture: Path, out: Path) -> None:
+    """The folder `out` is there when all of it is."""
+    from drgs.evaluate.look_at_capture import look_at_capture
+
+    draft = out.with_name(f"{out.name}.part")
+    draft.mkdir()
+    look = look_at_capture(capture, draft / SHEET_NAME)
+    (draft / LOOK_NAME).write_text(json.dumps(look, allow_nan=False))
+    draft.rename(out)
+
+
 def make_environment(source: Path, out: Path) -> None:
     from drgs.exchange.exr import PictureLimits, decode_environment, encode_environment
 
@@ -198,6 +221,8 @@ def main(arguments: list[str]) -> int:
                 make_asset(Path(source), Path(out))
             case ["environment", source, out]:
                 make_environment(Path(source), Path(out))
+            case ["look", capture, out]:
+                make_look(Path(capture), Path(out))
             case ["export", asset, out, format]:
                 export(Path(asset), Path(out), format)
             case ["export", asset, out, format, edits, environments, version]:
@@ -205,7 +230,7 @@ def main(arguments: list[str]) -> int:
             case ["version", asset, out, edits, environments, version]:
                 make_version(Path(asset), Path(out), Path(edits), Path(environments), int(version))
             case _:
-                raise ValueError(f"expected asset, environment, export or version with their arguments; found {arguments}")
+                raise ValueError(f"expected asset, environment, look, export or version with their arguments; found {arguments}")
     except RecursionError:
         print("the file is nested deeper than is read here", file=sys.stderr)
         return 2

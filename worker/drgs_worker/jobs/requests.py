@@ -76,11 +76,12 @@ class _Job(_Request):
 
 
 class BuildRequest(_Job):
-    """A build of a capture that the server can already see. A zip is uploaded as multipart instead, with the same fields."""
+    """A build of a capture that the server can already see. A zip may be uploaded as multipart instead, with the same fields."""
 
     kind: Literal["build"] = "build"
     dataset: Annotated[str, Field(max_length=1000), PlainText]
-    """`sample` for the bundled capture, or a folder below a root that was allowed when the server started."""
+    """`capture:ID` for an uploaded one (POST /api/captures), `sample` for the bundled one, or a folder below a root that was allowed when the
+    server started."""
     preset: PresetName = "fast"
     binding: BindingName = "particles"
     """particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face."""

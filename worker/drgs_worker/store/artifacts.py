@@ -24,7 +24,7 @@ from sqlalchemy.orm import Session
 from drgs.scene.edits import Edit, EnvironmentEdit, MaterialEdit, PoseEdit
 from drgs_worker.store.artifact_store import ArtifactMissing
 from drgs_worker.store.data_directory import DataDirectory, try_lock_file
-from drgs_worker.store.database import AssetRow, JobRow
+from drgs_worker.store.database import AssetRow, CaptureRow, JobRow
 
 _UPLOAD = re.compile(r"[0-9a-f]{32}")
 
@@ -210,12 +210,12 @@ def remove_deleted_elsewhere(directory: DataDirectory, engine: Engine) -> int:
     if directory.store is None:
         return 0
     with Session(engine) as session:
-        assets, jobs = (set(session.scalars(select(table.id))) for table in (AssetRow, JobRow))
+        assets, jobs, captures = (set(session.scalars(select(table.id))) for table in (AssetRow, JobRow, CaptureRow))
     old, removed = time.time() - CACHE_SECONDS, 0
     clips = directory.environments / "clips"
     for kind, folder, known in (
         ("assets", directory.assets, assets),
-        ("captures", directory.uploads, jobs),
+        ("captures", directory.uploads, jobs | captures),
         ("jobs", directory.jobs, jobs),
         ("clips", clips, jobs),
     ):

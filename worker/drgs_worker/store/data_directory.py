@@ -4,7 +4,9 @@ token               who knows it may use the service (mode 0600)
 app.sqlite          assets, jobs, workers, sessions with their edit logs; unless settings name another database
 jobs.sqlite         the queue's own state (DBOS), likewise. Whoever can write it runs code in workers, hence the mode of the folder
 assets/ID/          finished assets
+incoming/ID         uploads that are sent in parts, as far as they have come, and in ID.json what their senders said of them
 uploads/ID/         captures as they came, unpacked
+looks/ID/           what can be seen of a capture before a build: a sheet of its pictures, its cameras and points; may be deleted
 jobs/ID/            a job's working folder: checkpoints, preview, log.txt, and in files/ what can be downloaded
 environments/       NAME.exr and NAME.jpg, its small picture; clips/ID/ and weights/HASH.f32, since edits name all relative to one folder
 poses/ID.safetensors   what a session's long log has made so far, so that opening it costs little; may be deleted
@@ -60,6 +62,10 @@ class DataDirectory:
         return self.root / "uploads"
 
     @property
+    def incoming(self) -> Path:
+        return self.root / "incoming"
+
+    @property
     def jobs(self) -> Path:
         return self.root / "jobs"
 
@@ -81,6 +87,9 @@ class DataDirectory:
 
     def asset(self, asset_id: str) -> Path:
         return self.assets / asset_id
+
+    def look(self, capture_id: str) -> Path:
+        return self.root / "looks" / capture_id
 
     def job(self, job_id: str) -> Path:
         return self.jobs / job_id
@@ -128,7 +137,7 @@ def open_data_directory(
     try:
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
         root.chmod(0o700)
-        for name in ("assets", "uploads", "jobs", "environments", "poses", "workers", "scratch"):
+        for name in ("assets", "incoming", "uploads", "looks", "jobs", "environments", "poses", "workers", "scratch"):
             (root / name).mkdir(mode=0o700, exist_ok=True)
     except OSError as error:
         raise ValueError(f"data directory {root}: {error.strerror}; name a folder you may write with --data") from error

@@ -54,6 +54,19 @@ class AssetRow(Base):
     """Since when it waits for its files to be removed; None: it is there."""
 
 
+class CaptureRow(Base):
+    """An uploaded capture that builds can be made of. Those that came with their build (multipart) have none; they are their job's."""
+
+    __tablename__ = "captures"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    """That of its upload."""
+    name: Mapped[str]
+    created_at: Mapped[float] = mapped_column(index=True)
+    folder: Mapped[str]
+    """Where its files lie below the folder of uploads: ID, or ID/NAME where the archive held one folder."""
+
+
 class JobRow(Base):
     """What a job is and how far it got. Whether it waits, runs or is over is DBOS's to say."""
 

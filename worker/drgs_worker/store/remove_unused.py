@@ -1,19 +1,20 @@
-"""What nobody refers to any more is removed: painted weights, and the kept poses of sessions that are gone.
+"""What nobody refers to any more is removed: painted weights, the kept poses of sessions that are gone, and captures that nothing is built from.
 
 Never what a session, a snapshot, a version or a job names: an event of a session's log counts even where undo has left it behind, and what is
 younger than a day stays, for the edit that names it may still be on its way.
 """
 
 import re
+import shutil
 import time
 from pathlib import Path
 
-from sqlalchemy import ColumnElement, Engine, String, cast, select
+from sqlalchemy import ColumnElement, Engine, String, cast, delete, select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from drgs_worker.store.artifacts import WEIGHTS
+from drgs_worker.store.artifacts import WEIGHTS, unshare_artifact
 from drgs_worker.store.data_directory import DataDirectory
-from drgs_worker.store.database import AssetRow, JobRow, SessionEventRow, SessionRow, SnapshotRow
+from drgs_worker.store.database import AssetRow, CaptureRow, JobRow, SessionEventRow, SessionRow, SnapshotRow
 
 UNUSED_SECONDS = 24 * 3600.0
 """Since weights were sent or named last, after which they are removed if nothing names them."""
@@ -66,3 +67,31 @@ def remove_unused_poses(directory: DataDirectory, engine: Engine) -> int:
     for path in gone:
         path.unlink(missing_ok=True)
     return len(gone)
+
+
+def remove_unused_captures(directory: DataDirectory, engine: Engine, keep_seconds: float) -> int:
+    """Captures that came longer ago and that no job refers to. Returns how many."""
+    with Session(engine) as session:
+        old = session.scalars(select(CaptureRow.id).where(CaptureRow.created_at < time.time() - keep_seconds)).all()
+        unused = [capture_id for capture_id in old if not jobs_of_capture(session, capture_id)]
+    for capture_id in unused:
+        remove_capture(directory, engine, capture_id)
+    return len(unused)
+
+
+def jobs_of_capture(session: Session, capture_id: str) -> list[str]:
+    """Ids of the builds and re-decouplings that read this capture."""
+    return list(session.scalars(select(JobRow.id).where(JobRow.dataset.contains(f"/uploads/{capture_id}"))))
+
+
+def remove_capture(directory: DataDirectory, engine: Engine, capture_id: str) -> None:
+    """Its row last: what is left half done is done again.
+
+    Raises:
+        StoreAway: a sentence.
+    """
+    unshare_artifact(directory, "captures", capture_id)
+    for folder in (directory.uploads / capture_id, directory.look(capture_id)):
+        shutil.rmtree(folder, ignore_errors=True)
+    with Session(engine) as session, session.begin():
+        session.execute(delete(CaptureRow).where(CaptureRow.id == capture_id))

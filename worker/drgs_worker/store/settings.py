@@ -32,6 +32,12 @@ class Limits(BaseModel):
     body_bytes: Positive = 16 << 20
     """Of requests that are not uploads, with the token; a login has at most 4 KiB."""
     upload_bytes: Positive = 4 << 30
+    incoming_uploads: Positive = 64
+    """That are sent in parts and unfinished; more are answered 429."""
+    incoming_bytes: Positive = 16 << 30
+    """Of them all when they are complete."""
+    keep_upload_seconds: Annotated[float, Field(ge=0)] = 24 * 3600
+    """After the last byte of an unfinished upload came, and after a capture came that nothing is built from; then it is removed."""
     active_jobs: Positive = 1000
     """That wait or run; more are answered 429."""
     requests_a_second: Annotated[float, Field(gt=0)] = 200.0

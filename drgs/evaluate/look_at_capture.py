@@ -1,0 +1,90 @@
+"""What can be seen of a capture before a build: the sheet of its pictures, and its cameras, points and the object's box, for a small picture in 3D.
+
+In: a folder. Out: a picture and plain data for JSON. Bounded however large the capture is. A capture that cannot be read has findings and, where there are
+pictures, a sheet; photographs that are not posed yet have no cameras.
+"""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.evaluate.contact_sheet import contact_sheet
+from drgs.evaluate.doctor.doctor import examine
+from drgs.reconstruct.capture.initial_points import InitialPoints
+from drgs.reconstruct.capture.turn_up import up_of_cameras
+from drgs.scene.camera import Camera, opengl_from_camera
+
+MOST_CAMERAS = 400
+"""Of more, evenly chosen ones are told."""
+MOST_POINTS = 3000
+DIGITS = 5
+"""Of coordinates, a ten-thousandth of the object or finer where its world is of the usual size."""
+
+
+def look_at_capture(folder: Path, sheet: Path) -> dict[str, Any]:
+    """Write the sheet, where there are pictures, and return the rest.
+
+    Args:
+        sheet: as contact_sheet's `out`; not there yet.
+
+    Keys: ok, summary and findings as of the doctor; has_sheet; camera_count (0: not posed yet, or unreadable); cameras, as the asset's training views
+    are told (docs/protocol.md); up, the mean of the cameras' own, or None; box_low and box_high, corners of the object's box [world units] or None; box_origin, masks or cameras (a guess: what all
+    cameras see); points and colors, three numbers for each point [world units; sRGB 0..1].
+    """
+    examined = examine(folder)
+    report, views, points = examined.report, examined.views, examined.points
+    with suppress(ValueError):  # a film, or nothing that is a picture: the findings say so
+        contact_sheet(folder, report, sheet)
+    look: dict[str, Any] = {
+        "ok": report["ok"],
+        "summary": report["summary"],
+        "findings": report["findings"],
+        "has_sheet": sheet.is_file(),
+        "camera_count": 0,
+        "cameras": [],
+        "up": None,
+        "box_low": None,
+        "box_high": None,
+        "box_origin": None,
+        "points": [],
+        "colors": [],
+    }
+    if views is None or points is None:
+        return look
+    count = len(views.cameras)
+    shown = views.cameras if count <= MOST_CAMERAS else [views.cameras[k * count // MOST_CAMERAS] for k in range(MOST_CAMERAS)]
+    up = up_of_cameras(np.stack([opengl_from_camera(camera).numpy() for camera in views.cameras])).round(DIGITS).tolist()
+    return look | {"camera_count": count, "cameras": [_told_camera(camera) for camera in shown], "up": up} | _told_points(points)
+
+
+def _told_camera(camera: Camera) -> dict[str, Any]:
+    fx, fy, cx, cy = (float(camera.intrinsics[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "world_from_camera": opengl_from_camera(camera).numpy().round(DIGITS).tolist(),
+        "left": -cx / fx,
+        "right": (camera.width - cx) / fx,
+        "bottom": (cy - camera.height) / fy,
+        "top": cy / fy,
+    }
+
+
+def _told_points(points: InitialPoints) -> dict[str, Any]:
+    """The box, and such points as say something: those at random do not."""
+    if points.hull_vertices is not None:
+        low, high, origin = points.hull_vertices.amin(0), points.hull_vertices.amax(0), "masks"
+    else:
+        low, high, origin = points.bounds_center - points.bounds_radius, points.bounds_center + points.bounds_radius, "cameras"
+    count = 0 if points.origin == "random" else len(points.points_world)
+    kept = np.random.default_rng(0).permutation(count)[:MOST_POINTS]
+    return {
+        "box_low": low.double().numpy().round(DIGITS).tolist(),
+        "box_high": high.double().numpy().round(DIGITS).tolist(),
+        "box_origin": origin,
+        "points": points.points_world[kept].double().numpy().round(DIGITS).reshape(-1).tolist(),
+        "colors": points.colors_srgb[kept].double().numpy().round(2).reshape(-1).tolist(),
+    }

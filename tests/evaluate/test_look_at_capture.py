@@ -1,0 +1,66 @@
+"""What can be seen of a capture before a build: cameras as they stand, points and a box where the object is, bounded however large the capture."""
+
+import json
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from drgs.evaluate import look_at_capture as looking
+from drgs.evaluate.look_at_capture import look_at_capture
+from tests.reconstruct.tiny_capture import FX, SPHERE_CENTER, SPHERE_RADIUS, VIEWS, WIDTH, camera_positions, write_nerf_synthetic
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_nerf_synthetic(tmp_path_factory.mktemp("look") / "capture")
+
+
+def test_cameras_points_and_box_of_a_ball_are_where_they_are(capture: Path, tmp_path: Path) -> None:
+    look = look_at_capture(capture, tmp_path / "sheet.jpg")
+    json.dumps(look, allow_nan=False)
+    assert look["ok"] and look["camera_count"] == len(look["cameras"]) == VIEWS
+    places = np.array([camera["world_from_camera"] for camera in look["cameras"]])[:, :3, 3]
+    assert np.allclose(places, camera_positions(VIEWS), atol=1e-4)
+    first = look["cameras"][0]
+    assert first["left"] == pytest.approx(-WIDTH / 2 / FX) and first["right"] == pytest.approx(WIDTH / 2 / FX)
+    assert look["box_origin"] == "masks"
+    # Pictures are 72 pixels wide: a pixel is 0.033 at the ball.
+    assert np.allclose(look["box_low"], SPHERE_CENTER - SPHERE_RADIUS, atol=0.05)
+    assert np.allclose(look["box_high"], SPHERE_CENTER + SPHERE_RADIUS, atol=0.05)
+    points = np.array(look["points"]).reshape(-1, 3)
+    assert 500 < len(points) <= looking.MOST_POINTS and len(look["colors"]) == len(look["points"])
+    assert np.linalg.norm(points - SPHERE_CENTER, axis=1) == pytest.approx(SPHERE_RADIUS, abs=0.1)
+    with Image.open(tmp_path / "sheet.jpg") as sheet:
+        assert look["has_sheet"] and sheet.format == "JPEG" and min(sheet.size) > 200
+
+
+def test_of_very_many_cameras_and_points_some_are_told(capture: Path, tmp_path: Path) -> None:
+    with patch.multiple(looking, MOST_CAMERAS=7, MOST_POINTS=50):
+        look = look_at_capture(capture, tmp_path / "sheet.jpg")
+    assert look["camera_count"] == VIEWS and len(look["cameras"]) == 7 and len(look["points"]) == 150
+    assert len({camera["name"] for camera in look["cameras"]}) == 7
+
+
+def test_what_cannot_be_read_has_findings_and_its_pictures(capture: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "transforms_train.json").write_text("{")
+    Image.new("RGB", (40, 30), "red").save(broken / "a.png")
+    look = look_at_capture(broken, tmp_path / "sheet.jpg")
+    assert not look["ok"] and look["findings"][0]["level"] == "error" and look["has_sheet"]
+    assert (look["camera_count"], look["cameras"], look["box_low"], look["points"]) == (0, [], None, [])
+    (broken / "a.png").unlink()
+    assert look_at_capture(broken, tmp_path / "none.jpg")["has_sheet"] is False
+
+
+def test_pictures_without_poses_have_a_sheet_and_no_cameras(tmp_path: Path) -> None:
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    random = np.random.default_rng(0)
+    for number in range(12):
+        Image.fromarray(random.integers(0, 255, (60, 80, 3), np.uint8)).save(photographs / f"{number}.jpg")
+    look = look_at_capture(photographs, tmp_path / "sheet.jpg")
+    assert look["ok"] and look["has_sheet"] and look["camera_count"] == 0 and look["box_low"] is None
