@@ -1,14 +1,29 @@
-"""Loose pictures dropped on the page become one capture of the service, bit for bit, and a build of it waits."""
+"""What is dropped on the page is one capture of the service, bit for bit; it is shown before anything is built of it, and its upload outlives the connection.
+
+    DRGS_SCREENSHOTS=FOLDER python -m pytest tests/web/test_dropped_photos.py
+
+keeps pictures of what is shown in FOLDER; otherwise they lie in pytest's folder of temporary files.
+"""
 
 import base64
 import io
+import json
+import os
+import shutil
+import sqlite3
+from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
-from playwright.sync_api import expect
+from playwright.sync_api import Locator, Route, expect
 
+from tests.web.browser import ROOT
 from tests.web.conftest import Viewer, wait_until
+from tests.web.test_screenshots import FIND_FAULTS
 
+SAMPLE = ROOT / "examples" / "sample_capture"
+LAPTOP, PHONE = (1280, 720), (390, 844)
 DROP = """(photographs) => {
   const files = new DataTransfer();
   for (const [name, base64] of photographs) {
@@ -18,6 +33,15 @@ DROP = """(photographs) => {
   for (const type of ['dragenter', 'dragover', 'drop'])
     document.body.dispatchEvent(new DragEvent(type, { dataTransfer: files, bubbles: true, cancelable: true }));
 }"""
+IS_LOADED = "(image) => image.complete && image.naturalWidth > 0"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    named = os.environ.get("DRGS_SCREENSHOTS")
+    chosen = Path(named) if named else tmp_path_factory.mktemp("screenshots")
+    chosen.mkdir(parents=True, exist_ok=True)
+    return chosen
 
 
 def jpeg(seed: int) -> bytes:
@@ -26,14 +50,140 @@ def jpeg(seed: int) -> bytes:
     return file.getvalue()
 
 
+def captures(viewer: Viewer, name: str) -> list[dict]:
+    return [capture for capture in viewer.server.ask("/api/captures")["captures"] if capture["name"] == name]
+
+
+def drop_folder(viewer: Viewer, dropped: Path) -> None:
+    """As the browser itself hands a folder over that is dropped from another program."""
+    session = viewer.page.context.new_cdp_session(viewer.page)
+    for kind in ("dragEnter", "dragOver", "drop"):
+        data = {"items": [], "files": [str(dropped)], "dragOperationsMask": 1}
+        session.send("Input.dispatchDragEvent", {"type": kind, "x": 400, "y": 200, "data": data})
+
+
+def drawn_share(canvas: Locator) -> float:
+    """Of the pixels of a canvas, those that are of another colour than most. A canvas of WebGL shows its pixels to nobody but the screen."""
+    with Image.open(io.BytesIO(canvas.screenshot())) as picture:
+        pixels = np.asarray(picture.convert("RGB"), int)
+    return float((np.abs(pixels - np.median(pixels, axis=(0, 1))).max(-1) > 30).mean())
+
+
+def look(viewer: Viewer, shown: Locator, folder: Path, name: str, size: tuple[int, int]) -> list[str]:
+    viewer.page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    wait_until(lambda: drawn_share(shown.locator("canvas")) > 0.02, "a picture of the cameras")
+    viewer.page.screenshot(path=folder / f"{name}.png")
+    faults = [f"{name}: {fault}" for fault in viewer.page.evaluate(FIND_FAULTS)]
+    shown.evaluate("(dialog) => dialog.scrollTo(0, dialog.scrollHeight)")
+    viewer.page.screenshot(path=folder / f"{name}-end.png")
+    shown.evaluate("(dialog) => dialog.scrollTo(0, 0)")
+    return faults
+
+
 def test_loose_pictures_are_one_capture(viewer: Viewer) -> None:
-    pictures = {f"IMG_{number}.JPG": jpeg(number) for number in range(9)}
+    pictures = {f"IMG_{number}.JPG": jpeg(number) for number in range(5)}
     viewer.page.evaluate(DROP, [[name, base64.b64encode(data).decode()] for name, data in pictures.items()])
-    jobs = wait_until(lambda: [job for job in viewer.server.ask("/api/jobs")["jobs"] if job["name"] == "photographs"], "the build")
-    card = viewer.page.get_by_role("listitem", name="Build photographs")
-    expect(card).to_be_visible()
-    kept = viewer.server.data / "uploads" / jobs[0]["id"]
+    shown = viewer.page.get_by_role("dialog", name="photographs")
+    expect(shown).to_be_visible()
+    (made,) = wait_until(lambda: captures(viewer, "photographs"), "the capture")
+    kept = viewer.server.data / "uploads" / made["id"]
     assert {path.name: path.read_bytes() for path in kept.iterdir()} == pictures
+    # Five are too few: it says so, shows them all the same, and builds nothing.
+    expect(shown.get_by_text("5 pictures, expected at least 8")).to_be_visible()
+    expect(shown.get_by_role("button", name="Build")).to_be_disabled()
+    sheet = shown.get_by_role("img", name="All pictures of photographs")
+    wait_until(lambda: sheet.evaluate(IS_LOADED), "the sheet")
+    shown.get_by_role("button", name="Close").click()
+    viewer.page.get_by_role("button", name="Remove photographs").click()
+    wait_until(lambda: captures(viewer, "photographs") == [] and not kept.exists(), "its removal")
+    assert viewer.server.ask("/api/jobs")["jobs"] == []
+
+
+@pytest.mark.slow
+def test_a_dropped_folder_is_shown_with_its_cameras_and_its_pictures_before_a_build(viewer: Viewer, folder: Path, tmp_path: Path) -> None:
+    mug = tmp_path / "Teal mug"
+    shutil.copytree(SAMPLE, mug, ignore=shutil.ignore_patterns("test", "env", "*.py"))
+    lost = 0
+
+    def lose(route: Route) -> None:
+        """Two parts in a row get nowhere, as in a tunnel."""
+        nonlocal lost
+        lost += route.request.method == "PATCH"
+        if route.request.method == "PATCH" and lost <= 2:
+            route.abort("connectionreset")
+        else:
+            route.continue_()
+
+    viewer.page.route("**/api/uploads/**", lose)
+    drop_folder(viewer, mug)
+    expect(viewer.page.get_by_text("Teal mug.zip goes on by itself")).to_be_visible()
+    shown = viewer.page.get_by_role("dialog", name="Teal mug")
+    expect(shown).to_be_visible()
+    assert lost > 2
+    viewer.page.unroute("**/api/uploads/**")
+    (made,) = captures(viewer, "Teal mug")
+    kept = viewer.server.data / "uploads" / made["id"] / "Teal mug"
+    sent, came = ({path.relative_to(top): path.read_bytes() for path in top.rglob("*") if path.is_file()} for top in (mug, kept))
+    assert sent == came
+    cameras = shown.get_by_role("img", name="56 cameras around the object")
+    expect(cameras).to_have_attribute("data-cameras", "56")
+    expect(shown.get_by_text("56 pictures of 256x256 with masks")).to_be_visible()
+    sheet = shown.get_by_role("img", name="All pictures of Teal mug")
+    wait_until(lambda: sheet.evaluate(IS_LOADED), "the sheet")
+    faults = look(viewer, shown, folder, "capture-laptop", LAPTOP)
+    before = cameras.screenshot()
+    place = cameras.bounding_box()
+    assert place is not None
+    viewer.page.mouse.move(place["x"] + 100, place["y"] + 100)
+    viewer.page.mouse.down()
+    viewer.page.mouse.move(place["x"] + 200, place["y"] + 120, steps=4)
+    viewer.page.mouse.up()
+    wait_until(lambda: cameras.screenshot() != before, "another view of the cameras")
+    faults += look(viewer, shown, folder, "capture-phone", PHONE)
+    viewer.page.set_viewport_size({"width": 760, "height": 420})
+    assert faults == []
+    shown.get_by_role("radio", name="Draft").check()
+    shown.get_by_role("button", name="Build").click()
+    expect(shown).to_be_hidden()
+    card = viewer.page.get_by_role("listitem", name="Build Teal mug")
+    expect(card).to_be_visible()
+    (job,) = viewer.server.ask("/api/jobs")["jobs"]
+    assert (job["name"], job["preset"]) == ("Teal mug", "draft") and captures(viewer, "Teal mug")[0]["jobs"] == [job["id"]]
     card.get_by_role("button", name="Cancel").click()
     card.get_by_role("button", name="Remove").click()
     expect(card).to_have_count(0)
+    viewer.page.get_by_role("button", name="Remove Teal mug").click()
+    wait_until(lambda: captures(viewer, "Teal mug") == [] and not kept.exists(), "its removal")
+
+
+@pytest.mark.slow
+def test_a_capture_that_lies_on_its_side_is_shown_upright_and_built_so(viewer: Viewer, folder: Path, tmp_path: Path) -> None:
+    vase = tmp_path / "Vase"
+    (vase / "train").mkdir(parents=True)
+    document = json.loads((SAMPLE / "transforms_train.json").read_text())
+    document["frames"] = document["frames"][::4]
+    y_up = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    for frame in document["frames"]:
+        frame["transform_matrix"] = (y_up @ np.array(frame["transform_matrix"])).tolist()
+        shutil.copy(SAMPLE / f"{frame['file_path']}.png", vase / "train")
+    (vase / "transforms_train.json").write_text(json.dumps(document))
+    drop_folder(viewer, vase)
+    shown = viewer.page.get_by_role("dialog", name="Vase")
+    expect(shown.get_by_role("img", name="14 cameras around the object")).to_have_attribute("data-cameras", "14")
+    expect(shown.get_by_role("radio", name="As held")).to_be_checked()
+    expect(shown.get_by_text("far from how the camera was held")).to_be_visible()
+    assert look(viewer, shown, folder, "capture-held", LAPTOP) == []
+    shown.get_by_role("spinbutton", name="Direction x").fill("0.25")
+    shown.get_by_role("spinbutton", name="Direction x").press("Enter")
+    expect(shown).to_be_visible()
+    viewer.page.set_viewport_size({"width": 760, "height": 420})
+    shown.get_by_role("button", name="Build").click()
+    expect(shown).to_be_hidden()
+    card = viewer.page.get_by_role("listitem", name="Build Vase")
+    card.get_by_role("button", name="Cancel").click()
+    with sqlite3.connect(viewer.server.data / "app.sqlite") as database:
+        ((parameters,),) = database.execute("SELECT parameters FROM jobs WHERE name = 'Vase'").fetchall()
+    x, y, z = json.loads(parameters)["up"]
+    assert x == 0.25 and y > 0.9 and abs(z) < 0.3
+    card.get_by_role("button", name="Remove").click()
+    viewer.page.get_by_role("button", name="Remove Vase").click()

@@ -87,7 +87,7 @@ def test_a_capture_that_cannot_be_built_says_why_and_what_to_do(viewer: Viewer, 
     card = shown(viewer.page, jobs, state="failed", error=ERROR["sentence"], capture={"summary": "", "findings": [ERROR]})
     expect(card.get_by_text("r_003.png: no such image.")).to_have_count(1)
     expect(card.get_by_text("Mend that first.")).to_be_visible()
-    expect(card.get_by_text("Then drop the mended folder here, zipped.")).to_be_visible()
+    expect(card.get_by_text("Then drop the mended folder here.")).to_be_visible()
     card.get_by_role("button", name="Retry").click()
     wait_for_a_request(viewer.page, jobs)
     assert ("POST", f"/{RUNNING['id']}/retry") in jobs.asked

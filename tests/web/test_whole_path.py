@@ -1,4 +1,4 @@
-"""The whole way of a newcomer: drop a capture, watch it built, change a part, the light and the shape, take all back, carry files away.
+"""The whole way of a newcomer: drop a capture, look at it, watch it built, change a part, the light and the shape, take all back, carry files away.
 
 A real worker process builds the sample's photographs, fewer and smaller ones, in `short_builder`'s few iterations. The tests run in this
 order on one page; each looks at the pixels of the canvas and at what the server says.
@@ -140,9 +140,15 @@ def jobs_of(viewer: Viewer) -> list[dict]:
     return [job for job in viewer.server.ask("/api/jobs")["jobs"] if job["name"] == "Little sample"]
 
 
-def test_a_dropped_capture_becomes_a_job_whose_progress_is_shown(path: Viewer) -> None:
-    path.page.get_by_role("radio", name="Draft").check()
+def test_a_dropped_capture_is_shown_and_becomes_a_job_whose_progress_is_shown(path: Viewer) -> None:
     path.page.evaluate(DROP, base64.b64encode(small_capture()).decode())
+    shown = path.page.get_by_role("dialog", name="Little sample")
+    expect(shown.get_by_role("img", name="cameras around the object")).to_have_attribute("data-cameras", "28")
+    expect(shown.get_by_text("28 pictures of 96x96 with masks")).to_be_visible()
+    assert jobs_of(path) == [], "nothing is built before somebody says so"
+    shown.get_by_role("radio", name="Draft").check()
+    shown.get_by_role("button", name="Build").click()
+    expect(shown).to_be_hidden()
     listed = path.page.get_by_role("listitem", name="Build Little sample")
     expect(listed).to_be_visible()
     (job,) = wait_until(lambda: jobs_of(path), "a job on the server", 60)

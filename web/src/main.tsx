@@ -2,6 +2,7 @@
 
 import { render } from 'preact';
 import * as api from './session/api';
+import { refreshCaptures } from './session/captures';
 import { watchJobs } from './session/jobs';
 import { refreshAssets, refreshEnvironments } from './session/library';
 import { attempt } from './session/notices';
@@ -19,7 +20,7 @@ async function start(): Promise<void> {
     history.replaceState(null, '', location.pathname + (rest ? `#${rest}` : ''));
     if ((await attempt(api.login(token).then(() => true))) === null) return;
   }
-  await attempt(Promise.all([refreshAssets(), refreshEnvironments()]));
+  await attempt(Promise.all([refreshAssets(), refreshEnvironments(), refreshCaptures()]));
   watchJobs();
   const asset = fragment.get('asset');
   if (asset) await openAsset(asset);

@@ -1,7 +1,7 @@
 /** The REST calls of the viewer, each once. Every failure is an ApiError whose message is a sentence for the user. */
 
 import { STILL_BOUNCES, type DownloadFormat } from './constants.gen';
-import type { AssetInfo, AssetList, BuildRequest, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest, TrainingViewList, WeightsInfo } from './protocol.gen';
+import type { AssetInfo, AssetList, BuildRequest, CaptureInfo, CaptureList, CaptureLook, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest, TrainingViewList, WeightsInfo } from './protocol.gen';
 import type { View } from './view';
 
 export class ApiError extends Error {
@@ -102,6 +102,53 @@ export function uploadEnvironment(file: File, onProgress?: (share: number) => vo
   return upload('/api/environments', form, onProgress);
 }
 
+export const makeCapture = (upload: string) => call<CaptureInfo>('POST', '/api/captures', { upload });
+export const listCaptures = () => call<CaptureList>('GET', '/api/captures');
+export const deleteCapture = (id: string) => call<void>('DELETE', `/api/captures/${part(id)}`);
+/** Takes seconds to minutes when it is asked for the first time. */
+export const lookAtCapture = (id: string) => call<CaptureLook>('GET', `/api/captures/${part(id)}/look`);
+export const captureSheet = (id: string) => `/api/captures/${part(id)}/sheet.jpg`;
+
+const TUS = { 'Tus-Resumable': '1.0.0' };
+
+async function tus(method: 'POST' | 'HEAD' | 'DELETE', path: string, headers: Record<string, string>): Promise<Headers> {
+  await signedIn;
+  const response = await fetch(path, { method, headers: { ...TUS, ...headers } }).catch(() => {
+    throw new ApiError(0, UNREACHABLE);
+  });
+  if (!response.ok) throw new ApiError(response.status, sentenceFor(response.status, await response.text()));
+  return response.headers;
+}
+
+/** Announce an upload in parts; where its parts go. */
+export async function announceUpload(name: string, bytes: number): Promise<string> {
+  const filename = btoa(String.fromCharCode(...new TextEncoder().encode(name)));
+  return (await tus('POST', '/api/uploads', { 'Upload-Length': String(bytes), 'Upload-Metadata': `filename ${filename}` })).get('Location')!;
+}
+
+/** Bytes of an upload that have arrived. */
+export const uploadOffset = async (address: string) => Number((await tus('HEAD', address, {})).get('Upload-Offset'));
+export const deleteUpload = (address: string) => tus('DELETE', address, {});
+
+/** Send bytes that begin at `offset`; how many have arrived then. `onSent`: of this part. */
+export async function sendPart(address: string, offset: number, bytes: Blob, onSent: (bytes: number) => void, leaving: AbortSignal): Promise<number> {
+  await signedIn;
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    request.open('PATCH', address);
+    for (const [name, value] of Object.entries({ ...TUS, 'Upload-Offset': String(offset), 'Content-Type': 'application/offset+octet-stream' })) request.setRequestHeader(name, value);
+    const leave = () => request.abort();
+    leaving.addEventListener('abort', leave);
+    request.upload.onprogress = (event) => onSent(event.loaded);
+    request.onloadend = () => {
+      leaving.removeEventListener('abort', leave);
+      if (request.status === 204) resolve(Number(request.getResponseHeader('Upload-Offset')));
+      else reject(leaving.aborted ? new DOMException('The upload was cancelled.', 'AbortError') : new ApiError(request.status, request.status ? sentenceFor(request.status, request.responseText) : UNREACHABLE));
+    };
+    request.send(bytes);
+  });
+}
+
 export const listJobs = () => call<JobList>('GET', '/api/jobs');
 export const startJob = (request: BuildRequest | RenderRequest | SimulateRequest) => call<JobInfo>('POST', '/api/jobs', request);
 export const cancelJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/cancel`);
@@ -111,16 +158,6 @@ export const deleteJob = (id: string) => call<void>('DELETE', `/api/jobs/${part(
 export const jobFiles = (id: string) => call<JobFileList>('GET', `/api/jobs/${part(id)}/files`);
 export const jobFile = (id: string, name: string) => `/api/jobs/${part(id)}/files/${part(name)}`;
 export const jobPreview = (job: JobInfo) => `/api/jobs/${part(job.id)}/preview.jpg?v=${job.preview_version}`;
-
-export function uploadCapture(file: File, { preset, binding, light }: Required<Pick<BuildRequest, 'preset' | 'binding' | 'light'>>, onProgress?: (share: number) => void): Promise<JobInfo> {
-  const form = new FormData();
-  form.append('preset', preset);
-  form.append('binding', binding);
-  form.append('light', light);
-  form.append('name', file.name.replace(/\.zip$/i, ''));
-  form.append('file', file);
-  return upload('/api/jobs', form, onProgress);
-}
 
 export async function uploadWeights(weights: ArrayLike<number>): Promise<WeightsInfo> {
   await signedIn;

@@ -5,8 +5,9 @@ import * as api from './api';
 import { refreshAssets, refreshEnvironments } from './library';
 import { attempt, notify } from './notices';
 import { preference } from './preferences';
-import type { BuildRequest, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
+import type { BuildRequest, CaptureInfo, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
 import { openAsset, session } from './session';
+import type { Vec3 } from './view';
 
 /** Jobs are asked for this often while one runs, and otherwise. */
 const BUSY_MS = 1000;
@@ -95,7 +96,8 @@ async function follow(started: Promise<JobInfo>): Promise<JobInfo | null> {
 export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding' | 'light'>>;
 
 export const buildSample = (choice: BuildChoice) => follow(api.startJob({ dataset: 'sample', ...choice }));
-export const buildCapture = (zip: File, choice: BuildChoice, onProgress: (share: number) => void) => follow(api.uploadCapture(zip, choice, onProgress));
+/** `up`: direction of the capture's world that points up. */
+export const buildCapture = (capture: CaptureInfo, choice: BuildChoice, up: Vec3) => follow(api.startJob({ dataset: `capture:${capture.id}`, ...choice, up }));
 /** What to call a job on an asset. Those of earlier versions may have slashes in their names, which names no longer have. */
 export const jobName = (asset: string, what: string) => `${asset.replaceAll(/[/\\]/g, '-').slice(0, 100 - what.length - 2)}, ${what}`;
 /** A job that makes no asset. */

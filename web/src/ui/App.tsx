@@ -20,6 +20,7 @@ import { download } from './download';
 import { Icon } from './icons';
 import { Inspector } from './inspector/Inspector';
 import { helpOpen, inspectorOpen, libraryOpen, theme } from './layout';
+import { CaptureDialog } from './library/CaptureDialog';
 import { Library, takeFiles } from './library/Library';
 import { listenForKeys, titleFor, type Actions } from './shortcuts';
 
@@ -99,6 +100,7 @@ export function App() {
       <Notices />
       <DropZone />
       <Help />
+      <CaptureDialog />
     </>
   );
 }
@@ -200,7 +202,7 @@ function DropZone() {
   }, []);
   return over ? (
     <div class="dropzone">
-      <p>Drop a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr)</p>
+      <p>Drop photos, their folder, a film, a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr)</p>
     </div>
   ) : null;
 }

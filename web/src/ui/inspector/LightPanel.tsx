@@ -52,7 +52,7 @@ function Environment() {
           onChange={(event) => {
             const chosen = event.currentTarget.files?.[0];
             event.currentTarget.value = '';
-            if (chosen) void takeFile(chosen, { preset: 'fast', binding: 'particles', light: 'auto' }, () => {});
+            if (chosen) void takeFile(chosen, () => {}, new AbortController().signal);
           }}
         />
       </div>

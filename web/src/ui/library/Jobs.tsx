@@ -4,10 +4,11 @@ import { useEffect, useState } from 'preact/hooks';
 import * as api from '../../session/api';
 import { cancel, isActive, jobs, psnrCurves, remove, resume, retry, workersAlive } from '../../session/jobs';
 import { attempt } from '../../session/notices';
-import type { CaptureReport, JobFile, JobInfo } from '../../session/protocol.gen';
+import type { JobFile, JobInfo } from '../../session/protocol.gen';
 import { openAsset, session } from '../../session/session';
 import { Bar, Section } from '../fields';
 import { Icon } from '../icons';
+import { Findings, isUnreadable } from './Findings';
 
 export function Jobs() {
   const list = jobs.value;
@@ -67,7 +68,7 @@ function Job({ job }: { job: JobInfo }) {
       {active && job.message && facts.length > 0 && <p class="facts">{job.message}</p>}
       {job.error && <p class="warning">{job.error}</p>}
       {job.capture && <Findings report={job.capture} said={job.error} open={active || job.state === 'failed'} />}
-      {job.state === 'failed' && isUnreadable(job.capture) && <p class="hint">Then drop the mended folder here, zipped. “Retry” reads the same pictures again.</p>}
+      {job.state === 'failed' && isUnreadable(job.capture) && <p class="hint">Then drop the mended folder here. “Retry” reads the same pictures again.</p>}
       {job.state === 'done' && (job.kind === 'render' || job.kind === 'export') && <JobFiles job={job} />}
       <div class="buttons">
         {active && <button onClick={() => void cancel(job)}>Cancel</button>}
@@ -79,47 +80,6 @@ function Job({ job }: { job: JobInfo }) {
     </li>
   );
 }
-
-const LEVEL_TEXT = { error: 'Error', warning: 'Warning', info: 'Note' };
-const counted = (count: number, word: string) => (count > 0 ? [`${count} ${word}${count > 1 ? 's' : ''}`] : []);
-
-/** What the doctor says of the capture. `said`: what stands above already. */
-function Findings({ report, said, open }: { report: CaptureReport; said: string | null; open: boolean }) {
-  const { summary, findings } = report;
-  const warnings = findings.filter((finding) => finding.level === 'warning').length;
-  const counts = [...counted(warnings, 'warning'), ...counted(findings.length - warnings, 'note')].join(', ');
-  const list = (
-    <ul>
-      {findings.map(({ level, sentence, advice }) => (
-        <li class={level}>
-          {sentence !== said && (
-            <p>
-              <strong>{LEVEL_TEXT[level]}:</strong> {sentence}
-            </p>
-          )}
-          {advice && <p class="hint">{advice}</p>}
-        </li>
-      ))}
-    </ul>
-  );
-  return (
-    <div class="findings">
-      {summary && <p class="facts">{summary}</p>}
-      {findings.length === 0 ? (
-        <p class="facts good">Nothing about this capture stands in the way.</p>
-      ) : isUnreadable(report) ? (
-        list
-      ) : (
-        <details class="fold" open={open && warnings > 0}>
-          <summary>The capture: {counts}</summary>
-          {list}
-        </details>
-      )}
-    </div>
-  );
-}
-
-const isUnreadable = (report: CaptureReport | null) => report?.findings.some((finding) => finding.level === 'error') ?? false;
 
 /** Quality against progress; nothing until there are two points. */
 function PsnrCurve({ curve }: { curve: [number, number][] }) {

@@ -6,31 +6,35 @@ import * as api from '../../session/api';
 import { captureAmong, chosenFiles } from '../../capture/dropped_files';
 import { takeFile } from '../../capture/take_file';
 import { zipOf, type PlacedFile } from '../../capture/zip';
-import { buildSample, type BuildChoice } from '../../session/jobs';
+import { buildSample } from '../../session/jobs';
 import { assets } from '../../session/library';
 import { attempt } from '../../session/notices';
 import { openAsset, session } from '../../session/session';
-import { Bar, Choice, Section } from '../fields';
+import type { UploadProgress } from '../../session/uploads';
+import { Bar, Section } from '../fields';
 import { Icon } from '../icons';
 import { libraryOpen } from '../layout';
+import { build, BuildChoices } from './BuildChoices';
+import { Captures } from './Captures';
 import { Jobs } from './Jobs';
 
-const build = signal<BuildChoice>({ preset: 'fast', binding: 'particles', light: 'auto' });
-/** Share of the upload under way; null while there is none. */
-const uploading = signal<{ name: string; share: number } | null>(null);
+/** The upload under way, and what gives it up; null while there is none. */
+const uploading = signal<({ name: string; leaving: AbortController } & UploadProgress) | null>(null);
 
-/** Loose pictures, a film or a folder among the files are sent as one capture. */
+/** Loose pictures, a film or a folder among the files are sent as one capture, which is shown before anything is built of it. */
 export async function takeFiles(files: PlacedFile[]): Promise<void> {
   const { name, capture, others } = captureAmong(files);
   if (capture.length > 0) {
-    uploading.value = { name, share: 0 };
+    uploading.value = { name, share: 0, waiting: false, leaving: new AbortController() };
     const zip = await attempt(zipOf(capture));
     if (zip) others.unshift(new File([zip], `${name}.zip`));
     uploading.value = null;
   }
   for (const file of others) {
-    uploading.value = { name: file.name, share: 0 };
-    await takeFile(file, build.value, (share) => (uploading.value = { name: file.name, share }));
+    const leaving = new AbortController();
+    const show = (progress: UploadProgress) => (uploading.value = { name: file.name, leaving, ...progress });
+    show({ share: 0, waiting: false });
+    await takeFile(file, show, leaving.signal);
     uploading.value = null;
   }
 }
@@ -40,6 +44,7 @@ export function Library() {
   return (
     <aside class="panel library" aria-label="Library">
       <NewBuild />
+      <Captures />
       <Jobs />
       <Assets />
     </aside>
@@ -50,38 +55,7 @@ function NewBuild() {
   const file = useRef<HTMLInputElement>(null);
   return (
     <Section title="New asset">
-      <Choice
-        label="Quality"
-        value={build.value.preset}
-        options={[
-          { value: 'draft', text: 'Draft', title: 'About a minute: to see whether the capture works' },
-          { value: 'fast', text: 'Fast', title: 'Some minutes' },
-          { value: 'full', text: 'Full', title: 'Up to an hour: the best this capture gives' },
-        ]}
-        onChange={(preset) => (build.value = { ...build.value, preset })}
-      />
-      <details class="fold">
-        <summary>Advanced</summary>
-        <Choice
-          label="Gaussians lie"
-          value={build.value.binding}
-          options={[
-            { value: 'particles', text: 'As fitted', title: 'Where they were fitted, carried along by the mesh: the sharper pictures' },
-            { value: 'mesh', text: 'On the mesh', title: 'Rebuilt on its faces, one a face: they follow every deformation exactly, highlights are a little softer' },
-          ]}
-          onChange={(binding) => (build.value = { ...build.value, binding })}
-        />
-        <Choice
-          label="Lamps stood still with"
-          value={build.value.light}
-          options={[
-            { value: 'auto', text: 'Auto', title: 'By what is around the object in the pictures, and by how its brightness changes' },
-            { value: 'object', text: 'The object', title: 'The camera went around it' },
-            { value: 'camera', text: 'The camera', title: 'The object stood on a turntable' },
-          ]}
-          onChange={(light) => (build.value = { ...build.value, light })}
-        />
-      </details>
+      <BuildChoices />
       <div class="buttons">
         <button class="primary" onClick={() => void buildSample(build.value)}>
           Build the sample
@@ -108,12 +82,16 @@ function NewBuild() {
   );
 }
 
-function Upload({ name, share }: { name: string; share: number }) {
-  const label = share < 1 ? `Uploading ${name}` : `The server is reading ${name}…`;
+function Upload({ name, share, waiting, leaving }: { name: string; leaving: AbortController } & UploadProgress) {
+  const arrived = `${Math.floor(100 * share)} %`;
+  const label = waiting ? `The server does not answer. ${name} goes on by itself: ${arrived} have arrived` : share < 1 ? `Uploading ${name}: ${arrived}` : `The server is reading ${name}…`;
   return (
-    <div role="status">
-      <p class="facts">{label}</p>
-      <Bar label={label} share={share} />
+    <div class="upload">
+      <p class={waiting ? 'warning' : 'facts'} role="status">
+        {label}
+      </p>
+      <Bar label={`Upload of ${name}`} share={share} />
+      {/\.zip$/.test(name) && <button onClick={() => leaving.abort()}>Give up</button>}
     </div>
   );
 }
