@@ -338,7 +338,7 @@ BAD: dict[str, Bad] = {
         posed(lambda n, picture: replace(picture, world_from_camera=turned(180, 0) @ picture.world_from_camera)),
         "warning",
         r"The cameras' mean upward direction is 1[78]\d degrees off the world's z axis\.",
-        "turn the world upright",
+        "turn the world upright by --up ",
     ),
     "a pose that is not finite": Bad(
         spoiled(frames(lambda f: f[5]["transform_matrix"][1].__setitem__(3, math.nan))),

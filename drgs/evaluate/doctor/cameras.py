@@ -123,13 +123,14 @@ def scale(views: Views, points: InitialPoints) -> Section:
             )
         )
     up = torch.stack([-camera.camera_from_world[1, :3] for camera in views.cameras]).mean(0)
+    x, y, z = (up / up.norm().clamp(min=1e-6)).tolist()
     tilt = float(torch.rad2deg(torch.acos((up[2] / up.norm().clamp(min=1e-6)).clamp(-1, 1))))
     if tilt > TILTED_UP:
         findings.append(
             Finding(
                 "warning",
                 f"The cameras' mean upward direction is {tilt:.0f} degrees off the world's z axis.",
-                "Environments have z up: turn the world upright (COLMAP: model_orientation_aligner), or rotate the light.",
+                f"Environments have z up: turn the world upright by --up {x:.3f} {y:.3f} {z:.3f} (in the viewer: up as held).",
             )
         )
     decimals = max(5, 4 - math.floor(math.log10(points.bounds_radius)))  # whatever the capture's unit
