@@ -4,8 +4,11 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-NAMES = tuple(sorted(path.stem for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")))
-"""Each file here is a benchmark with a `main(arguments)`."""
+HERE = Path(__file__).parent
+MODULES = {path.stem: path.stem for path in HERE.glob("*.py") if not path.stem.startswith("_")}
+MODULES |= {path.parent.name: f"{path.parent.name}.command" for path in HERE.glob("*/command.py")}
+NAMES = tuple(sorted(MODULES))
+"""Each file here is a benchmark with a `main(arguments)`, and each folder whose command.py has one."""
 
 
 def main(arguments: list[str]) -> None:
@@ -19,7 +22,7 @@ def main(arguments: list[str]) -> None:
         return
     if arguments[0] not in NAMES:
         raise ValueError(f"there is no benchmark {arguments[0]!r}; expected one of {', '.join(NAMES)}")
-    import_module(f"benchmarks.{arguments[0]}").main(arguments[1:])
+    import_module(f"benchmarks.{MODULES[arguments[0]]}").main(arguments[1:])
 
 
 if __name__ == "__main__":

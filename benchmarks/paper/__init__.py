@@ -1,0 +1,5 @@
+"""The evidence of drgs2026 made anew: other systems' ways as variants behind one interface, its tables and its figures.
+
+The command is command.py. `variant.py` has the interface, `variants/` one file a way, `splats.py` what all that draw Gaussians share and
+`harmonics.py` how their radiance is baked; `cells.py` keeps what is finished, `tables.py` and `figures.py` make it, `pages.py` writes it down.
+"""

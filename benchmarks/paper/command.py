@@ -1,0 +1,112 @@
+"""drgs2026's evidence as one command: its comparisons, on scenes with truth, beside drivers built as the others build theirs.
+
+    python -m benchmarks paper OUT --scenes DIR ... [--assets 'ASSETS/{scene}'] [--only WORD ...] [--quick] [--json]
+
+For each scene: an asset (built, or that of --assets), every way bound to it (variants/), test views at rest, deformed views under the light of the
+photographs and under a new one, time and memory, and figures. OUT gets index.html, paper.md and their pictures in images/paper; cells/ has what is finished,
+one file a cell, so that a killed run goes on. --only takes ways ({ways}) and parts ({parts}). --quick: drafts, few Gaussians, few rays,
+every second test view.
+"""
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from benchmarks.measures.bench_scene import open_scene
+from benchmarks.measures.build_process import built_asset, cli_command
+from benchmarks.paper.cells import CellFolder
+from benchmarks.paper.figures import figure_cells
+from benchmarks.paper.harmonics import BakeSettings
+from benchmarks.paper.pages import write_pages
+from benchmarks.paper.tables import EvidenceSettings, SceneEvidence, bound_tensors, deformed_cell, static_cell
+from benchmarks.paper.variant import AbstractVariant
+from benchmarks.paper.variants import VARIANTS
+from drgs.reconstruct.build_asset import PRESETS
+
+PARTS = ("static", "deformed", "figures")
+QUICK = EvidenceSettings(samples_per_pixel=32, budget=20_000, bake=BakeSettings(rounds=0), test_every=2)
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks paper",
+        description=(__doc__ or "").format(ways=", ".join(VARIANTS), parts=", ".join(PARTS), scene="{scene}"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--scenes", nargs="+", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--assets", help="finished assets, {scene} in place of the scene's name; by default they are built")
+    parser.add_argument("--only", nargs="+", metavar="WORD", default=[], choices=[*VARIANTS, *PARTS])
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--preset", choices=list(PRESETS), help="of builds; by default full, draft with --quick")
+    parser.add_argument("--spp", type=int, help="rays a pixel of ways that trace them")
+    parser.add_argument("--budget", type=int, help="Gaussians of ways that put them on faces of their own")
+    parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of builds")
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args(arguments)
+    settings = settings_of(given)
+    variants = [VARIANTS[name] for name in VARIANTS if name in given.only] or list(VARIANTS.values())
+    parts = [part for part in PARTS if part in given.only] or list(PARTS)
+    cells = CellFolder(given.out, repeated(arguments))
+    document: dict = {}
+    for folder in given.scenes:
+        scene = open_scene(folder)
+        evidence = SceneEvidence(scene, asset_of(given, folder, scene.name), cells, settings)
+        document[scene.name] = scene_document(evidence, variants, parts)
+    write_pages(given.out, document, variants)
+    print(f"Wrote {given.out / 'index.html'} and {given.out / 'paper.md'}", file=sys.stderr)
+    if given.json:
+        print(json.dumps(document))
+
+
+def settings_of(given: argparse.Namespace) -> EvidenceSettings:
+    """Raises:
+    ValueError: a count is below 1.
+    """
+    settings = QUICK if given.quick else EvidenceSettings()
+    if given.spp is not None:
+        settings = replace(settings, samples_per_pixel=given.spp)
+    if given.budget is not None:
+        settings = replace(settings, budget=given.budget)
+    if min(settings.samples_per_pixel, settings.budget) < 1:
+        raise ValueError(f"--spp is {settings.samples_per_pixel} and --budget {settings.budget}; expected at least 1 of each")
+    return settings
+
+
+def asset_of(given: argparse.Namespace, folder: Path, name: str) -> Path:
+    """The scene's asset, built where none is given.
+
+    Raises:
+        ValueError: the one given is not there.
+    """
+    if given.assets is not None:
+        path = Path(given.assets.replace("{scene}", name))
+        if not (path / "asset.json").is_file():
+            raise ValueError(f"{path} holds no asset.json; expected the asset of {name}, or --assets with {{scene}} where its name stands")
+        return path
+    work = given.out / "assets" / name
+    preset = given.preset or ("draft" if given.quick else "full")
+    built_asset(cli_command(folder, work / "asset", preset, 0, given.device), work, {"preset": preset, "seed": 0})
+    return work / "asset"
+
+
+def scene_document(evidence: SceneEvidence, variants: list[AbstractVariant], parts: list[str]) -> dict:
+    """{"bind", "static", "deformed": by way; "figures": by name}."""
+    document: dict = {"bind": {}, "static": {}, "deformed": {}, "figures": {}}
+    for variant in variants:
+        document["bind"][variant.name] = bound_tensors(evidence, variant)[0]
+        if "static" in parts:
+            document["static"][variant.name] = static_cell(evidence, variant)
+        if "deformed" in parts:
+            document["deformed"][variant.name] = deformed_cell(evidence, variant)
+    if "figures" in parts:
+        document["figures"] = figure_cells(evidence, variants)
+    return document
+
+
+def repeated(arguments: list[str]) -> str:
+    """The command for a reader: folders by their last names, which are all that another machine has in common."""
+    words = [Path(word).name if word.startswith(("/", ".")) else word for word in arguments]
+    return " ".join(["python -m benchmarks paper", *words])

@@ -1,0 +1,235 @@
+"""The figures: what the tables' numbers look like. Each is one JPEG of a scene, and a cell that says what is on it.
+
+In: a scene's evidence, and the pictures that the tables' cells left. Out: OUT/images/paper/SCENE_FIGURE.jpg. All are on white, cut to the object,
+of the first camera that has a deformed truth.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.measures.bench_scene import has_true_maps, read_light, read_rgba, read_true_maps
+from benchmarks.measures.peak_memory import measured
+from benchmarks.paper.sheets import Array, halved, object_window, sheet
+from benchmarks.paper.tables import SceneEvidence
+from benchmarks.paper.variant import AbstractVariant
+from drgs.deform.pose_scene import pose_scene
+from drgs.evaluate.metrics import normal_error_degrees, on_white, psnr
+from drgs.maths.color_numpy import srgb_from_linear
+from drgs.maths.constants import STILL_BOUNCES
+from drgs.render.records import Frame, RenderSettings
+from drgs.render.render_frame import render_frame
+from drgs.scene.camera import Camera
+from drgs.scene.edits import parse_edits
+
+Mask = NDArray[np.bool_]
+Figure = Callable[[SceneEvidence, list[AbstractVariant], Path], dict]
+"""Writes a picture and says what is on it: {"caption", ...}."""
+EDITS: dict[str, list[dict]] = {
+    "as captured": [],
+    "gold, polished": [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.9, 0.6, 0.2], "metallic": 1.0, "roughness": 0.1}}],
+    "gold, rough": [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.9, 0.6, 0.2], "metallic": 1.0, "roughness": 0.5}}],
+    "red paint": [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.6, 0.05, 0.05], "metallic": 0.0, "roughness": 0.3}}],
+}
+AMOUNTS = {"rate": 0.0, "curvature": 0.0, "factor": 1.0}
+"""Of maps, and their value at rest."""
+STRIP = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""How much of a deformation each picture of the strip has."""
+DIFFERENCE_GAIN = 4.0
+"""Differences are shown brighter by this factor."""
+NORMAL_ERROR_SHOWN = 30.0
+"""[degrees] that is drawn white."""
+
+
+def deformed(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path, new_light: bool) -> dict:
+    """drgs2026, Fig. 3 (light of the photographs) and Fig. 4 (new light): every way beside the truth."""
+    folder = next(folder for folder, new in evidence.truths() if new is new_light)
+    name = camera_of(evidence).name
+    truth = read_rgba(evidence.scene.folder / folder / f"{name}.png")
+    drawn = [("truth", truth)]
+    for variant in variants:
+        file = evidence.pictures(variant) / folder / f"{name}.png"
+        drawn.append((variant.title, read_rgba(file)))
+    window = object_window([picture[..., 3] for _, picture in drawn])
+    cut = [(title, halved(on_white(picture))[halved_window(window)]) for title, picture in drawn]
+    middle = -(-len(cut) // 2)
+    sheet([row for row in (cut[:middle], cut[middle:]) if row], path)
+    return {"caption": f"{folder.parent.name} under {folder.name}" + (" (new light)" if new_light else " (light of the photographs)")}
+
+
+def materials(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
+    """drgs2026, Fig. 6: edits of the material alone."""
+    drawn = [(name, picture_of(evidence, edits)) for name, edits in EDITS.items()]
+    sheet([drawn], path)
+    return {"caption": "material edits under the recovered light"}
+
+
+def inter_reflection(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
+    """drgs2026, Fig. 8: light between surfaces on and off, and what it adds."""
+    frames = {bounces: frame_of(evidence, [], bounces) for bounces in (STILL_BOUNCES, 0)}
+    with_it, without = (on_white(rgba_of(frame)) for frame in frames.values())
+    truth = on_white(read_rgba(evidence.scene.folder / "test" / f"{camera_of(evidence).name}.png"))
+    window = object_window([rgba_of(frame)[..., 3] for frame in frames.values()])
+    cut = [("truth", truth), ("with", with_it), ("without", without), ("4 x difference", 1 - DIFFERENCE_GAIN * np.abs(with_it - without))]
+    sheet([[(name, halved(picture)[halved_window(window)]) for name, picture in cut]], path)
+    figures = {"psnr_with": psnr(with_it, truth), "psnr_without": psnr(without, truth)}
+    return {"caption": "inter-reflection on and off, light of the photographs", "figures": figures}
+
+
+def normals_and_light(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
+    """drgs2026, Fig. 10: normals, their error, and the recovered light beside the true one."""
+    frame, camera = frame_of(evidence, [], 0), camera_of(evidence)
+    true = read_true_maps(evidence.scene, camera)
+    inside = true.alpha > 0.5
+    normal = array_of(frame.gbuffer.normal_world)
+    error = np.zeros(inside.shape)
+    error[inside] = normal_error_degrees(normal[inside], true.normal_world[inside])
+    window = halved_window(object_window([true.alpha]))
+    maps = [
+        ("true normals", colors_of_normals(true.normal_world, inside)),
+        ("ours", colors_of_normals(normal, array_of(frame.gbuffer.coverage) > 0.5)),
+        (f"error, white {NORMAL_ERROR_SHOWN:.0f} degrees", np.repeat(error[..., None] / NORMAL_ERROR_SHOWN, 3, -1)),
+    ]
+    assert evidence.scene.training_light is not None
+    recovered = array_of(evidence.subject.asset.environment.radiance)
+    truth = array_of(read_light(evidence.scene, evidence.scene.training_light).radiance)
+    # One factor, since nobody can tell how bright light and how dark paint is.
+    recovered = recovered * float(truth.mean() / recovered.mean())
+    lights = [("true light", light_picture(truth)), ("recovered", light_picture(recovered))]
+    sheet([[(name, halved(picture)[window]) for name, picture in maps], lights], path)
+    return {"caption": "normals and the light of the photographs", "figures": {"normal_mae_of_this_view": float(error[inside].mean())}}
+
+
+def material_maps(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
+    """drgs2026, Fig. 11: materials and visibility, the truth above."""
+    frame, camera = frame_of(evidence, [], 0), camera_of(evidence)
+    true = read_true_maps(evidence.scene, camera)
+    shown = array_of(frame.gbuffer.coverage) > 0.5
+    window = halved_window(object_window([true.alpha, shown.astype(float)]))
+
+    def grey(values: Array, where: Mask) -> Array:
+        return np.where(where[..., None], np.repeat(values[..., None], 3, -1), 1.0)
+
+    def colour(albedo: Array, where: Mask) -> Array:
+        return np.where(where[..., None], srgb_from_linear(albedo.clip(0, 1)), 1.0)
+
+    inside, gbuffer = true.alpha > 0.5, frame.gbuffer
+    above = [
+        ("true albedo", colour(true.albedo, inside)),
+        ("true roughness", grey(true.roughness, inside)),
+        ("true metallic", grey(true.metallic, inside)),
+    ]
+    below = [
+        ("albedo", colour(array_of(gbuffer.albedo), shown)),
+        ("roughness", grey(array_of(gbuffer.roughness), shown)),
+        ("metallic", grey(array_of(gbuffer.metallic), shown)),
+        ("open sky", grey(array_of(frame.radiance.visibility), shown)),
+    ]
+    sheet([[(name, halved(picture)[window]) for name, picture in row] for row in (above, below)], path)
+    return {"caption": "material maps and visibility"}
+
+
+def strip(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
+    """drgs2026, Fig. 12: a continuous deformation, ours."""
+    (name, analytic), *_ = evidence.deformations.items()
+    amount = amount_of(analytic)
+    assert amount is not None
+    still = AMOUNTS[amount]
+    drawn = []
+    for part in STRIP:
+        value = still + part * (analytic[amount] - still)
+        drawn.append((f"{amount} {value:.2f}", picture_of(evidence, [{"op": "deform", "map": analytic | {amount: value}}])))
+    sheet([drawn], path)
+    return {"caption": f"{name}, growing"}
+
+
+def amount_of(analytic: dict) -> str | None:
+    """What of a map says how much; None where no single number does."""
+    return next((key for key in analytic if key in AMOUNTS), None)
+
+
+def camera_of(evidence: SceneEvidence) -> Camera:
+    """The first test camera that the deformed truth has a picture of."""
+    folders = [evidence.scene.folder / folder for folder, _ in evidence.truths()]
+    return next(camera for camera in evidence.scene.cameras if all((folder / f"{camera.name}.png").is_file() for folder in folders))
+
+
+def frame_of(evidence: SceneEvidence, edits: list[dict], bounces: int = STILL_BOUNCES) -> Frame:
+    """Ours as the asset prefers to be seen."""
+    settings = RenderSettings(samples_per_pixel=evidence.settings.samples_per_pixel, bounces=bounces)
+    return render_frame(pose_scene(evidence.subject.asset, parse_edits(edits)), camera_of(evidence), settings)
+
+
+def picture_of(evidence: SceneEvidence, edits: list[dict]) -> Array:
+    """Half as large, on white, with its empty rim cut off by a tenth on each side."""
+    picture = halved(on_white(rgba_of(frame_of(evidence, edits))))
+    height, width = picture.shape[0] // 10, picture.shape[1] // 10
+    return picture[height:-height, width:-width]
+
+
+def rgba_of(frame: Frame) -> Array:
+    return array_of(frame.rgba_srgb.clamp(0, 1))
+
+
+def array_of(values: Tensor) -> Array:
+    return values.detach().cpu().double().numpy()
+
+
+def colors_of_normals(normals: Array, inside: Mask) -> Array:
+    return np.where(inside[..., None], 0.5 + 0.5 * normals, 1.0)
+
+
+def halved_window(window: tuple[slice, slice]) -> tuple[slice, slice]:
+    """Of a picture that is half as large."""
+    rows, columns = (
+        slice(None if part.start is None else part.start // 2, None if part.stop is None else part.stop // 2) for part in window
+    )
+    return rows, columns
+
+
+def light_picture(table: Array) -> Array:
+    """An environment at 128 rows, in sRGB."""
+    while table.shape[0] > 128:
+        table = halved(table)
+    return np.asarray(srgb_from_linear(table.clip(0, 1)), np.float64)
+
+
+FIGURES: dict[str, tuple[Figure, bool]] = {
+    "deformed": (lambda evidence, variants, path: deformed(evidence, variants, path, False), False),
+    "deformed_relit": (lambda evidence, variants, path: deformed(evidence, variants, path, True), False),
+    "materials": (materials, False),
+    "inter_reflection": (inter_reflection, False),
+    "normals_and_light": (normals_and_light, True),
+    "material_maps": (material_maps, True),
+    "strip": (strip, False),
+}
+"""By name, and whether the figure needs the scene's true maps."""
+COMPARISONS = ("deformed", "deformed_relit")
+
+
+def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant]) -> dict[str, dict]:
+    """All figures that the scene has truth for, by name: {"caption", "picture", ...}."""
+    found = {}
+    for name, (figure, needs_maps) in FIGURES.items():
+        if (needs_maps and not (has_true_maps(evidence.scene) and evidence.scene.training_light)) or not evidence.truths():
+            continue
+        if name == "strip" and amount_of(next(iter(evidence.deformations.values()))) is None:
+            continue
+        if name in COMPARISONS and not any(new is (name == "deformed_relit") for _, new in evidence.truths()):
+            continue
+        file = f"images/paper/{evidence.scene.name}_{name}.jpg"
+        path = evidence.cells.folder / file
+
+        def make(figure: Figure = figure, path: Path = path, file: str = file) -> dict:
+            with torch.no_grad():
+                told, cost = measured(lambda: figure(evidence, variants, path))
+            return told | {"picture": file, "cost": asdict(cost)}
+
+        asked = evidence.asked | ({"ways": [variant.name for variant in variants]} if name in COMPARISONS else {})
+        found[name] = evidence.cells.cell(f"{evidence.scene.name}-figure-{name}", asked, make, [path])
+    return found

@@ -1,0 +1,134 @@
+"""The command on a scene small enough to know: every table and figure is there, and what is finished is not made again."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from benchmarks.__main__ import main
+from benchmarks.paper.cells import CellFolder
+from benchmarks.paper.command import repeated
+from benchmarks.paper.pages import honesty
+from benchmarks.paper.variants import VARIANTS
+from drgs.exchange.exr import encode_environment
+from drgs.reconstruct.capture.load_views import load_cameras
+from drgs.reconstruct.geometry.face_surfels import surfels_on_faces_of
+from drgs.scene.asset import Asset, save_asset
+from tests.benchmarks.test_quality_benchmark import sphere_shape
+from tests.reconstruct.tiny_capture import SPHERE_RADIUS, sphere_views, write_nerf_synthetic
+from tests.render.closed_form_scenes import constant_sky, mesh_of
+
+WAYS = ("mani_gs", "gsp", "ours_particles")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A painted sphere, two test views, and a deformed truth under two lights that is the sphere at rest: the map does nothing."""
+    folder = write_nerf_synthetic(tmp_path_factory.mktemp("scene"), sphere_views(6, square=True))
+    train = json.loads((folder / "transforms_train.json").read_text())
+    frames = []
+    views = sphere_views(2, square=True)
+    for where in ("test", "deform/stretch/noon", "deform/stretch/dusk"):
+        (folder / where).mkdir(parents=True)
+        for view in views:
+            Image.fromarray(view.rgba).save(folder / where / f"{view.name}.png")
+    frames = [{"file_path": f"./test/{view.name}", "transform_matrix": view.world_from_opengl.tolist()} for view in views]
+    (folder / "transforms_test.json").write_text(json.dumps(train | {"frames": frames}))
+    facts = {"name": "ball", "train_env": "noon", "deform": {"stretch": {"type": "stretch", "factor": 1.0}}}
+    (folder / "scene.json").write_text(json.dumps(facts))
+    (folder / "env").mkdir()
+    for light, radiance in (("noon", 1.0), ("dusk", 0.5)):
+        (folder / "env" / f"{light}.exr").write_bytes(encode_environment(torch.full((8, 16, 3), radiance).numpy()))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def assets(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    mesh = mesh_of(sphere_shape(SPHERE_RADIUS), 0.5, 0.6, 0.0)
+    gaussians, binding = surfels_on_faces_of(mesh)
+    folder = tmp_path_factory.mktemp("assets")
+    cameras = tuple(load_cameras(scene / "transforms_train.json"))
+    save_asset(Asset(gaussians, mesh, binding, constant_sky(0.8), cameras, primary="mesh"), folder / "ball_asset")
+    return folder
+
+
+def arguments(out: Path, scene: Path, assets: Path, *more: str) -> list[str]:
+    given = ["--assets", str(assets / "{scene}_asset"), "--quick", "--spp", "4", "--budget", "600", "--json", *more]
+    return ["paper", str(out), "--scenes", str(scene), *given]
+
+
+@pytest.mark.slow
+def test_every_table_and_figure_is_there_and_nothing_is_made_twice(scene: Path, assets: Path, tmp_path: Path, capsys, monkeypatch):
+    out = tmp_path / "out"
+    command = arguments(out, scene, assets, "--only", *WAYS)
+    main(command)
+    document = json.loads(capsys.readouterr().out)["ball"]
+    assert set(document["static"]) == set(document["deformed"]) == set(document["bind"]) == set(WAYS)
+    assert set(document["deformed"]["gsp"]["figures"]) == {"stretch/noon", "stretch/dusk"}
+    baked = document["static"]["mani_gs"]["figures"]["psnr"]
+    assert baked > 20, "painted by the direction of the normal, and baked"
+    # The map does nothing, so a baked picture under the same light is the one at rest.
+    assert document["deformed"]["mani_gs"]["figures"]["stretch/noon"]["psnr"] == pytest.approx(baked, abs=1.5)
+    # This scene has no true maps: two of the figures need them.
+    assert set(document["figures"]) == {"deformed", "deformed_relit", "materials", "inter_reflection", "strip"}
+    assert all(Image.open(out / cell["picture"]).size[0] > 50 for cell in document["figures"].values())
+    page = (out / "paper.md").read_text()
+    assert all(title in page for title in ("## Static views", "## Deformed, new light", "## Time and memory", "## Who is better"))
+    assert str(tmp_path) not in page, "no address of this machine"
+    assert "<table>" in (out / "index.html").read_text()
+
+    def unwanted(*_: object) -> None:
+        raise AssertionError("it is there already")
+
+    (out / "cells" / "ball-gsp-static.json").unlink()
+    for way in set(WAYS) - {"gsp"}:
+        monkeypatch.setattr(VARIANTS[way], "bind", unwanted)
+        monkeypatch.setattr(VARIANTS[way], "pose", unwanted)
+    main(command)
+    again = json.loads(capsys.readouterr().out)["ball"]
+    assert again["static"]["gsp"]["figures"] == document["static"]["gsp"]["figures"]
+    assert again["static"]["mani_gs"] == document["static"]["mani_gs"]
+
+
+def test_a_cell_that_a_kill_cut_short_is_made_again_and_one_of_other_settings_too(tmp_path: Path):
+    made = []
+
+    def make(value: int) -> dict:
+        made.append(value)
+        return {"value": value}
+
+    cells = CellFolder(tmp_path, "command")
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "cells" / "one.json.part").write_text('{"asked": {"rays"')
+    assert cells.cell("one", {"rays": 4}, lambda: make(1))["value"] == 1
+    assert cells.cell("one", {"rays": 4}, lambda: make(2))["value"] == 1
+    assert cells.cell("one", {"rays": 8}, lambda: make(3))["value"] == 3
+    assert cells.cell("one", {"rays": 8}, lambda: make(4), [tmp_path / "gone.png"])["value"] == 4
+    kept = json.loads((tmp_path / "cells" / "one.json").read_text())
+    assert made == [1, 3, 4] and {"command", "commit", "time", "machine"} == set(kept["made"])
+
+
+def test_the_page_says_where_another_way_is_better():
+    def cells(ours: float, other: float) -> dict:
+        figures = {"ours_particles": {"psnr": ours, "ssim": 0.9}, "gsp": {"psnr": other, "ssim": 0.8}}
+        return {"static": {way: {"figures": values} for way, values in figures.items()}, "deformed": {}}
+
+    ways = [VARIANTS["gsp"], VARIANTS["ours_particles"]]
+    assert "ahead of the best other (GSP) by 2.00 dB" in honesty({"ball": cells(30, 28)}, ways)
+    assert "**behind** GSP by 1.00 dB" in honesty({"ball": cells(30, 31)}, ways)
+
+
+def test_commands_for_readers_name_no_folder_of_this_machine():
+    told = repeated(["/somewhere/out", "--scenes", "/data/scenes/teapot", "--assets", "/data/{scene}_asset", "--quick"])
+    assert told == "python -m benchmarks paper out --scenes teapot --assets {scene}_asset --quick"
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [(["--spp", "0"], "--spp is 0"), (["--assets", "nowhere/{scene}"], "nowhere/ball holds no asset.json")],
+)
+def test_what_cannot_be_compared_is_refused(scene: Path, assets: Path, tmp_path: Path, more: list[str], sentence: str):
+    with pytest.raises(ValueError, match=sentence):
+        main(arguments(tmp_path / "out", scene, assets, *more))
