@@ -4,8 +4,8 @@
 
 For each scene: an asset (built, or that of --assets), every way bound to it (variants/), test views at rest, deformed views under the light of the
 photographs and under a new one, time and memory, and figures. OUT gets index.html, paper.md and their pictures in images/paper; cells/ has what is finished,
-one file a cell, so that a killed run goes on. --only takes ways ({ways}) and parts ({parts}). --quick: drafts, few Gaussians, few rays,
-every second test view.
+one file a cell, so that a killed run goes on. --only takes ways ({ways}), parts ({parts})
+and single figures ({figures}). --quick: drafts, few Gaussians, few rays, every second test view.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks.measures.bench_scene import open_scene
 from benchmarks.measures.build_process import built_asset, cli_command
 from benchmarks.paper.cells import CellFolder
-from benchmarks.paper.figures import figure_cells
+from benchmarks.paper.figures import FIGURES, figure_cells
 from benchmarks.paper.harmonics import BakeSettings
 from benchmarks.paper.pages import write_pages
 from benchmarks.paper.tables import EvidenceSettings, SceneEvidence, bound_tensors, deformed_cell, static_cell
@@ -32,13 +32,13 @@ QUICK = EvidenceSettings(samples_per_pixel=32, budget=20_000, bake=BakeSettings(
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks paper",
-        description=(__doc__ or "").format(ways=", ".join(VARIANTS), parts=", ".join(PARTS), scene="{scene}"),
+        description=(__doc__ or "").format(ways=", ".join(VARIANTS), parts=", ".join(PARTS), figures=", ".join(FIGURES), scene="{scene}"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--scenes", nargs="+", type=Path, required=True, metavar="DIR")
     parser.add_argument("--assets", help="finished assets, {scene} in place of the scene's name; by default they are built")
-    parser.add_argument("--only", nargs="+", metavar="WORD", default=[], choices=[*VARIANTS, *PARTS])
+    parser.add_argument("--only", nargs="+", metavar="WORD", default=[], choices=[*VARIANTS, *PARTS, *FIGURES])
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--preset", choices=list(PRESETS), help="of builds; by default full, draft with --quick")
     parser.add_argument("--spp", type=int, help="rays a pixel of ways that trace them")
@@ -48,13 +48,18 @@ def main(arguments: list[str]) -> None:
     given = parser.parse_args(arguments)
     settings = settings_of(given)
     variants = [VARIANTS[name] for name in VARIANTS if name in given.only] or list(VARIANTS.values())
-    parts = [part for part in PARTS if part in given.only] or list(PARTS)
+    parts = [part for part in (*PARTS, *FIGURES) if part in given.only] or list(PARTS)
     cells = CellFolder(given.out, repeated(arguments))
-    document: dict = {}
-    for folder in given.scenes:
+
+    def evidence(folder: Path) -> SceneEvidence:
         scene = open_scene(folder)
-        evidence = SceneEvidence(scene, asset_of(given, folder, scene.name), cells, settings)
-        document[scene.name] = scene_document(evidence, variants, parts)
+        return SceneEvidence(scene, asset_of(given, folder, scene.name), cells, settings)
+
+    # Each scene's evidence anew for each part: what one has read is not another's memory.
+    document = {open_scene(folder).name: scene_tables(evidence(folder), variants, parts) for folder in given.scenes}
+    wanted = [name for name in FIGURES if name in parts or "figures" in parts]
+    for folder, tables in zip(given.scenes, document.values(), strict=True):
+        tables["figures"] = figure_cells(evidence(folder), variants, wanted)
     write_pages(given.out, document, variants)
     print(f"Wrote {given.out / 'index.html'} and {given.out / 'paper.md'}", file=sys.stderr)
     if given.json:
@@ -92,17 +97,15 @@ def asset_of(given: argparse.Namespace, folder: Path, name: str) -> Path:
     return work / "asset"
 
 
-def scene_document(evidence: SceneEvidence, variants: list[AbstractVariant], parts: list[str]) -> dict:
-    """{"bind", "static", "deformed": by way; "figures": by name}."""
-    document: dict = {"bind": {}, "static": {}, "deformed": {}, "figures": {}}
+def scene_tables(evidence: SceneEvidence, variants: list[AbstractVariant], parts: list[str]) -> dict:
+    """{"bind", "static", "deformed": by way}."""
+    document: dict = {"bind": {}, "static": {}, "deformed": {}}
     for variant in variants:
         document["bind"][variant.name] = bound_tensors(evidence, variant)[0]
         if "static" in parts:
             document["static"][variant.name] = static_cell(evidence, variant)
         if "deformed" in parts:
             document["deformed"][variant.name] = deformed_cell(evidence, variant)
-    if "figures" in parts:
-        document["figures"] = figure_cells(evidence, variants)
     return document
 
 

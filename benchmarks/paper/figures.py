@@ -36,6 +36,12 @@ EDITS: dict[str, list[dict]] = {
     "gold, rough": [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.9, 0.6, 0.2], "metallic": 1.0, "roughness": 0.5}}],
     "red paint": [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.6, 0.05, 0.05], "metallic": 0.0, "roughness": 0.3}}],
 }
+MATTERS = ("jelly", "rubber", "clay", "sand")
+"""Presets, softest first: E is 10 rho g L of jelly and 100 of the others."""
+FALL = {"time": 0.4, "speed": 1.5}
+"""When the pictures of matter are taken [s], and how fast the object arrives [world units/s]."""
+PARTICLES_SHARE = 1 / 3
+"""Of the budget: how many particles the falling object has."""
 AMOUNTS = {"rate": 0.0, "curvature": 0.0, "factor": 1.0}
 """Of maps, and their value at rest."""
 STRIP = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -148,6 +154,17 @@ def strip(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) 
     return {"caption": f"{name}, growing"}
 
 
+def matter(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
+    """drgs2026, Fig. 5: the same fall with soft and with stiff matter; beside it clay, which stays bent, and sand."""
+    particles = max(int(PARTICLES_SHARE * evidence.settings.budget), 1)
+    drawn = [("at rest", picture_of(evidence, []))]
+    for preset in MATTERS:
+        scene = {"matter": {"preset": preset}, "velocity": [0, 0, -FALL["speed"]], "particles": particles, "duration": FALL["time"]}
+        drawn.append((preset, picture_of(evidence, [{"op": "simulate", "scene": scene, "time": FALL["time"]}])))
+    sheet([drawn], path)
+    return {"caption": f"{FALL['time']:g} s after meeting the floor at {FALL['speed']:g} units/s, {particles} particles"}
+
+
 def amount_of(analytic: dict) -> str | None:
     """What of a map says how much; None where no single number does."""
     return next((key for key in analytic if key in AMOUNTS), None)
@@ -200,27 +217,30 @@ def light_picture(table: Array) -> Array:
 
 
 FIGURES: dict[str, tuple[Figure, bool]] = {
-    "deformed": (lambda evidence, variants, path: deformed(evidence, variants, path, False), False),
-    "deformed_relit": (lambda evidence, variants, path: deformed(evidence, variants, path, True), False),
+    "comparison": (lambda evidence, variants, path: deformed(evidence, variants, path, False), False),
+    "comparison_relit": (lambda evidence, variants, path: deformed(evidence, variants, path, True), False),
     "materials": (materials, False),
     "inter_reflection": (inter_reflection, False),
     "normals_and_light": (normals_and_light, True),
     "material_maps": (material_maps, True),
     "strip": (strip, False),
+    "matter": (matter, False),
 }
 """By name, and whether the figure needs the scene's true maps."""
-COMPARISONS = ("deformed", "deformed_relit")
+COMPARISONS = ("comparison", "comparison_relit")
 
 
-def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant]) -> dict[str, dict]:
-    """All figures that the scene has truth for, by name: {"caption", "picture", ...}."""
+def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant], wanted: list[str]) -> dict[str, dict]:
+    """The wanted figures, of those that the scene has truth for, by name: {"caption", "picture", ...}."""
     found = {}
     for name, (figure, needs_maps) in FIGURES.items():
+        if name not in wanted:
+            continue
         if (needs_maps and not (has_true_maps(evidence.scene) and evidence.scene.training_light)) or not evidence.truths():
             continue
         if name == "strip" and amount_of(next(iter(evidence.deformations.values()))) is None:
             continue
-        if name in COMPARISONS and not any(new is (name == "deformed_relit") for _, new in evidence.truths()):
+        if name in COMPARISONS and not any(new is (name == "comparison_relit") for _, new in evidence.truths()):
             continue
         file = f"images/paper/{evidence.scene.name}_{name}.jpg"
         path = evidence.cells.folder / file
