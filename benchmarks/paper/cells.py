@@ -18,6 +18,10 @@ from torch import Tensor
 from benchmarks.ablate import commit
 
 
+class NotMade(Exception):
+    """A cell is wanted that only a longer run would make."""
+
+
 @dataclass(frozen=True)
 class CellFolder:
     """Cells of one evidence."""
@@ -25,6 +29,8 @@ class CellFolder:
     folder: Path
     command: str
     """That a reader repeats them with."""
+    finished_only: bool = False
+    """Make none."""
 
     def cell(self, name: str, asked: dict, make: Callable[[], dict], files: Sequence[Path] = ()) -> dict:
         """The cell of that name as asked; made where there is none, or one of other settings, or a file of it is gone.
@@ -34,6 +40,9 @@ class CellFolder:
 
         Returns:
             What `make` gave, and under "made": the command, commit, time and machine; under "asked": the settings.
+
+        Raises:
+            NotMade: it is not there, and none is to be made.
         """
         path = self.folder / "cells" / f"{name}.json"
         plain = json.loads(json.dumps(asked))
@@ -41,6 +50,8 @@ class CellFolder:
             kept = json.loads(path.read_text())
             if kept["asked"] == plain:
                 return kept
+        if self.finished_only:
+            raise NotMade(name)
         print(f"paper: {name} ...", file=sys.stderr, flush=True)
         document = {"asked": plain, **make(), "made": self._made()}
         write_whole(path, json.dumps(document, indent=1).encode())

@@ -11,12 +11,13 @@ and single figures ({figures}). --quick: drafts, few Gaussians, few rays, every 
 import argparse
 import json
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.measures.bench_scene import open_scene
 from benchmarks.measures.build_process import built_asset, cli_command
-from benchmarks.paper.cells import CellFolder
+from benchmarks.paper.cells import CellFolder, NotMade
 from benchmarks.paper.figures import FIGURES, figure_cells
 from benchmarks.paper.harmonics import BakeSettings
 from benchmarks.paper.pages import write_pages
@@ -44,12 +45,13 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--spp", type=int, help="rays a pixel of ways that trace them")
     parser.add_argument("--budget", type=int, help="Gaussians of ways that put them on faces of their own")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of builds")
+    parser.add_argument("--finished", action="store_true", help="make nothing: write the pages of what is finished")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
     settings = settings_of(given)
     variants = [VARIANTS[name] for name in VARIANTS if name in given.only] or list(VARIANTS.values())
     parts = [part for part in (*PARTS, *FIGURES) if part in given.only] or list(PARTS)
-    cells = CellFolder(given.out, repeated(arguments))
+    cells = CellFolder(given.out, repeated(arguments), given.finished)
 
     def evidence(folder: Path) -> SceneEvidence:
         scene = open_scene(folder)
@@ -92,6 +94,8 @@ def asset_of(given: argparse.Namespace, folder: Path, name: str) -> Path:
             raise ValueError(f"{path} holds no asset.json; expected the asset of {name}, or --assets with {{scene}} where its name stands")
         return path
     work = given.out / "assets" / name
+    if given.finished and not (work / "asset" / "asset.json").is_file():
+        raise ValueError(f"{work} holds no finished asset of {name}; expected one, or --assets, or no --finished")
     preset = given.preset or ("draft" if given.quick else "full")
     built_asset(cli_command(folder, work / "asset", preset, 0, given.device), work, {"preset": preset, "seed": 0})
     return work / "asset"
@@ -101,11 +105,12 @@ def scene_tables(evidence: SceneEvidence, variants: list[AbstractVariant], parts
     """{"bind", "static", "deformed": by way}."""
     document: dict = {"bind": {}, "static": {}, "deformed": {}}
     for variant in variants:
-        document["bind"][variant.name] = bound_tensors(evidence, variant)[0]
-        if "static" in parts:
-            document["static"][variant.name] = static_cell(evidence, variant)
-        if "deformed" in parts:
-            document["deformed"][variant.name] = deformed_cell(evidence, variant)
+        with suppress(NotMade):
+            document["bind"][variant.name] = bound_tensors(evidence, variant)[0]
+            if "static" in parts:
+                document["static"][variant.name] = static_cell(evidence, variant)
+            if "deformed" in parts:
+                document["deformed"][variant.name] = deformed_cell(evidence, variant)
     return document
 
 

@@ -5,6 +5,7 @@ of the first camera that has a deformed truth.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from benchmarks.measures.bench_scene import has_true_maps, read_light, read_rgba, read_true_maps
 from benchmarks.measures.peak_memory import measured
+from benchmarks.paper.cells import NotMade
 from benchmarks.paper.sheets import Array, halved, object_window, sheet
 from benchmarks.paper.tables import SceneEvidence
 from benchmarks.paper.variant import AbstractVariant
@@ -251,5 +253,6 @@ def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant], wante
             return told | {"picture": file, "cost": asdict(cost)}
 
         asked = evidence.asked | ({"ways": [variant.name for variant in variants]} if name in COMPARISONS else {})
-        found[name] = evidence.cells.cell(f"{evidence.scene.name}-figure-{name}", asked, make, [path])
+        with suppress(NotMade):
+            found[name] = evidence.cells.cell(f"{evidence.scene.name}-figure-{name}", asked, make, [path])
     return found

@@ -92,6 +92,11 @@ def test_every_table_and_figure_is_there_and_nothing_is_made_twice(scene: Path, 
     assert again["static"]["gsp"]["figures"] == document["static"]["gsp"]["figures"]
     assert again["static"]["mani_gs"] == document["static"]["mani_gs"]
 
+    (out / "cells" / "ball-gsp-deformed.json").unlink()
+    main([*command, "--finished"])
+    finished = json.loads(capsys.readouterr().out)["ball"]
+    assert set(finished["static"]) == set(WAYS) and set(finished["deformed"]) == {"mani_gs", "ours_particles"}
+
 
 def test_a_cell_that_a_kill_cut_short_is_made_again_and_one_of_other_settings_too(tmp_path: Path):
     made = []
