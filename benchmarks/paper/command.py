@@ -115,6 +115,10 @@ def scene_tables(evidence: SceneEvidence, variants: list[AbstractVariant], parts
 
 
 def repeated(arguments: list[str]) -> str:
-    """The command for a reader: folders by their last names, which are all that another machine has in common."""
-    words = [Path(word).name if word.startswith(("/", ".")) else word for word in arguments]
-    return " ".join(["python -m benchmarks paper", *words])
+    """The command for a reader: OUT, and folders by their last names, which are all that another machine has in common.
+
+    Args:
+        arguments: the out folder first.
+    """
+    words = [Path(word).name if word.startswith(("/", ".")) else word for word in arguments[1:]]
+    return " ".join(["python -m benchmarks paper OUT", *words])

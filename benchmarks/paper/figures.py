@@ -48,6 +48,8 @@ AMOUNTS = {"rate": 0.0, "curvature": 0.0, "factor": 1.0}
 """Of maps, and their value at rest."""
 STRIP = (0.0, 0.25, 0.5, 0.75, 1.0)
 """How much of a deformation each picture of the strip has."""
+AROUND_MAPS = 0.85
+"""Grey, so that metal, which is 1, is seen."""
 DIFFERENCE_GAIN = 4.0
 """Differences are shown brighter by this factor."""
 NORMAL_ERROR_SHOWN = 30.0
@@ -64,7 +66,7 @@ def deformed(evidence: SceneEvidence, variants: list[AbstractVariant], path: Pat
         file = evidence.pictures(variant) / folder / f"{name}.png"
         drawn.append((variant.title, read_rgba(file)))
     window = object_window([picture[..., 3] for _, picture in drawn])
-    cut = [(title, halved(on_white(picture))[halved_window(window)]) for title, picture in drawn]
+    cut = [(title, on_white(picture)[window]) for title, picture in drawn]
     middle = -(-len(cut) // 2)
     sheet([row for row in (cut[:middle], cut[middle:]) if row], path)
     return {"caption": f"{folder.parent.name} under {folder.name}" + (" (new light)" if new_light else " (light of the photographs)")}
@@ -121,10 +123,10 @@ def material_maps(evidence: SceneEvidence, variants: list[AbstractVariant], path
     window = halved_window(object_window([true.alpha, shown.astype(float)]))
 
     def grey(values: Array, where: Mask) -> Array:
-        return np.where(where[..., None], np.repeat(values[..., None], 3, -1), 1.0)
+        return np.where(where[..., None], np.repeat(values[..., None], 3, -1), AROUND_MAPS)
 
     def colour(albedo: Array, where: Mask) -> Array:
-        return np.where(where[..., None], srgb_from_linear(albedo.clip(0, 1)), 1.0)
+        return np.where(where[..., None], srgb_from_linear(albedo.clip(0, 1)), AROUND_MAPS)
 
     inside, gbuffer = true.alpha > 0.5, frame.gbuffer
     above = [
@@ -139,7 +141,7 @@ def material_maps(evidence: SceneEvidence, variants: list[AbstractVariant], path
         ("open sky", grey(array_of(frame.radiance.visibility), shown)),
     ]
     sheet([[(name, halved(picture)[window]) for name, picture in row] for row in (above, below)], path)
-    return {"caption": "material maps and visibility"}
+    return {"caption": "material maps and visibility; albedo is known up to one factor a channel"}
 
 
 def strip(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:

@@ -128,7 +128,7 @@ def test_the_page_says_where_another_way_is_better():
 
 def test_commands_for_readers_name_no_folder_of_this_machine():
     told = repeated(["/somewhere/out", "--scenes", "/data/scenes/teapot", "--assets", "/data/{scene}_asset", "--quick"])
-    assert told == "python -m benchmarks paper out --scenes teapot --assets {scene}_asset --quick"
+    assert told == "python -m benchmarks paper OUT --scenes teapot --assets {scene}_asset --quick"
 
 
 @pytest.mark.parametrize(

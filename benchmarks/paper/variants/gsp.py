@@ -55,5 +55,6 @@ GSP = SplatVariant(
     split_sum_colors,
     relights=True,
     simplified="a known deformation moves the particles where the paper has position-based dynamics; materials and environment are those that we recover, "
-    "not learned through split sum; the paper's diffuse colour is baked, here the light reaches it too; no water",
+    "not learned through split sum; the paper's diffuse colour is baked, here the light reaches it too; the rest of harmonics stays what it "
+    "was under another light; no water",
 )
