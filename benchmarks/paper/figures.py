@@ -42,7 +42,7 @@ MATTERS = ("jelly", "rubber", "clay", "sand")
 """Presets, softest first: E is 10 rho g L of jelly and 100 of the others."""
 FALL = {"time": 0.4, "speed": 1.5}
 """When the pictures of matter are taken [s], and how fast the object arrives [world units/s]."""
-PARTICLES_SHARE = 1 / 3
+PARTICLES_SHARE = 1 / 12
 """Of the budget: how many particles the falling object has."""
 AMOUNTS = {"rate": 0.0, "curvature": 0.0, "factor": 1.0}
 """Of maps, and their value at rest."""
@@ -187,10 +187,8 @@ def frame_of(evidence: SceneEvidence, edits: list[dict], bounces: int = STILL_BO
 
 
 def picture_of(evidence: SceneEvidence, edits: list[dict]) -> Array:
-    """Half as large, on white, with its empty rim cut off by a tenth on each side."""
-    picture = halved(on_white(rgba_of(frame_of(evidence, edits))))
-    height, width = picture.shape[0] // 10, picture.shape[1] // 10
-    return picture[height:-height, width:-width]
+    """Half as large, on white."""
+    return halved(on_white(rgba_of(frame_of(evidence, edits))))
 
 
 def rgba_of(frame: Frame) -> Array:
