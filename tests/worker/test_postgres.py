@@ -72,7 +72,7 @@ def test_two_workers_share_the_jobs_and_one_takes_over_when_the_other_is_killed(
         assert sorted(set(ran)) == list(range(12)) and len(ran) <= 13
     with Session(bench.engine) as session:
         assert session.query(AssetRow).count() == 3
-        assert session.scalar(text("select version_num from alembic_version")) == "0004"
+        assert session.scalar(text("select version_num from alembic_version")) == "0005"
 
 
 @pytest.mark.slow
