@@ -188,8 +188,7 @@ class _Steps:
         seen = not_grazing(seen_places(target, solid, self.surface.tracer), normals)
         tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
         light = self.surface.light_of(filter_environment(environment))(target)
-        first, second = (shade_places(seen, target, tracer, normals, materials, light, self.state.generator) for _ in range(2))
-        return seen.pixels, first, second
+        return seen.pixels, *shade_places(seen, target, tracer, normals, materials, light, self.state.generator)
 
 
 def prior_terms(

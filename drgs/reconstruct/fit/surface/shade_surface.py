@@ -72,8 +72,9 @@ def shade_places(
     materials: dict[str, Tensor],
     light: MeshLight,
     generator: torch.Generator,
-) -> Float[Tensor, "place 3"]:
-    """Colours in display space, by split sum with one traced mirror ray.
+) -> tuple[Float[Tensor, "place 3"], Float[Tensor, "place 3"]]:
+    """Two independent estimates of the colours in display space, by split sum with one traced mirror ray each: what crossed_halves and
+    crossed_squares compare.
 
     Args:
         tracer: its mesh has the materials that mirrors see. materials: albedo, roughness and metallic of the vertices. light: its tables may
@@ -82,15 +83,21 @@ def shade_places(
     corners, weights = seen.corners, seen.weights
     normal = torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1)
     albedo, roughness, metallic = (at_corners(materials[name], corners, weights) for name in ("albedo", "roughness", "metallic"))
-    with torch.no_grad():
-        known = MeshLight(light.tables.detach(), light.open_share, light.light_from_world)
-        position = at_corners(tracer.mesh.vertices, corners, weights)
-        transmittance, met = mirrored_light(
-            tracer, position, tracer.face_normals[seen.face], normal.detach(), roughness.detach(), seen.wo, known, generator
-        )
-    radiance = shade_split_sum(
-        albedo * (1 - metallic)[:, None], torch.zeros_like(albedo), f0_from_base(albedo, metallic), roughness, normal, seen.wo, light.tables,
-        transmittance, met, at_corners(light.open_share, corners, weights), light.light_from_world,
-    )  # fmt: skip
+    diffuse, f0 = albedo * (1 - metallic)[:, None], f0_from_base(albedo, metallic)
+    open_share = at_corners(light.open_share, corners, weights)
+    position = at_corners(tracer.mesh.vertices, corners, weights).detach()
+    known = MeshLight(light.tables.detach(), light.open_share, light.light_from_world)
     photo = target.saturation.reshape(-1, 3)[seen.pixels]
-    return display_image(radiance, torch.ones_like(roughness), photo, target.ceiling)
+
+    halves = []
+    for _ in range(2):
+        with torch.no_grad():
+            transmittance, met = mirrored_light(
+                tracer, position, tracer.face_normals[seen.face], normal.detach(), roughness.detach(), seen.wo, known, generator
+            )
+        radiance = shade_split_sum(
+            diffuse, torch.zeros_like(albedo), f0, roughness, normal, seen.wo, light.tables, transmittance, met, open_share,
+            light.light_from_world,
+        )  # fmt: skip
+        halves.append(display_image(radiance, torch.ones_like(roughness), photo, target.ceiling))
+    return halves[0], halves[1]

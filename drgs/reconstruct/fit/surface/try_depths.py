@@ -292,12 +292,12 @@ class _Trials:
             materials = {name: torch.sigmoid(values[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
             return torch.nn.functional.normalize(values["normals"], dim=-1), materials
 
-        def shown(index: int, normals: Tensor, materials: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-            """Nearest vertices, colours and the photograph's colours of a view's pixels."""
+        def shown(index: int, normals: Tensor, materials: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            """Nearest vertices, two estimates of the colours and the photograph's colours of a view's pixels."""
             target, places = self._targets[index], not_grazing(seen[index], normals)
             tracer = surface.tracer.with_materials(mesh_from_surface_fit(state, self._faces))
-            colours = shade_places(places, target, tracer, normals, materials, light_of(target), state.generator)
-            return places.nearest, colours, target.saturation.reshape(-1, 3)[places.pixels]
+            halves = shade_places(places, target, tracer, normals, materials, light_of(target), state.generator)
+            return places.nearest, *halves, target.saturation.reshape(-1, 3)[places.pixels]
 
         def step(iteration: int) -> StepLoss:
             index = drawn_view(iteration, len(self._targets), self._seed)
@@ -305,11 +305,11 @@ class _Trials:
             terms = prior_terms(
                 self.edges, environment, normals, materials, values["metal"], settings.weight_bend, settings.weight_smooth, 0.0, 0.0, 0.0
             )
-            _, colours, photo = shown(index, normals, materials)
+            _, first, second, photo = shown(index, normals, materials)
             squared_error = None
-            if len(colours):
-                terms["shaded"] = crossed_halves(colours, shown(index, normals, materials)[1], photo)
-                squared_error = float((colours.detach().clamp(0, 1) - photo).square().mean())
+            if len(photo):
+                terms["shaded"] = crossed_halves(first, second, photo)
+                squared_error = float((first.detach().clamp(0, 1) - photo).square().mean())
             return StepLoss(terms, self._targets[index].camera, squared_error)
 
         def rates(iteration: int) -> dict[str, float]:
@@ -325,9 +325,9 @@ class _Trials:
             for index, target in enumerate(self._targets):
                 if self.stopped:
                     break
-                vertex, colours, photo = shown(index, normals, materials)
+                vertex, first, second, photo = shown(index, normals, materials)
                 # A square would count the noise of mirrored rays, which hollows have and what fills them has not.
-                error = crossed_squares(colours, shown(index, normals, materials)[1], photo)
+                error = crossed_squares(first, second, photo)
                 errors.index_add_(0, vertex, torch.stack([error, torch.ones_like(error)], 1))
                 foreign = seen_places(target, self._bare[index], surface.tracer).nearest
                 wrong = torch.tensor([FOREIGN_ERROR, 1.0], device=errors.device)
