@@ -166,25 +166,28 @@ def test_what_came_before_the_connection_was_cut_is_kept(tmp_path: Path) -> None
     with listening(tmp_path) as server:
         headers = {"Authorization": f"Bearer {server.service.token}"} | TUS
         with httpx.Client(base_url=server.address, headers=headers, timeout=PATIENCE_SECONDS) as http:
-            address = http.post("/api/uploads", headers={"Upload-Length": "3000000"}).headers["Location"]
-            data = os.urandom(3_000_000)
-            lines = [f"PATCH {address} HTTP/1.1", "Host: 127.0.0.1", "Content-Length: 3000000", "Upload-Offset: 0"]
+            address = http.post("/api/uploads", headers={"Upload-Length": "4000000"}).headers["Location"]
+            data = os.urandom(4_000_000)
+            lines = [f"PATCH {address} HTTP/1.1", "Host: 127.0.0.1", "Content-Length: 4000000", "Upload-Offset: 0"]
             head = "\r\n".join([*lines, *(f"{name}: {value}" for name, value in (headers | PART).items()), "", ""])
-            cut = server.connect(head.encode() + data[:2_000_000])
-            arrived = 0
             started = time.monotonic()
-            while arrived < 1 << 20 and time.monotonic() - started < PATIENCE_SECONDS:
-                arrived = int(http.head(address).headers["Upload-Offset"])
+
+            def arrived(enough: int) -> int:
+                while (offset := int(http.head(address).headers["Upload-Offset"])) < enough:
+                    assert time.monotonic() - started < PATIENCE_SECONDS
+                return offset
+
+            cut = server.connect(head.encode() + data[:2_000_000])
+            arrived(1 << 20)
             cut.shutdown(socket.SHUT_RDWR)
             cut.close()
-            while arrived < 2_000_000 and time.monotonic() - started < PATIENCE_SECONDS:
-                arrived = int(http.head(address).headers["Upload-Offset"])
-            assert arrived == 2_000_000
-            # A connection that is dead without the server knowing is taken over from.
-            hanging = server.connect(head.replace("Upload-Offset: 0", "Upload-Offset: 2000000").encode())
-            rest = http.patch(address, content=data[arrived:], headers=PART | {"Upload-Offset": str(arrived)})
+            assert arrived(2_000_000) == 2_000_000
+            # A connection that is dead without the server knowing is taken over from, once the server has begun with it.
+            hanging = server.connect(head.replace("Upload-Offset: 0", "Upload-Offset: 2000000").encode() + data[2_000_000:3_500_000])
+            offset = arrived(2_000_001)
+            rest = http.patch(address, content=data[offset:], headers=PART | {"Upload-Offset": str(offset)})
             hanging.close()
-            assert rest.status_code == 204 and rest.headers["Upload-Offset"] == "3000000"
+            assert rest.status_code == 204 and rest.headers["Upload-Offset"] == "4000000"
         upload = address.rpartition("/")[2]
         assert (server.service.context.directory.incoming / upload).read_bytes() == data
 
