@@ -7,14 +7,18 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from drgs.scene.camera import Camera
 from drgs.scene.mesh import TriangleMesh
+from drgs.warp_torch import launch, warp_array, warp_device
 
-TILE = 16
+wp.set_module_options({"enable_backward": False})
+
+TILE = wp.constant(16)
 """Side [pixels]."""
-MARGIN = 0.01
+MARGIN = wp.constant(0.01)
 """By which triangles are widened on the screen, against rounding [pixels]."""
 
 
@@ -99,34 +103,95 @@ def tile_of_pixels(pixel: Tensor, width: int) -> Tensor:
     return (pixel // width // TILE) * across + pixel % width // TILE
 
 
+@wp.func
+def tile_at(place: wp.float64, tiles: wp.float64) -> int:
+    """One tile beyond the image stands for all further ones."""
+    return int(wp.clamp(wp.floor(place / wp.float64(TILE)), wp.float64(-1.0), tiles))
+
+
+@wp.kernel
+def project_corners(
+    first: int,
+    vertices: wp.array[wp.vec3],
+    rotation: wp.mat33d,
+    translation: wp.vec3d,
+    intrinsics: wp.mat33d,
+    near: wp.float64,
+    across: wp.float64,
+    down: wp.float64,
+    # outputs
+    side: wp.array[int],
+    box: wp.array[wp.vec4i],
+):
+    """Whether each vertex is ahead of the camera's plane (1), on it or behind (-1), and its first and last tile on both axes."""
+    i = first + wp.tid()
+    v = vertices[i]
+    in_camera = rotation * wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2])) + translation
+    side[i] = wp.where(in_camera[2] > near, 1, wp.where(in_camera[2] <= -near, -1, 0))
+    box[i] = wp.vec4i(0, 0, 0, 0)
+    if side[i] < 1:
+        return
+    on_screen = intrinsics * in_camera
+    x = on_screen[0] / on_screen[2]
+    y = on_screen[1] / on_screen[2]
+    margin = wp.float64(MARGIN)
+    box[i] = wp.vec4i(tile_at(x - margin, across), tile_at(y - margin, down), tile_at(x + margin, across), tile_at(y + margin, down))
+
+
+@wp.kernel
+def mark_tiles(
+    first: int,
+    faces: wp.array[int],
+    side: wp.array[int],
+    box: wp.array[wp.vec4i],
+    across: int,
+    down: int,
+    # outputs; threads may write the same True to one place
+    covered: wp.array[wp.bool],
+    crossing: wp.array[wp.bool],
+):
+    i = 3 * (first + wp.tid())
+    a = faces[i]
+    b = faces[i + 1]
+    c = faces[i + 2]
+    nearest = wp.min(side[a], wp.min(side[b], side[c]))
+    if nearest < 1:
+        if wp.max(side[a], wp.max(side[b], side[c])) > -1:
+            crossing[0] = True
+        return
+    low_x = wp.max(wp.min(box[a][0], wp.min(box[b][0], box[c][0])), 0)
+    low_y = wp.max(wp.min(box[a][1], wp.min(box[b][1], box[c][1])), 0)
+    high_x = wp.min(wp.max(box[a][2], wp.max(box[b][2], box[c][2])), across - 1)
+    high_y = wp.min(wp.max(box[a][3], wp.max(box[b][3], box[c][3])), down - 1)
+    for y in range(low_y, high_y + 1):
+        for x in range(low_x, high_x + 1):
+            covered[y * across + x] = True
+
+
 def tiles_of_mesh(mesh: TriangleMesh, camera: Camera) -> Tensor:
     """(tile,) bool: False only where no ray through the tile can meet the mesh.
 
     A triangle's tiles are those of its box on the screen. A triangle that crosses the camera's plane may be seen anywhere.
     """
-    device = mesh.vertices.device
+    device, count = mesh.vertices.device, len(mesh.vertices)
     across, down = tile_grid(camera.width, camera.height)
-    camera_from_world = camera.camera_from_world.to(device).double()
-    in_camera = mesh.vertices.detach().double() @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    depth = in_camera[:, 2][mesh.faces.long()]
-    near = 1e-9 * float(in_camera.abs().max())
-    if bool(((depth.amin(1) <= near) & (depth.amax(1) > -near)).any()):
-        return torch.ones(across * down, dtype=torch.bool, device=device)
-    on_screen = in_camera @ camera.intrinsics.to(device).double().T
-    corners = (on_screen[:, :2] / on_screen[:, 2:])[mesh.faces[depth[:, 0] > near].long()]
-    low = ((corners.amin(1) - MARGIN) / TILE).floor()
-    high = ((corners.amax(1) + MARGIN) / TILE).floor()
-    size = torch.tensor([across, down], device=device)
-    inside = ((high >= 0) & (low < size)).all(1)
-    low = torch.minimum(low[inside].clamp(min=0), size - 1.0).long()
-    high = torch.minimum(high[inside].clamp(min=0), size - 1.0).long() + 1
-    # Corners of boxes, summed along both axes, count the boxes over each tile.
-    edges = torch.zeros((down + 1) * (across + 1), dtype=torch.int64, device=device)
-    for y, x, sign in ((low, low, 1), (low, high, -1), (high, low, -1), (high, high, 1)):
-        at = y[:, 1] * (across + 1) + x[:, 0]
-        edges.index_add_(0, at, torch.full_like(at, sign))
-    covered = edges.view(down + 1, across + 1).cumsum(0).cumsum(1)[:down, :across]
-    return (covered > 0).reshape(-1)
+    pose, intrinsics = camera.camera_from_world.double().cpu(), camera.intrinsics.double().cpu()
+    farthest = 0.0 if count == 0 else float(mesh.vertices.detach().abs().max()) + float(pose[:3, 3].abs().max())
+    side, box = torch.empty(count, dtype=torch.int32, device=device), torch.empty(count, 4, dtype=torch.int32, device=device)
+    launch(
+        project_corners,
+        count,
+        [
+            warp_array(mesh.vertices.float(), wp.vec3), wp.mat33d(*pose[:3, :3].flatten().tolist()), wp.vec3d(*pose[:3, 3].tolist()),
+            wp.mat33d(*intrinsics.flatten().tolist()), wp.float64(1e-9 * farthest), wp.float64(across), wp.float64(down),
+        ],
+        [warp_array(side), warp_array(box, wp.vec4i)],
+        warp_device(side),
+    )  # fmt: skip
+    covered, crossing = (torch.zeros(count, dtype=torch.bool, device=device) for count in (across * down, 1))
+    inputs = [warp_array(mesh.faces.int().reshape(-1)), warp_array(side), warp_array(box, wp.vec4i), across, down]
+    launch(mark_tiles, len(mesh.faces), inputs, [warp_array(covered), warp_array(crossing)], warp_device(covered))
+    return torch.ones_like(covered) if bool(crossing) else covered
 
 
 def pixels_of_tiles(tiles: Tensor, width: int, height: int) -> Tensor:

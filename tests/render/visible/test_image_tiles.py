@@ -30,6 +30,17 @@ def test_no_ray_of_a_tile_left_out_meets_the_mesh(shift: tuple[float, float]) ->
     assert int((tiles & ~hit).sum()) <= 0.25 * int(tiles.sum()) + 1
 
 
+def test_tiles_are_those_of_the_triangles_boxes() -> None:
+    mesh, camera = two_spheres(), shifted(front_camera(100, distance=5), 30.0, -20.0)
+    in_camera = mesh.vertices.double() @ camera.camera_from_world[:3, :3].T.double() + camera.camera_from_world[:3, 3].double()
+    on_screen = in_camera @ camera.intrinsics.double().T
+    corners = (on_screen[:, :2] / on_screen[:, 2:])[mesh.faces.long()]
+    expected = torch.zeros(7, 7, dtype=torch.bool)
+    for low, high in zip((corners.amin(1) / 16).floor().int().tolist(), (corners.amax(1) / 16).floor().int().tolist(), strict=True):
+        expected[max(low[1], 0) : max(high[1] + 1, 0), max(low[0], 0) : max(high[0] + 1, 0)] = True
+    assert torch.equal(tiles_of_mesh(mesh, camera), expected.reshape(-1))
+
+
 def test_a_mesh_around_the_camera_may_be_seen_anywhere_and_one_behind_nowhere() -> None:
     assert bool(tiles_of_mesh(sphere_mesh(), front_camera(40, distance=0.5)).all())
     assert not bool(tiles_of_mesh(sphere_mesh(), front_camera(40, distance=-4.0)).any())
