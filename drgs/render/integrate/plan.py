@@ -46,13 +46,20 @@ class SceneFacts:
 def scene_facts(scene: PosedScene, empty_tiles: int = 0, tiles: int = 0) -> SceneFacts:
     """Facts about the materials of mesh and Gaussians."""
     carriers: list[TriangleMesh | Materials] = [scene.mesh] if scene.surfels is None else [scene.mesh, scene.surfels.materials]
-    return SceneFacts(
-        max(float(((1 - m.metallic) * m.albedo.amax(-1)).max()) for m in carriers),
-        max(float(m.metallic.max()) for m in carriers),
-        min(float(m.roughness.min()) for m in carriers),
-        empty_tiles,
-        tiles,
-    )
+    diffuse, metallic, roughness = zip(*map(_extremes, carriers), strict=True)
+    return SceneFacts(max(diffuse), max(metallic), min(roughness), empty_tiles, tiles)
+
+
+_known_extremes: WeakKeyDictionary[TriangleMesh | Materials, tuple[float, float, float]] = WeakKeyDictionary()
+"""Every picture of a moving camera asks for them."""
+
+
+def _extremes(m: TriangleMesh | Materials) -> tuple[float, float, float]:
+    """Largest diffuse part, largest metallic, smallest roughness."""
+    if m not in _known_extremes:
+        diffuse = float(((1 - m.metallic) * m.albedo.amax(-1)).max())
+        _known_extremes[m] = diffuse, float(m.metallic.max()), float(m.roughness.min())
+    return _known_extremes[m]
 
 
 _spreads: WeakKeyDictionary[Environment, float] = WeakKeyDictionary()

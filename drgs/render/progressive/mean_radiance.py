@@ -9,7 +9,7 @@ from torch import Tensor
 
 from drgs.render.integrate.plan import samples_per_pass
 from drgs.render.progressive.frame_state import FrameState, GaussianView
-from drgs.render.progressive.frame_sums import SumArrays, sum_arrays
+from drgs.render.progressive.frame_sums import FrameSums, SumArrays, sum_arrays
 from drgs.render.progressive.reproject import blend_history, remember
 from drgs.render.records import GBuffer, History, Radiance
 from drgs.render.visible.image_tiles import TILE, Window, tile_grid
@@ -100,10 +100,22 @@ def mean_radiance(state: FrameState) -> Radiance:
     return radiance
 
 
+_gbuffers: WeakKeyDictionary[FrameSums, tuple[int, GBuffer]] = WeakKeyDictionary()
+"""Of sums that live, after so many passes over all tiles: denoiser, history and whoever shows the picture ask for it."""
+
+
 def mean_gbuffer(state: FrameState) -> GBuffer:
     """Of the window: the rasterised one, or the mean over passes of what rays to the mesh saw."""
     if isinstance(state.view, GaussianView):
         return GBuffer(**{name: state.window.crop(values) for name, values in vars(state.view.gbuffer).items()})
+    passes = int(state.tiles.passes.sum())
+    known = _gbuffers.get(state.sums)
+    if known is None or known[0] != passes:
+        known = _gbuffers[state.sums] = passes, _mean_surface(state)
+    return known[1]
+
+
+def _mean_surface(state: FrameState) -> GBuffer:
     assert state.sums.surface is not None
     weight = state.in_window(state.sums.weight)
     coverage = weight / state.passes_in_window.clamp(min=1)
