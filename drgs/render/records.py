@@ -58,6 +58,9 @@ class RenderSettings:
     """Leave out what the scene does not need (drgs/render/integrate/plan.py)."""
     skip_error: float = 0.0
     """Share of the cosine-weighted sky that may be taken for open without asking, at faces where the mesh provably blocks no more."""
+    keep_light: bool = False
+    """A denoised picture of one pass after a camera's move may read diffuse light that is kept on the mesh (progressive/kept_light), and the
+    next pass begins anew without it. For whoever shows pictures to somebody who moves."""
     seed: int = 0
     exposure: float = 0.0
     """[stops]."""
@@ -119,6 +122,8 @@ class RenderPlan:
     skips: tuple[Skip, ...]
     candidates: int = 1
     """Directions that each environment sample chooses among (environment_pool.py)."""
+    kept_light: bool = False
+    """The first pass may read light that is kept on the mesh."""
 
 
 # ---- what the camera sees ------------------------------------------------------------------------------------------------
@@ -240,6 +245,8 @@ class ShadedPoints:
     """Open share of the cosine-weighted sky, 0..1."""
     indirect: Float[Tensor, "point 3"] | None = None
     """The part of diffuse + specular that other surfaces send; None unless asked for (RenderSettings.split_indirect)."""
+    indirect_diffuse: Float[Tensor, "point 3"] | None = None
+    """The diffuse part of that."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -186,3 +186,20 @@ def test_a_change_of_settings_computes_what_the_renderers_table_says_and_nothing
     after = pose.begin(message, Settings(**{"channel": "final", "spp_target": 16, **change}), SIDE, SIDE, final)
     assert isinstance(after, Picture) and after.state.computed_parts == computed
     assert after.samples == (0 if "sums" in computed else final.samples)
+
+
+def test_a_picture_of_a_moving_camera_shows_kept_light_and_is_never_the_last() -> None:
+    pose, picture, camera = posed(two_spheres(), sunny_sky()), None, FRONT
+    for step in range(12):
+        camera = (*FRONT[:1], (0.0, 0.0, -1.0, -6.0 + 0.02 * step), *FRONT[2:])
+        message = CameraMessage(type="camera", world_from_camera=camera, fov_y_degrees=40, width=SIDE, height=SIDE)
+        picture = pose.begin(message, Settings(spp_target=4), SIDE, SIDE, picture)
+        picture.refine()
+    assert isinstance(picture, Picture) and picture.state.kept_samples is not None and bool(picture.state.kept_samples.any())
+    assert any("kept on the mesh" in note for note in picture.notes)
+    assert any("kept on the mesh" in why for _, why, _ in picture.explain().skipped)
+    assert picture.samples < picture.samples_target == 4  # so whoever shows it goes on
+    picture.refine()
+    fresh = picture_of(pose, "final", camera=camera, spp_target=4)
+    assert isinstance(fresh, Picture) and picture.samples == 4 and not any("kept on the mesh" in note for note in picture.notes)
+    assert torch.equal(picture.state.sums.diffuse, fresh.state.sums.diffuse)

@@ -42,7 +42,7 @@ class IntegratorSettings:
     by_material: bool = False
     """Each point shares its samples out by its material (sample_rays.split_at)."""
     split_indirect: bool = False
-    """Say how much of the light comes from other surfaces (ShadedPoints.indirect)."""
+    """Say how much of the light comes from other surfaces (ShadedPoints.indirect, .indirect_diffuse)."""
     candidates: int = 1
     """Directions that each environment sample chooses among: 1 or environment_pool.CANDIDATES."""
 
@@ -107,8 +107,8 @@ class AbstractIntegrator(ABC):
         """
         device, point_count, rays_a_point = points.normal_world.device, len(points.pixel), settings.counts.total
         diffuse, specular, variance = (torch.zeros(point_count, 3, device=device) for _ in range(3))
-        indirect = torch.zeros(point_count, 3, device=device) if settings.split_indirect else None
-        result = ShadedPoints(diffuse, specular, variance, torch.zeros(point_count, device=device), indirect)
+        indirect, of_it_diffuse = (torch.zeros(point_count, 3, device=device) if settings.split_indirect else None for _ in range(2))
+        result = ShadedPoints(diffuse, specular, variance, torch.zeros(point_count, device=device), indirect, of_it_diffuse)
         ray_count, finds_surfaces = point_count * rays_a_point, settings.bounces > 0
         if ray_count == 0:
             return result
@@ -146,5 +146,7 @@ def _light_sums(light: ShadedPoints) -> Any:
     sums = LightSums()
     sums.diffuse, sums.specular = warp_array(light.diffuse, wp.vec3), warp_array(light.specular, wp.vec3)
     sums.variance, sums.visibility = warp_array(light.variance, wp.vec3), warp_array(light.visibility)
-    sums.indirect = warp_array(light.diffuse[:0] if light.indirect is None else light.indirect, wp.vec3)
+    none = light.diffuse[:0]
+    sums.indirect = warp_array(none if light.indirect is None else light.indirect, wp.vec3)
+    sums.indirect_diffuse = warp_array(none if light.indirect_diffuse is None else light.indirect_diffuse, wp.vec3)
     return sums

@@ -48,6 +48,8 @@ class LightSums:
     visibility: wp.array[float]
     indirect: wp.array[wp.vec3]
     """Empty unless it is asked for."""
+    indirect_diffuse: wp.array[wp.vec3]
+    """The same."""
 
 
 @wp.func
@@ -59,6 +61,17 @@ def light_of_surfaces(diffuse_brdf: wp.vec3, first_ray: int, end: int, rays: Ray
             if rays.blocked[ray]:
                 incoming = rays.indirect[ray]
                 total += rays.cosine_weight[ray] * wp.cw_mul(diffuse_brdf, incoming) + wp.cw_mul(rays.specular[ray], incoming)
+    return total
+
+
+@wp.func
+def diffuse_light_of_surfaces(diffuse_brdf: wp.vec3, first_ray: int, end: int, rays: RaySamples, bounces: int) -> wp.vec3:
+    """What is reflected diffusely of that."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    if bounces > 0:
+        for ray in range(first_ray, end):
+            if rays.blocked[ray]:
+                total += rays.cosine_weight[ray] * wp.cw_mul(diffuse_brdf, rays.indirect[ray])
     return total
 
 
@@ -114,6 +127,7 @@ def sum_point(
     sums.variance[point] = variance
     if sums.indirect.shape[0] > 0:
         sums.indirect[point] = light_of_surfaces(diffuse_brdf, first_ray, ray, rays, bounces)
+        sums.indirect_diffuse[point] = diffuse_light_of_surfaces(diffuse_brdf, first_ray, ray, rays, bounces)
     sums.visibility[point] = wp.where(all_sum > 0.0, open_sum / wp.max(all_sum, 1.0e-30), 1.0)
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.render.integrate.environment_table import EnvironmentTable
@@ -13,6 +13,7 @@ from drgs.render.intersect.ray_memory import RayMemory
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.frame_sums import FrameSums
 from drgs.render.progressive.invalidate import Part
+from drgs.render.progressive.kept_light.kept_light import KeptLight
 from drgs.render.records import FrameInputs, GBuffer, History, PrimaryPoints, RenderPlan, Reprojected
 from drgs.render.visible.image_tiles import Window, spread_over_pixels, window_of_tiles
 
@@ -71,6 +72,11 @@ class FrameState:
     """Of the window of the view before a camera's move, until the first pass shows what can be used of it."""
     reprojected: Reprojected | None
     """What can be used of it, in the window."""
+    kept_light: KeptLight | None
+    """Diffuse light on the mesh that moving pictures read; None until the camera moves."""
+    kept_samples: Float[Tensor, "pixel"] | None
+    """Rays behind the kept light that the one pass so far shows, 0 where it shows none; None where it was not asked. Such sums are not gone
+    on with: the next pass begins anew, with this picture as history."""
     computed_parts: tuple[Part, ...]
     """For this frame; the others were taken over from the frame before (invalidate.py)."""
     seconds: dict[str, float]

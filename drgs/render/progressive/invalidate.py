@@ -14,11 +14,14 @@ from drgs.render.records import FrameInputs
 from drgs.scene.camera import Camera
 from drgs.scene.posed_scene import PosedScene
 
-Input = Literal["camera", "shape", "materials", "environment", "rotation", "intensity", "rays", "split"]
-"""rays: the settings that say which rays are shot, and the rows of the image that they are shot for. split: a sum is asked for that the frame before has not. Exposure, background, denoiser,
+Input = Literal["camera", "shape", "materials", "environment", "rotation", "intensity", "rays", "split", "bounces"]
+"""rays: the settings that say which rays are shot, and the rows of the image that they are shot for. split: a sum is asked for that the frame before has not.
+bounces: of these, how far light is followed. Exposure, background, denoiser,
 samples and error wanted are no inputs: they change how the sums are shown, or how long they go on."""
 
-Part = Literal["tracer", "view", "materials", "environment_table", "light", "plan", "first_rays", "sums", "scale"]
+Part = Literal[
+    "tracer", "view", "materials", "environment_table", "light", "plan", "first_rays", "sums", "scale", "kept_direct", "kept_indirect"
+]
 PARTS: tuple[Part, ...] = get_args(Part)
 
 MADE_FROM: dict[Part, frozenset[Input]] = {
@@ -34,9 +37,12 @@ MADE_FROM: dict[Part, frozenset[Input]] = {
     "plan": frozenset({"camera", "shape", "materials", "environment", "intensity", "rays"}),
     # What the first pass's rays met; rays that an edit turned elsewhere are traced again (ray_memory.py).
     "first_rays": frozenset({"camera", "shape", "rays"}),
-    "sums": frozenset({"camera", "shape", "materials", "environment", "rotation", "rays", "split"}),
+    "sums": frozenset({"camera", "shape", "materials", "environment", "rotation", "rays", "split", "bounces"}),
     # Light is linear in the environment's strength: sums are multiplied.
     "scale": frozenset({"intensity"}),
+    # Light kept on the mesh (kept_light/): the environment's own, and what other surfaces send, which wear their materials.
+    "kept_direct": frozenset({"shape", "environment", "rotation"}),
+    "kept_indirect": frozenset({"shape", "environment", "rotation", "materials", "bounces"}),
 }
 
 
@@ -69,6 +75,8 @@ def invalidate(before: FrameInputs, now: FrameInputs) -> Invalidation:
         changed |= {"camera"}
     if _rays_asked_for(before) != _rays_asked_for(now):
         changed |= {"rays"}
+    if before.settings.bounces != now.settings.bounces:
+        changed |= {"bounces"}
     if now.settings.split_indirect and not before.settings.split_indirect:
         changed |= {"split"}
     return Invalidation(changed, parts_made_from(changed))

@@ -87,7 +87,7 @@ def mean_radiance(state: FrameState) -> Radiance:
     if state in _means:
         return _means[state]
     own = _own_samples(state)
-    height, width = own.shape
+    height, width = own.shape[:2]
     diffuse, specular = (own.new_empty(height, width, 3) for _ in range(2))
     variance, visibility, diffuse_variance, specular_variance = (own.new_empty(height, width) for _ in range(4))
     indirect = None if state.sums.indirect is None else torch.empty_like(diffuse)
@@ -134,8 +134,12 @@ def frame_history(state: FrameState) -> History | None:
 
 
 def _own_samples(state: FrameState) -> Tensor:
-    """(rows, columns) behind the frame's own mean."""
-    return (state.passes_in_window * samples_per_pass(state.inputs).total).float()
+    """(rows, columns, 2) behind the diffuse and the specular part of the frame's own mean."""
+    samples = (state.passes_in_window * samples_per_pass(state.inputs).total).float()
+    if state.kept_samples is None:
+        return torch.stack([samples, samples], -1)
+    kept = state.in_window(state.kept_samples)
+    return torch.stack([torch.where(kept > 0, kept, samples), samples], -1)
 
 
 def _window_place(window: Window) -> Any:

@@ -14,16 +14,19 @@ from torch import Tensor
 from drgs.render.integrate.choose_integrator import choose_integrator
 from drgs.render.integrate.environment_pool import ROUNDS_KEPT
 from drgs.render.integrate.integrator import IntegratorSettings
+from drgs.render.integrate.plan import without_kept_light
 from drgs.render.intersect.horizon import usable_horizons
 from drgs.render.intersect.ray_memory import RayMemory
 from drgs.render.intersect.trace_rays import over_slices
 from drgs.render.progressive.converge import MIN_PASSES, still_active
-from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshView, with_seconds
-from drgs.render.progressive.frame_sums import add_estimate, copy_sums
-from drgs.render.progressive.mean_radiance import mean_gbuffer
+from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshView, Tiles, with_seconds
+from drgs.render.progressive.frame_sums import add_estimate, copy_sums, no_sums
+from drgs.render.progressive.kept_light.shade_moving import shade_moving
+from drgs.render.progressive.mean_radiance import frame_history, mean_gbuffer
 from drgs.render.progressive.reproject import reproject
-from drgs.render.records import PrimaryPoints, RayStarts, ShadingPoints
+from drgs.render.records import PrimaryPoints
 from drgs.render.visible.image_tiles import pixels_of_tiles, tile_of_pixels
+from drgs.render.visible.points_at import points_at
 from drgs.render.visible.trace_primary import trace_primary_points
 from drgs.warp_torch import thread_count
 
@@ -42,6 +45,11 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
     Args:
         consume: the given state is not needed any more, and its sums are added to instead of copied.
     """
+    if state.kept_samples is not None:
+        state = _begin_anew(state)
+    reads = state.plan.kept_light and state.kept_light is not None and state.passes == 0 and passes == 1 and state.plan.counts.total > 0
+    if not reads:
+        state = replace(state, plan=without_kept_light(state.plan))
     if not consume or state.passes == 0:  # sums of no pass share one zero
         state = _with_sums_of_its_own(state)
     while passes > 0 and bool(state.tiles.active.any()):
@@ -58,6 +66,15 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
         if state.inputs.settings.target_error is not None and index + count >= MIN_PASSES:
             state = replace(state, tiles=replace(state.tiles, active=still_active(state, state.tiles.active)))
     return state
+
+
+def _begin_anew(state: FrameState) -> FrameState:
+    """A frame whose one pass showed kept light, before its first pass: what it showed is history."""
+    inputs, covered = state.inputs, state.tiles.covered
+    sums = no_sums(len(state.sums.weight), True, inputs.settings.split_indirect, covered.device)
+    tiles = Tiles(covered, torch.zeros_like(state.tiles.passes), covered.clone())
+    plan = without_kept_light(state.plan)
+    return replace(state, plan=plan, sums=sums, tiles=tiles, history=frame_history(state), reprojected=None, kept_samples=None)
 
 
 def _with_sums_of_its_own(state: FrameState) -> FrameState:
@@ -84,7 +101,10 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
     whole_first_pass = index == 0 and bool((chosen == state.tiles.covered).all())
     primary = _primary_points(state, chosen, index, whole_first_pass)
     traced = time.perf_counter()
-    _shade_and_add(state, primary, index, state.first_rays if whole_first_pass else None)
+    if state.plan.kept_light:
+        state = _shade_and_read(state, primary)
+    else:
+        _shade_and_add(state, primary, index, state.first_rays if whole_first_pass else None)
     if whole_first_pass and isinstance(state.view, MeshView):
         state = replace(state, view=MeshView(first_primary_points=primary))
     seconds = {"trace_primary": traced - started, "shade": time.perf_counter() - traced}
@@ -138,21 +158,37 @@ def _pixels(state: FrameState, chosen: Tensor) -> Tensor:
 
 def points_in_tiles(primary: PrimaryPoints, tiles: Tensor, width: int, first_pixel: int = 0) -> PrimaryPoints:
     """The points whose pixels lie in chosen tiles (tile,) bool of an image of this width, or of its band that begins at `first_pixel`."""
-    here = torch.nonzero(tiles[tile_of_pixels(primary.points.pixel - first_pixel, width)]).squeeze(-1)
-    points = ShadingPoints(**{name: values[here] for name, values in vars(primary.points).items()})
-    starts = primary.starts
-    face = None if starts.face is None else starts.face[here]
-    return PrimaryPoints(points, RayStarts(starts.origin_world[here], starts.surface_normal_world[here], face), primary.depth[here])
+    return points_at(primary, torch.nonzero(tiles[tile_of_pixels(primary.points.pixel - first_pixel, width)]).squeeze(-1))
 
 
 def _shade_and_add(state: FrameState, primary: PrimaryPoints, index: int | Tensor, memory: RayMemory | None) -> None:
     """Light of the points of pass `index`, or of several passes, added to the sums of their pixels."""
-    plan, settings, traced = state.plan, state.inputs.settings, state.traced
-    horizon = usable_horizons(traced.tracer.horizons, settings.skip_error) if settings.skip else None
-    how = IntegratorSettings(plan.counts, plan.bounces, settings.seed, plan.by_material, settings.split_indirect, plan.candidates)
+    traced = state.traced
     integrator = choose_integrator(traced.tracer)
-    light = integrator.shade(primary.points, primary.starts, traced.environment_light, how, index, memory, horizon)
+    light = integrator.shade(primary.points, primary.starts, traced.environment_light, _how(state), index, memory, _horizon(state))
     add_estimate(state.sums, primary, light, state.inputs.first_pixel)
+
+
+def _shade_and_read(state: FrameState, primary: PrimaryPoints) -> FrameState:
+    """The same for the one pass of a moving picture, which reads kept light and adds to it."""
+    assert state.kept_light is not None
+    footprint = 1.0 / float(state.inputs.camera.intrinsics[0, 0])
+    integrator, light = choose_integrator(state.traced.tracer), state.traced.environment_light
+    moving = shade_moving(integrator, primary, light, _how(state), state.kept_light, _horizon(state), footprint)
+    add_estimate(state.sums, primary, moving.light, state.inputs.first_pixel)
+    kept_samples = torch.zeros_like(state.sums.weight)
+    kept_samples[primary.points.pixel.long() - state.inputs.first_pixel] = moving.kept_samples
+    return replace(state, kept_light=moving.kept, kept_samples=kept_samples)
+
+
+def _how(state: FrameState) -> IntegratorSettings:
+    plan, settings = state.plan, state.inputs.settings
+    return IntegratorSettings(plan.counts, plan.bounces, settings.seed, plan.by_material, settings.split_indirect, plan.candidates)
+
+
+def _horizon(state: FrameState) -> Tensor | None:
+    settings = state.inputs.settings
+    return usable_horizons(state.traced.tracer.horizons, settings.skip_error) if settings.skip else None
 
 
 def _pay_for_horizons(state: FrameState, starts: Tensor | None, points: int) -> FrameState:

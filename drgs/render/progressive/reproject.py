@@ -164,7 +164,7 @@ def history_share(worth: float, samples: float) -> float:
 def add_history(
     first: int,
     width: int,
-    samples: wp.array2d[float],
+    samples: wp.array2d[wp.vec2],
     albedo: wp.array2d[wp.vec3],
     metallic: wp.array2d[float],
     old: LightMaps,
@@ -179,11 +179,11 @@ def add_history(
     x = i - y * width
     worth = old.samples[y, x]
     d = diffuse_reflectance(albedo[y, x], metallic[y, x])
-    share = history_share(worth[0], samples[y, x])
+    share = history_share(worth[0], samples[y, x][0])
     diffuse[y, x] = (1.0 - share) * diffuse[y, x] + share * wp.cw_mul(old.diffuse[y, x], d)
     diffuse_variance[y, x] = (1.0 - share) * (1.0 - share) * diffuse_variance[y, x] + share * share * old.variance[y, x][0] * mean_square(d)
     s = specular_reflectance(albedo[y, x], metallic[y, x])
-    share = history_share(worth[1], samples[y, x])
+    share = history_share(worth[1], samples[y, x][1])
     specular[y, x] = (1.0 - share) * specular[y, x] + share * wp.cw_mul(old.specular[y, x], s)
     specular_variance[y, x] = (1.0 - share) * (1.0 - share) * specular_variance[y, x] + share * share * old.variance[y, x][1] * mean_square(
         s
@@ -212,14 +212,14 @@ def blend_history(radiance: Radiance, reprojected: Reprojected, gbuffer: GBuffer
     """Make a frame's own mean the mean of that and of what history is worth, in place.
 
     Args:
-        samples: (height, width) behind the frame's own mean.
+        samples: (height, width, 2) behind the diffuse and the specular part of the frame's own mean.
     """
     assert radiance.diffuse_variance is not None and radiance.specular_variance is not None
     height, width = gbuffer.coverage.shape
     launch(
         add_history,
         height * width,
-        [width, warp_view(samples), warp_view(gbuffer.albedo, wp.vec3), warp_view(gbuffer.metallic), _light_maps(reprojected)],
+        [width, warp_view(samples, wp.vec2), warp_view(gbuffer.albedo, wp.vec3), warp_view(gbuffer.metallic), _light_maps(reprojected)],
         [
             warp_view(radiance.diffuse, wp.vec3), warp_view(radiance.specular, wp.vec3),
             warp_view(radiance.diffuse_variance), warp_view(radiance.specular_variance),
@@ -232,12 +232,12 @@ def remember(radiance: Radiance, gbuffer: GBuffer, camera: Camera, samples: Tens
     """A picture as history of the next.
 
     Args:
-        radiance: with history blended in, not filtered. samples: (height, width) of the frame's own.
+        radiance: with history blended in, not filtered. samples: (height, width, 2) of the frame's own, of both parts.
         reprojected: the history that was blended in.
     """
-    behind = samples[..., None].expand(*samples.shape, 2).contiguous()
+    behind = samples
     if reprojected is not None:
-        behind += reprojected.samples * (1 - samples / FADE_SAMPLES).clamp(min=0)[..., None]
+        behind = samples + reprojected.samples * (1 - samples / FADE_SAMPLES).clamp(min=0)
     return History(camera, gbuffer, demodulate_albedo(radiance, gbuffer), behind)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from drgs.render.integrate.environment_table import build_environment_table, environment_light
-from drgs.render.integrate.plan import plan_frame, samples_per_pass, scene_facts
+from drgs.render.integrate.plan import plan_frame, samples_per_pass, scene_facts, without_kept_light
 from drgs.render.integrate.sample_rays import shading_points
 from drgs.render.intersect.horizon import Horizons
 from drgs.render.intersect.ray_memory import RayMemory
@@ -21,6 +21,7 @@ from drgs.render.progressive.converge import still_active
 from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshView, Tiles, TracedScene, with_seconds
 from drgs.render.progressive.frame_sums import brighten_sums, no_sums
 from drgs.render.progressive.invalidate import NOTHING_BEFORE, PARTS, Invalidation, Part, changed_in_scene, invalidate, parts_made_from
+from drgs.render.progressive.kept_light.kept_light import MOST_VERTICES, KeptLight, brighten_kept, no_light, without_indirect
 from drgs.render.progressive.mean_radiance import frame_history
 from drgs.render.progressive.reproject import brighten_light
 from drgs.render.records import FrameInputs, GBuffer, History, PrimaryPoints, RenderPlan, RenderSettings
@@ -62,8 +63,10 @@ def start_frame(
     view = _see_mesh(scene, reuse, clock) if inputs.primary == "mesh" else _see_gaussians(inputs, traced.tracer, gbuffer, reuse, clock)
     covered = _covered_tiles(inputs, view, reuse, clock)
     plan = _spend_samples(inputs, int((~covered).sum()), len(covered), reuse)
+    kept_light = _kept_light(inputs, plan, reuse)
+    clock.lap("kept_light")
     if (before := reuse.keeps("sums")) is not None:
-        state = replace(before, inputs=inputs, traced=traced, plan=plan, computed_parts=reuse.computed_parts)
+        state = replace(before, inputs=inputs, traced=traced, plan=plan, computed_parts=reuse.computed_parts, kept_light=kept_light)
         return with_seconds(_continue_sums(state, _brightness(before.inputs.scene, scene)), clock.seconds)
     history = _history(settings, reuse)
     clock.lap("history")
@@ -77,6 +80,8 @@ def start_frame(
         first_rays=_first_rays(inputs, reuse),
         history=history,
         reprojected=None,
+        kept_light=kept_light,
+        kept_samples=None,
         computed_parts=reuse.computed_parts,
         seconds=clock.seconds,
     )
@@ -111,7 +116,9 @@ class Reuse:
 
     @property
     def computed_parts(self) -> tuple[Part, ...]:
-        return tuple(part for part in PARTS if part in self.invalidation.old_parts)
+        kept = None if self.previous is None else self.previous.kept_light
+        nothing = frozenset[Part]() if kept is not None else frozenset[Part]({"kept_direct", "kept_indirect"})
+        return tuple(part for part in PARTS if part in self.invalidation.old_parts - nothing)
 
 
 def tracer_of(scene: PosedScene, before: tuple[PosedScene, AbstractTracer] | None) -> AbstractTracer:
@@ -148,9 +155,9 @@ def _turned_and_bright(scene: PosedScene) -> tuple[float, float]:
 
 
 def _spend_samples(inputs: FrameInputs, empty_tiles: int, tiles: int, reuse: Reuse) -> RenderPlan:
-    before = reuse.keeps("plan")
+    before, reads = reuse.keeps("plan"), _may_read_kept_light(inputs, reuse)
     if before is not None:
-        return before.plan
+        return before.plan if reads else without_kept_light(before.plan)
     scene, settings = inputs.scene, inputs.settings
     return plan_frame(
         scene.environment,
@@ -161,6 +168,7 @@ def _spend_samples(inputs: FrameInputs, empty_tiles: int, tiles: int, reuse: Reu
         scene_facts(scene, empty_tiles, tiles),
         settings.skip_error,
         counts_given=settings.counts is not None,
+        kept_light=reads,
     )
 
 
@@ -219,6 +227,33 @@ def _covered_tiles(inputs: FrameInputs, view: GaussianView | MeshView, reuse: Re
         covered[0] = True
     clock.lap("covered_tiles")
     return covered
+
+
+# ---- what is kept on the mesh --------------------------------------------------------------------------------------------
+
+
+def _may_read_kept_light(inputs: FrameInputs, reuse: Reuse) -> bool:
+    """Of a picture that somebody sees while the camera moves."""
+    settings, changed = inputs.settings, reuse.invalidation.changed
+    moved = "camera" in changed and "shape" not in changed
+    shown = settings.keep_light and settings.skip and settings.denoise != "none"
+    is_plain = settings.counts is None and not settings.split_indirect and inputs.band is None
+    return moved and shown and is_plain and inputs.primary == "mesh" and len(inputs.scene.mesh.vertices) <= MOST_VERTICES
+
+
+def _kept_light(inputs: FrameInputs, plan: RenderPlan, reuse: Reuse) -> KeptLight | None:
+    """What the frame before has, without what is old of it."""
+    previous, old = reuse.previous, reuse.invalidation
+    kept = None if previous is None or "shape" in old.changed else previous.kept_light
+    if kept is None:
+        return no_light(inputs.scene.mesh) if plan.kept_light else None
+    assert previous is not None
+    if "kept_direct" in old.old_parts:
+        return no_light(inputs.scene.mesh, kept.around)
+    if "kept_indirect" in old.old_parts:
+        kept = without_indirect(kept)
+    brightness = _brightness(previous.inputs.scene, inputs.scene)
+    return kept if brightness == 1.0 else brighten_kept(kept, brightness)
 
 
 # ---- what is summed ------------------------------------------------------------------------------------------------------

@@ -215,11 +215,15 @@ class Picture(AbstractPicture):
         self._passes_at_once: int = 1 if continued is None else continued._passes_at_once
         self._samples_a_pass = _samples_a_pass(state)
         self._nothing_known = settings.channel == "certainty" and pose.certainty is None
-        self.notes = (NO_CERTAINTY,) if self._nothing_known else tuple(f"{skip.what} left out: {skip.why}" for skip in state.plan.skips)
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return (NO_CERTAINTY,) if self._nothing_known else tuple(f"{skip.what} left out: {skip.why}" for skip in self.state.plan.skips)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        return self.state.samples
+        # A picture of kept light is not finished, however few samples are asked for.
+        return self.state.samples if self.state.kept_samples is None else min(self.state.samples, self.samples_target - 1)
 
     @property
     def samples_target(self) -> int:  # type: ignore[override]
@@ -330,6 +334,7 @@ def _render_settings(settings: Settings):
         counts=SampleCounts(SAMPLES_PER_PASS, 0, 0) if channel == "visibility" else None,
         bounces=_bounces(settings),
         split_indirect=channel == "indirect",
+        keep_light=True,
         denoise="svgf" if settings.denoise and channel == "final" else "none",
         exposure=settings.exposure_stops,
         tone_curve=settings.tone_curve,

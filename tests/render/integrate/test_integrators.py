@@ -304,4 +304,6 @@ def test_the_light_of_other_surfaces_is_what_bounces_add(integrator: type, bounc
     assert plain.indirect is None and all(torch.equal(getattr(split, name), getattr(plain, name)) for name in MAPS)
     added = split.diffuse + split.specular - direct.diffuse - direct.specular
     torch.testing.assert_close(split.indirect, added, rtol=1e-4, atol=1e-5 * float(split.diffuse.max()))
+    added = split.diffuse - direct.diffuse
+    torch.testing.assert_close(split.indirect_diffuse, added, rtol=1e-4, atol=1e-5 * float(split.diffuse.max()))
     assert float(split.indirect.mean()) > 0.01 * float(split.diffuse.mean()) if bounces else not bool(split.indirect.any())

@@ -116,7 +116,7 @@ def test_the_share_of_history_falls_to_nothing_as_samples_grow(device: str) -> N
     shares = []
     for samples in (8.0, 64.0, FADE_SAMPLES):
         mean = radiance_like(gbuffer, 1.0, 0.0)
-        blend_history(mean, found, gbuffer, torch.full((SIZE, SIZE), samples, device=device))
+        blend_history(mean, found, gbuffer, torch.full((SIZE, SIZE, 2), samples, device=device))
         shares.append(1 - float(mean.diffuse.min()))
     assert shares[0] > 0.8 and shares[0] > shares[1] > shares[2] == 0
 
@@ -126,10 +126,10 @@ def test_history_is_blended_by_its_worth_and_remembered_without_reflectance(devi
     gbuffer = moved_to(trace_primary(two_spheres(), camera), device)
     light = DemodulatedLight(*(torch.rand(SIZE, SIZE, n, device=device) for n in (3, 3, 2)))
     old = Reprojected(light, 64 * torch.rand(SIZE, SIZE, 2, device=device))
-    mean, own = radiance_like(gbuffer, 0.7, 0.2), torch.full((SIZE, SIZE), 16.0, device=device)
+    mean, own = radiance_like(gbuffer, 0.7, 0.2), torch.tensor([40.0, 16.0], device=device).expand(SIZE, SIZE, 2).contiguous()
     blend_history(mean, old, gbuffer, own)
-    share = old.samples * (1 - 16 / FADE_SAMPLES)
-    share = share / (share + 16)
+    share = old.samples * (1 - own / FADE_SAMPLES)
+    share = share / (share + own)
     kept = remember(mean, gbuffer, camera, own, old)
     parts = ((mean.diffuse, mean.diffuse_variance), (mean.specular, mean.specular_variance))
     for k, ((color, variance), before, factor) in enumerate(
@@ -141,7 +141,7 @@ def test_history_is_blended_by_its_worth_and_remembered_without_reflectance(devi
         torch.testing.assert_close(variance, (1 - w).square() * 0.2 + w.square() * light.variance[..., k] * square)
         torch.testing.assert_close((kept.light.diffuse, kept.light.specular)[k], color / factor)
         torch.testing.assert_close(kept.light.variance[..., k], variance / square)
-    torch.testing.assert_close(kept.samples, 16 + old.samples * (1 - 16 / FADE_SAMPLES))
+    torch.testing.assert_close(kept.samples, own + old.samples * (1 - own / FADE_SAMPLES))
 
 
 SCENE = PosedScene(None, sphere_mesh(4, roughness=0.6), sunny_sky(sun=20.0))
