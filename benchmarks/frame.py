@@ -1,12 +1,14 @@
 """Frames as they are made live: a moving camera, an edit, a picture at rest.
 
-    python -m benchmarks frame --asset ASSET [--size 400] [--spp 32] [--frames 24] [--json]
+    python -m benchmarks frame --asset ASSET [--size 400] [--spp 32] [--frames 24] [--truth 1024] [--json]
 
 fps_moving: pictures a second with the camera turning around the asset, one degree each, `spp` new rays a pixel, what came before
-reprojected, SVGF, tone mapped; the median. `milliseconds` tells where the time goes and `cpu_ms` is summed over threads, steadier on
-a busy machine. edit_to_frame_ms: from sending an edit to having the first picture that shows it, through the WebSocket of a server
-started for this; the median of eight. idle_cpu_percent: of one core, of that server with its viewer still connected, once the
-picture has converged.
+reprojected, diffuse light that is kept on the mesh read where it is known, SVGF, tone mapped; the median. `milliseconds` tells where
+the time goes and `cpu_ms` is summed over threads, steadier on a busy machine. kept: share of the last picture's points that show kept
+light. relmse: of three of the pictures, a third of the path apart, against `truth` rays, over pixels that the object covers wholly.
+traced: the same of pictures that trace all their rays. edit_to_frame_ms: from sending an edit to having the first picture that shows
+it, through the WebSocket of a server started for this; the median of eight. idle_cpu_percent: of one core, of that server with its
+viewer still connected, once the picture has converged.
 """
 
 import argparse
@@ -18,19 +20,21 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import PIPE, Popen
+from types import MappingProxyType
 
 import psutil
 import torch
 
 from drgs.deform.pose_scene import pose_scene
 from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.integrate.plan import samples_per_pass
 from drgs.render.progressive.refine import refine_frame
 from drgs.render.progressive.start_frame import start_frame
-from drgs.render.records import RenderSettings
+from drgs.render.records import Frame, RenderSettings
 from drgs.scene.asset import Asset, load_asset
 from drgs.scene.camera import Camera, camera_from_opengl
 from drgs.scene.posed_scene import PrimarySurface
@@ -38,6 +42,8 @@ from drgs.warp_torch import device_from_name
 from drgs_server.client import Client, Stream
 from drgs_server.live.messages import AcceptedMessage
 
+WARM_UP = 3
+"""Pictures before the first that is measured."""
 EDITS = 8
 IDLE_SECONDS = 4.0
 PROGRAM = (
@@ -54,13 +60,16 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--size", type=int, default=400)
     parser.add_argument("--spp", type=int, default=32)
     parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--truth", type=int, default=1024, help="rays a pixel of the pictures that relmse compares with; 0: compares none")
     parser.add_argument("--primary", choices=["gaussians", "mesh"], help="default: what the asset has")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
     parser.add_argument("--no-server", action="store_true", help="only the moving camera")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
     asset = load_asset(given.asset, device_from_name(given.device))
-    result = moving(asset, given.size, given.spp, given.frames, given.primary)
+    truth = true_pictures(asset, given.size, given.truth, given.frames, given.primary)
+    result = moving(asset, given.size, given.spp, given.frames, given.primary, truth)
+    result["traced"] = moving(asset, given.size, given.spp, given.frames, given.primary, truth, keep_light=False)
     if not given.no_server:
         with served(given.asset, given.size, given.device) as (process, client, stream):
             result |= edits(client, stream, given.size)
@@ -91,15 +100,43 @@ def orbit(asset: Asset, size: int) -> Iterator[Camera]:
         degrees += 1
 
 
-def moving(asset: Asset, size: int, samples: int, frames: int, primary: PrimarySurface | None) -> dict:
-    """Frame times of a camera that turns."""
+def true_pictures(asset: Asset, size: int, rays: int, frames: int, primary: PrimarySurface | None) -> dict[int, Frame]:
+    """By their numbers on the path, those that errors are measured against."""
+    scene, truth = pose_scene(asset, []), {}
+    settings = RenderSettings(primary=primary, seed=1)  # random numbers of their own
+    for number, camera in zip(range(-WARM_UP, frames), orbit(asset, size), strict=False):
+        if rays > 0 and number + 1 in (frames // 3, 2 * frames // 3, frames):
+            state = start_frame(scene, camera, settings)
+            truth[number] = resolve_frame(refine_frame(state, -(-rays // samples_per_pass(state.inputs).total)))
+    return truth
+
+
+def relmse(found: Frame, truth: Frame) -> float:
+    inside = truth.gbuffer.coverage == 1
+    x, y = (frame.radiance_linear[inside].double() for frame in (found, truth))
+    return float(((x - y) ** 2 / (y * y + 0.01)).mean())
+
+
+def moving(
+    asset: Asset,
+    size: int,
+    samples: int,
+    frames: int,
+    primary: PrimarySurface | None,
+    truth: Mapping[int, Frame] = MappingProxyType({}),
+    keep_light: bool = True,
+) -> dict:
+    """Frame times of a camera that turns, and errors of the pictures of which there is a truth."""
     scene, cameras = pose_scene(asset, []), orbit(asset, size)
-    settings = RenderSettings(samples_per_pixel=samples, samples_per_pass=samples, primary=primary, denoise="svgf")
+    settings = RenderSettings(
+        samples_per_pixel=samples, samples_per_pass=samples, primary=primary, denoise="svgf", keep_light=keep_light
+    )  # fmt: skip
     wall: list[float] = []
     cpu: list[float] = []
+    errors: list[float] = []
     steps: dict[str, list[float]] = {}
     state = None
-    for number in range(-3, frames):  # the first pictures compile and build what all share
+    for number in range(-WARM_UP, frames):  # the first pictures compile and build what all share
         started, cpu_started = time.perf_counter(), time.process_time()
         state = refine_frame(start_frame(scene, next(cameras), settings, previous=state))
         frame = resolve_frame(state)
@@ -110,12 +147,17 @@ def moving(asset: Asset, size: int, samples: int, frames: int, primary: PrimaryS
             cpu.append(time.process_time() - cpu_started)
             for step, milliseconds in frame.metadata["milliseconds"].items():
                 steps.setdefault(step, []).append(milliseconds)
+        if number in truth:
+            errors.append(relmse(frame, truth[number]))
+    kept = None if state is None else state.kept_samples
     covered = float((frame.gbuffer.coverage > 0).float().mean())
     return {
         "fps_moving": round(1 / statistics.median(wall), 2),
         "frame_ms": round(1000 * statistics.median(wall), 1),
         "cpu_ms": round(1000 * statistics.median(cpu), 1),
         "covered": round(covered, 3),
+        "kept": 0.0 if kept is None else round(float((kept > 0).float().mean()) / covered, 3),
+        "relmse": [round(error, 5) for error in errors],
         "milliseconds": {step: round(statistics.median(values), 1) for step, values in steps.items()},
     }
 
