@@ -177,6 +177,14 @@ def build(
         tuple[float, float, float],
         typer.Option(metavar="X Y Z", help="Direction of the capture's world that points up; the asset's world is turned so that it is z."),
     ] = (0.0, 0.0, 1.0),
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            metavar="X0 Y0 Z0 X1 Y1 Z1",
+            help="Two corners in the asset's world, which is the capture's after --up: what lies outside is not built.",
+            show_default="all of the object",
+        ),
+    ] = None,
     device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
     seed: Annotated[int, typer.Option()] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint that a stopped build left.")] = False,
@@ -185,10 +193,18 @@ def build(
     """Build an asset from photographs; those without cameras, or a film, are posed first."""
     from drgs.cli_progress import StopOnInterrupt, build_progress
     from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
+    from drgs.reconstruct.capture.build_box import BuildBox
     from drgs.reconstruct.outline_agreement import complaint
 
     settings = BuildSettings(
-        preset=preset.value, binding=binding.value, device=device.value, seed=seed, resume=resume, light=light.value, up=up
+        preset=preset.value,
+        binding=binding.value,
+        device=device.value,
+        seed=seed,
+        resume=resume,
+        light=light.value,
+        up=up,
+        box=None if box is None else BuildBox(box[:3], box[3:]),
     )
     with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
         try:
@@ -197,6 +213,7 @@ def build(
             chosen = "" if binding == BindingKind.particles else f" --binding {binding.value}"
             chosen += "" if light == LightKind.auto else f" --light {light.value}"
             chosen += "" if up == (0.0, 0.0, 1.0) else f" --up {up[0]:g} {up[1]:g} {up[2]:g}"
+            chosen += "" if box is None else f" --box {' '.join(f'{value:g}' for value in box)}"
             print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value}{chosen} --resume", file=sys.stderr)
             raise typer.Exit(130) from None
     if json_progress:

@@ -54,6 +54,11 @@ def evaluate_asset(
             f"this asset's world is {capture}'s turned (up {asset.provenance['up']}), and its test cameras and lights are those of the unturned one; "
             "evaluate a build without --up"
         )
+    if "box" in asset.provenance:
+        raise ValueError(
+            f"this asset holds what of {capture} lies in the box {asset.provenance['box']}, and its test pictures show all of it; evaluate a build "
+            "without --box"
+        )
     with tempfile.TemporaryDirectory() as temporary:
         renders = out or Path(temporary)
         _render_all(asset, capture, renders, load_cameras(cameras_path), settings, done)

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from drgs.evaluate.contact_sheet import contact_sheet
 from drgs.evaluate.doctor.doctor import examine
@@ -19,6 +21,9 @@ from drgs.scene.camera import Camera, opengl_from_camera
 MOST_CAMERAS = 400
 """Of more, evenly chosen ones are told."""
 MOST_POINTS = 3000
+DIRECTIONS = 300
+"""In which the hull's outermost places are told. They are 9 degrees apart, so that a box of any world about those places misses a hundredth of the
+hull's width at most."""
 DIGITS = 5
 """Of coordinates, a ten-thousandth of the object or finer where its world is of the usual size."""
 
@@ -31,7 +36,7 @@ def look_at_capture(folder: Path, sheet: Path) -> dict[str, Any]:
 
     Keys: ok, summary and findings as of the doctor; has_sheet; camera_count (0: not posed yet, or unreadable); cameras, as the asset's training views
     are told (docs/protocol.md); up, the mean of the cameras' own, or None; box_low and box_high, corners of the object's box [world units] or None; box_origin, masks or cameras (a guess: what all
-    cameras see); points and colors, three numbers for each point [world units; sRGB 0..1].
+    cameras see); outermost, three numbers for each place that tells how far the hull reaches [world units], none without masks; points and colors, three numbers for each point [world units; sRGB 0..1].
     """
     examined = examine(folder)
     report, views, points = examined.report, examined.views, examined.points
@@ -48,6 +53,7 @@ def look_at_capture(folder: Path, sheet: Path) -> dict[str, Any]:
         "box_low": None,
         "box_high": None,
         "box_origin": None,
+        "outermost": [],
         "points": [],
         "colors": [],
     }
@@ -79,12 +85,23 @@ def _told_points(points: InitialPoints) -> dict[str, Any]:
         low, high, origin = points.hull_vertices.amin(0), points.hull_vertices.amax(0), "masks"
     else:
         low, high, origin = points.bounds_center - points.bounds_radius, points.bounds_center + points.bounds_radius, "cameras"
+    outermost = [] if points.hull_vertices is None else _outermost(points.hull_vertices.double().numpy()).round(DIGITS).reshape(-1).tolist()
     count = 0 if points.origin == "random" else len(points.points_world)
     kept = np.random.default_rng(0).permutation(count)[:MOST_POINTS]
     return {
         "box_low": low.double().numpy().round(DIGITS).tolist(),
         "box_high": high.double().numpy().round(DIGITS).tolist(),
         "box_origin": origin,
+        "outermost": outermost,
         "points": points.points_world[kept].double().numpy().round(DIGITS).reshape(-1).tolist(),
         "colors": points.colors_srgb[kept].double().numpy().round(2).reshape(-1).tolist(),
     }
+
+
+def _outermost(vertices: Float[ndarray, "vertex 3"]) -> Float[ndarray, "place 3"]:
+    """Those of the vertices that are farthest in some of many even directions, the axes among them: each once."""
+    number = np.arange(DIRECTIONS) + 0.5
+    z, angle = 1 - 2 * number / DIRECTIONS, np.pi * (1 + 5**0.5) * number  # Fibonacci's lattice on the sphere
+    flat = np.sqrt(1 - z * z)
+    directions = np.concatenate([np.stack([flat * np.cos(angle), flat * np.sin(angle), z], -1), np.eye(3), -np.eye(3)])
+    return vertices[np.unique((vertices @ directions.T).argmax(0))]

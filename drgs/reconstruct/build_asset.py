@@ -17,9 +17,11 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from drgs.exchange.photographs import encode_photographs
+from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
+from drgs.reconstruct.capture.cut_to_box import views_of
 from drgs.reconstruct.capture.exposures import with_gains_of_fit, with_gains_of_points
 from drgs.reconstruct.capture.find_hollows import HollowSettings
-from drgs.reconstruct.capture.find_masks import with_drawn_masks
+from drgs.reconstruct.capture.find_masks import masked_by_surfels
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.open_capture import open_capture
@@ -100,6 +102,8 @@ class BuildSettings:
     """What the lamps stood still with while the photographs were taken."""
     up: Direction = UP
     """Direction of the capture's world that points up. The asset's world is the capture's, turned so that it is z (turn_up.rotation_to_up)."""
+    box: BuildBox | None = None
+    """Of the asset's world: what lies outside is not built. None: all of the object is."""
     materials: str | None = None
     """Preset of the stage `materials` alone: None is `preset`. It is how material and light are separated anew on kept geometry."""
 
@@ -220,17 +224,17 @@ def build_stages(
     with timed("read"):
         reporter.report("read", 0.0, "reading the capture")
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
-        found, views, points = open_capture(capture, preset.image_side, preset.points, settings.seed, settings.up)
+        found, views, points = open_capture(capture, preset.image_side, preset.points, settings.seed, settings.up, settings.box)
         photographs = views
         views = with_gains_of_points(views, points)
-        identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views)}
+        identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views, settings.box)}
         place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, should_stop or (lambda: False))
         if not settings.resume:
             forget_checkpoints(place)
         fit_settings = replace(preset.fit, seed=settings.seed)
         if not views.has_masks:
-            masked = masks_stage(place, views, points, fit_settings, device)
-            points = points_of_found_masks(masked, points, preset.points, settings.seed)
+            masked = masks_stage(place, views, points, fit_settings, device, settings.box)
+            points = points_of_found_masks(masked, points, preset.points, settings.seed, settings.box)
         else:
             masked = views
         light = _light(settings, preset, found, masked, points)
@@ -238,19 +242,20 @@ def build_stages(
             # Hollows are found by paint that looks alike from all sides, which it does not under such light.
             views, place = with_light_of_camera(views), place.of(light="camera")
         else:
-            points = hollows_stage(place, masked, points, preset.points, preset.hollows, settings.seed, device)
+            points = hollows_stage(place, masked, points, preset.points, preset.hollows, settings.seed, device, settings.box)
     yield "read", None
 
     with timed("fit"):
         fit = fit_stage(place, views, points, fit_settings, device)
         if not views.has_masks:
-            views = with_drawn_masks(views, gaussians_from_state(fit), points.bounds_radius)
+            views = masked_by_surfels(views, gaussians_from_state(fit), points.bounds_radius, settings.box)
+            photographs = views_of(photographs, views)
         views = with_gains_of_fit(views, drawn_object(fit.parameters, points.bounds_radius, fit_settings.sh_degree))
     yield "fit", None
 
     with timed("mesh"):
         reporter.report("mesh", 0.0, "extracting the mesh")
-        gaussians, mesh = mesh_stage(place, views, points, fit, preset.mesh)
+        gaussians, mesh = mesh_stage(place, views, points, fit, preset.mesh, settings.box)
     yield "mesh", None
     if place.should_stop():
         raise BuildStopped
@@ -329,7 +334,8 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
     place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
     with timed("surface"):
         passes = built.preset.surface
-        passes = replace(passes, surface=replace(passes.surface, seed=seed))
+        moves = replace(passes.surface.moves, box=built.settings.box)
+        passes = replace(passes, surface=replace(passes.surface, seed=seed, moves=moves))
         surface = surface_stage(place, views, built.gaussians, built.mesh, built.fit.parameters, built.radius, passes)
     yield "surface", None
 
@@ -343,12 +349,17 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         yield "bind", None
 
     with timed("materials"):
-        materials_settings = replace(built.materials_preset.materials, seed=seed)
+        materials_settings = built.materials_preset.materials
+        moves = replace(materials_settings.moves, box=built.settings.box)
+        materials_settings = replace(materials_settings, seed=seed, moves=moves)
         decoupled = mesh_materials_stage(built.materials_place(place), views, surface, built.radius, materials_settings)
     yield "materials", None
 
     with timed("pack"):
         place.reporter.report("pack", 0.0, "writing the asset")
+        # Meshing anew rounds the box's edges, a little to either side.
+        vertices = decoupled.state.parameters["vertices"]
+        vertices.data = whole_or_within(built.settings.box, vertices.data)
         fitted, environment = decoupled.mesh, Environment(environment_table(decoupled.state.parameters).detach())
         # Faces moved once more with the materials; surfels stay where they are on them.
         surfels, binding = surfels_on_faces_of(fitted) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=fitted))
@@ -446,6 +457,7 @@ def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMes
         "materials_on": PRESETS[settings.preset].materials_on,
         "seed": settings.seed,
         **({"up": list(settings.up)} if settings.up != UP else {}),
+        **({"box": [list(settings.box.low), list(settings.box.high)]} if settings.box is not None else {}),
         "device": str(device),
         "torch": torch.__version__,
         "mesh": asdict(mesh_report(mesh.vertices, mesh.faces)),

@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from drgs.reconstruct.capture.build_box import BuildBox
+from drgs.reconstruct.capture.cut_to_box import chosen_views
 from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
 from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
@@ -32,7 +34,7 @@ from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, MeshF
 from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.reconstruct.fit.surfels.render_stage_two import render_stage_two
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
-from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen, mesh_from_gaussians
+from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, drop_unseen, mesh_from_gaussians
 from drgs.reconstruct.progress import BuildStopped
 from drgs.reconstruct.report_progress import BuildReporter, encode_preview
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
@@ -73,9 +75,9 @@ class Workplace:
         return replace(self, identity=self.identity | more)
 
 
-def capture_digest(views: Views) -> str:
-    """Hex digest of the photos, masks and poses: a checkpoint belongs to these and no others."""
-    digest = hashlib.sha256()
+def capture_digest(views: Views, box: BuildBox | None = None) -> str:
+    """Hex digest of the photos, masks, poses and the box: a checkpoint belongs to these and no others."""
+    digest = hashlib.sha256(b"" if box is None else repr(box).encode())
     for part in (*views.images_srgb, *views.coverage, *(camera.camera_from_world for camera in views.cameras)):
         digest.update(part.contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
@@ -87,32 +89,43 @@ def forget_checkpoints(place: Workplace) -> None:
         (place.folder / stale).unlink(missing_ok=True)
 
 
-def masks_stage(place: Workplace, views: Views, points: InitialPoints, settings: FitSettings, device: torch.device) -> Views:
+def masks_stage(
+    place: Workplace, views: Views, points: InitialPoints, settings: FitSettings, device: torch.device, box: BuildBox | None
+) -> Views:
     """find_masks."""
+    number_of = {camera.name: index for index, camera in enumerate(views.cameras)}
 
     def report(r: FitReport) -> None:
         place.reporter.report("read", r.iteration / r.iterations, "no masks: looking for the object", r)
 
     def found() -> dict[str, Tensor]:
-        masked = find_masks(views, points, settings, device, report, place.should_stop)
+        masked = find_masks(views, points, settings, device, report, place.should_stop, box)
         if masked is None:
             raise BuildStopped
-        return {f"coverage.{index}": mask for index, mask in enumerate(masked.coverage)}
+        return {f"coverage.{number_of[camera.name]}": mask for camera, mask in zip(masked.cameras, masked.coverage, strict=True)}
 
     kept = _kept_or_made(place, MASKS, torch.device("cpu"), found)
-    return replace(views, coverage=tuple(kept[f"coverage.{index}"] for index in range(len(views.coverage))), has_masks=True)
+    numbers = [number for number in range(len(views.cameras)) if f"coverage.{number}" in kept]
+    return replace(chosen_views(views, numbers), coverage=tuple(kept[f"coverage.{number}"] for number in numbers), has_masks=True)
 
 
-def points_of_found_masks(masked: Views, points: InitialPoints, count: int, seed: int) -> InitialPoints:
+def points_of_found_masks(masked: Views, points: InitialPoints, count: int, seed: int, box: BuildBox | None) -> InitialPoints:
     """Points on the found masks' hull; the given ones where the masks have none."""
     try:
-        return initial_points(masked, count, seed)
+        return initial_points(masked, count, seed, box=box)
     except ValueError:  # a first guess may be wrong where the user's own masks may not: the fit then starts from random points
         return points
 
 
 def hollows_stage(
-    place: Workplace, views: Views, points: InitialPoints, count: int, settings: HollowSettings, seed: int, device: torch.device
+    place: Workplace,
+    views: Views,
+    points: InitialPoints,
+    count: int,
+    settings: HollowSettings,
+    seed: int,
+    device: torch.device,
+    box: BuildBox | None,
 ) -> InitialPoints:
     """find_hollows: the points on the hull, moved to what the photographs show behind it. The bounds stay the hull's."""
     if points.hull_vertices is None or points.hull_faces is None or points.normals_world is None or not settings.grid.levels:
@@ -126,7 +139,7 @@ def hollows_stage(
         surface = find_hollows(views, hull, settings, seed, device, report, place.should_stop)
         if surface is None:
             raise BuildStopped
-        found = points if surface is hull else initial_points(views, count, seed, surface)
+        found = points if surface is hull else initial_points(views, count, seed, surface, box)
         assert found.normals_world is not None  # those of a surface
         return {"points": found.points_world, "normals": found.normals_world, "colors": found.colors_srgb}
 
@@ -153,13 +166,15 @@ def fit_stage(place: Workplace, views: Views, points: InitialPoints, settings: F
 
 
 def mesh_stage(
-    place: Workplace, views: Views, points: InitialPoints, fit: FitState, settings: MeshSettings
+    place: Workplace, views: Views, points: InitialPoints, fit: FitState, settings: MeshSettings, box: BuildBox | None
 ) -> tuple[Gaussians, TriangleMesh]:
-    """The surfels that cameras see and the mesh around them."""
+    """The surfels that cameras see and the mesh around them; of both what the box holds."""
 
     def made() -> dict[str, Tensor]:
         gaussians = drop_unseen(gaussians_from_state(fit), views.cameras, points.bounds_radius)
-        mesh = mesh_from_gaussians(gaussians, views.cameras, points, settings)
+        # Those outside still hide what is behind them.
+        mesh = mesh_from_gaussians(gaussians, views.cameras, points, settings, box)
+        gaussians = gaussians if box is None else chosen_surfels(gaussians, box.holds(gaussians.centers))
         return {f"{type(record).__name__}.{name}": value for record in (gaussians, mesh) for name, value in vars(record).items()}
 
     return _geometry(_kept_or_made(place, MESH, fit.parameters["centers"].device, made))

@@ -92,6 +92,7 @@ class Client:
         binding: BindingName = "particles",
         light: LightName = "auto",
         up: Triple = (0.0, 0.0, 1.0),
+        box: tuple[Triple, Triple] | None = None,
     ) -> JobInfo:
         """Start a build.
 
@@ -101,6 +102,7 @@ class Client:
             binding: particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh.
             light: what the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures.
             up: direction of the capture's world that points up; the asset's world is turned so that it is z.
+            box: low and high corner in the asset's world: what lies outside is not built. None: all of the object is.
             idempotency_key: the same key gives the same job, however often this is called.
         """
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
@@ -112,6 +114,7 @@ class Client:
             "binding": binding,
             "light": light,
             "up": up,
+            "box": None if box is None else {"low": box[0], "high": box[1]},
             "seed": seed,
             "name": name,
         }

@@ -30,6 +30,11 @@ def test_cameras_points_and_box_of_a_ball_are_where_they_are(capture: Path, tmp_
     # Pictures are 72 pixels wide: a pixel is 0.033 at the ball.
     assert np.allclose(look["box_low"], SPHERE_CENTER - SPHERE_RADIUS, atol=0.05)
     assert np.allclose(look["box_high"], SPHERE_CENTER + SPHERE_RADIUS, atol=0.05)
+    outermost = np.array(look["outermost"]).reshape(-1, 3)
+    assert (outermost.min(0).tolist(), outermost.max(0).tolist()) == (look["box_low"], look["box_high"])
+    # In any other direction they are as far apart as the ball is wide, too.
+    directions = np.random.default_rng(0).normal(size=(3, 50))
+    assert np.ptp(outermost @ (directions / np.linalg.norm(directions, axis=0)), axis=0) == pytest.approx(2 * SPHERE_RADIUS, abs=0.12)
     points = np.array(look["points"]).reshape(-1, 3)
     assert 500 < len(points) <= looking.MOST_POINTS and len(look["colors"]) == len(look["points"])
     assert np.linalg.norm(points - SPHERE_CENTER, axis=1) == pytest.approx(SPHERE_RADIUS, abs=0.1)

@@ -38,11 +38,15 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     assert steps["redecouple"] == ("copy", *steps["build"])
     assert (steps["simulate"], steps["export"]) == (("simulate",), ("export glb", "export ply"))
     assert steps["render"] == ("render asset ",)
-    meshed = service.client.post("/api/jobs", json={"dataset": "sample", "binding": "mesh"}).json()
+    box = {"low": [-1, -1, 0], "high": [1, 1, 2]}
+    meshed = service.client.post("/api/jobs", json={"dataset": "sample", "binding": "mesh", "box": box}).json()
     service.add_asset(meshed["id"], "meshed")
     again = service.client.post("/api/jobs", json={"kind": "redecouple", "asset": meshed["id"]}).json()
     found = [jobs._RUNS[info["kind"]](jobs._job_context(info["id"])).steps for info in (meshed, again)]
     assert found[0] == ("read", "fit", "mesh", "surface", "bind", "materials", "pack", "register") and found[1] == ("copy", *found[0])
+    assert jobs._job_context(again["id"]).parameters["box"] == box, "what was cut off is not there to find materials of"
+    asked = [jobs._RUNS[info["kind"]](jobs._job_context(info["id"]))._request() for info in (meshed, again, infos[1])]
+    assert [request.box for request in asked] == [((-1, -1, 0), (1, 1, 2)), ((-1, -1, 0), (1, 1, 2)), None]
     redecoupled = jobs._job_context(infos[1]["id"])
     assert redecoupled.parameters["built_preset"] == "draft" and redecoupled.dataset == service.settings.sample_capture.resolve()
 
@@ -63,6 +67,8 @@ VIEW = {"eye": [0, -3, 1], "target": [0, 0, 0]}
         ({"dataset": "sample", "binding": "glue"}, 422, "binding"),
         ({"dataset": "sample", "up": [0, 0, 0]}, 422, "expected a direction"),
         ({"dataset": "sample", "up": [0, 1]}, 422, "up"),
+        ({"dataset": "sample", "box": {"low": [0, 0, 0], "high": [1, 0, 1]}}, 422, "below that of high"),
+        ({"dataset": "sample", "box": [0, 0, 0, 1, 1, 1]}, 422, "box"),
         ({"dataset": "capture:" + "0" * 32}, 404, "No capture"),
         ({"dataset": "capture:../token"}, 404, "No capture"),
         ({"kind": "simulate", "asset": ASSET, "scene": {"gravity": "much"}}, 422, "gravity"),

@@ -12,6 +12,7 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from drgs.reconstruct.capture.build_box import BuildBox
 from drgs.reconstruct.capture.visual_hull import VisualHull, axes_meeting_point, camera_geometry, visual_hull
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
@@ -42,23 +43,25 @@ class InitialPoints:
     hull_faces: Int[Tensor, "face 3"] | None
 
 
-def initial_points(views: Views, count: int, seed: int, surface: VisualHull | None = None) -> InitialPoints:
+def initial_points(views: Views, count: int, seed: int, surface: VisualHull | None = None, box: BuildBox | None = None) -> InitialPoints:
     """`count` points (fewer when the capture's own sparse points are all there is).
 
     Args:
         surface: a better one than the hull, on which points are to lie.
+        box: of the build. Without masks the bounds are its own, and sparse points outside stay, for the pictures show what is there.
 
     Raises:
         ValueError: the masks have no common shape.
     """
     random = np.random.default_rng(seed)
-    hull = visual_hull(views) if views.has_masks else None
-    sparse = _sparse_points_on_object(views)
+    hull = visual_hull(views, box=box) if views.has_masks else None
+    sparse = _sparse_points_on_object(views, box)
     surface = hull if surface is None else surface
     if sparse is not None and len(sparse[0]) >= FEWEST_SPARSE_POINTS:
-        return _from_sparse(views, sparse, hull, surface, count, random)
+        return _from_sparse(views, sparse, hull, surface, count, random, box)
     if hull is not None and surface is not None:
         points, normals = _sample_surface(surface, count, random)
+        points = points if box is None else points.clip(box.low, box.high)
         colors = _median_colors(views, points, normals, surface)
         center, radius = _bounding_sphere(hull.vertices_world)
         return _record(points, normals, colors, center, radius, "hull", hull)
@@ -66,7 +69,7 @@ def initial_points(views: Views, count: int, seed: int, surface: VisualHull | No
         raise ValueError(
             "the masks of this capture have no common shape: check that the poses belong to the images and that white means object."
         )
-    center, radius = _seen_by_all(views)
+    center, radius = _sphere_without_masks(views, box)
     offsets = random.uniform(-1, 1, (count, 3))
     points = center + radius * offsets
     return _record(points, None, _median_colors(views, points, None, None), center, radius, "random", None)
@@ -100,6 +103,7 @@ def _from_sparse(
     surface: VisualHull | None,
     count: int,
     random: np.random.Generator,
+    box: BuildBox | None,
 ) -> InitialPoints:
     """The capture's points, filled up to `count` from the surface where there is one."""
     points, colors = sparse
@@ -108,24 +112,28 @@ def _from_sparse(
         points, colors = points[kept], colors[kept]
     if hull is None or surface is None:
         # Without masks the points are of the whole room; the object is where all cameras look.
-        return _record(points, None, colors, *_seen_by_all(views), "sparse", None)
+        return _record(points, None, colors, *_sphere_without_masks(views, box), "sparse", None)
     center, radius = _bounding_sphere(hull.vertices_world)
     normals = _vertex_normals(surface)[cKDTree(surface.vertices_world).query(points)[1]]
     if len(points) == count:
         return _record(points, normals, colors, center, radius, "sparse", hull)
     more_points, more_normals = _sample_surface(surface, count - len(points), random)
+    more_points = more_points if box is None else more_points.clip(box.low, box.high)
     more_colors = _median_colors(views, more_points, more_normals, surface)
     points, normals, colors = (np.concatenate(pair) for pair in ((points, more_points), (normals, more_normals), (colors, more_colors)))
     return _record(points, normals, colors, center, radius, "sparse+hull", hull)
 
 
-def _sparse_points_on_object(views: Views) -> tuple[Float[ndarray, "point 3"], Float[ndarray, "point 3"]] | None:
-    """The capture's points (n, 3) and colours (n, 3) without strays; None when it has none."""
+def _sparse_points_on_object(views: Views, box: BuildBox | None) -> tuple[Float[ndarray, "point 3"], Float[ndarray, "point 3"]] | None:
+    """The capture's points (n, 3) and colours (n, 3) without strays, where there are masks in the box; None when it has none."""
     if views.points_world is None or views.point_colors_srgb is None or len(views.points_world) == 0:
         return None
     points, colors = views.points_world.cpu().numpy(), views.point_colors_srgb.cpu().numpy()
     finite = np.isfinite(points).all(1)
     points, colors = points[finite], colors[finite]
+    if views.has_masks and box is not None:
+        held = box.holds(torch.from_numpy(points)).numpy()
+        points, colors = points[held], colors[held]
     if views.has_masks and len(points):
         seen, on_mask = np.zeros(len(points)), np.zeros(len(points))
         for camera, coverage in zip(views.cameras, views.coverage, strict=True):
@@ -161,6 +169,11 @@ def _bounding_sphere(points: Float[ndarray, "point 3"]) -> tuple[Float[ndarray, 
     """Centre of the bounding box and the distance of the farthest point from it."""
     center = (points.min(0) + points.max(0)) / 2
     return center, float(np.linalg.norm(points - center, axis=1).max())
+
+
+def _sphere_without_masks(views: Views, box: BuildBox | None) -> tuple[Float[ndarray, "3"], float]:
+    """Around the build's box, else what all cameras see."""
+    return _seen_by_all(views) if box is None else (np.array(box.center), box.radius)
 
 
 def _seen_by_all(views: Views) -> tuple[Float[ndarray, "3"], float]:

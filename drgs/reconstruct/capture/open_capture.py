@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from drgs.reconstruct.capture.build_box import BuildBox
+from drgs.reconstruct.capture.cut_to_box import cut_to_box
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import read_capture
 from drgs.reconstruct.capture.load_views.capture import Capture
@@ -37,12 +39,13 @@ INVERT = (
 
 
 def open_capture(
-    folder: Path, max_side: int | None, point_count: int, seed: int, up: Direction = UP
+    folder: Path, max_side: int | None, point_count: int, seed: int, up: Direction = UP, box: BuildBox | None = None
 ) -> tuple[Capture, Views, InitialPoints]:
     """The capture, its pictures of at most `max_side` pixels a side, and points to begin with.
 
     Args:
         up: the direction of the capture's own world that is to point up: all is given in the world that is turned so.
+        box: of that turned world. Masks of the capture's own are cut to what it holds (cut_to_box); without masks it bounds the points alone.
 
     Raises:
         ValueError: one sentence why there is nothing to build from; a CaptureFault where what to do about it is known, too.
@@ -51,9 +54,18 @@ def open_capture(
     _check_cameras(capture, folder)
     views = read_pictures(capture, max_side)
     _check_pictures(views, folder)
-    points = initial_points(views, point_count, seed)
+    if box is not None and views.has_masks:
+        views = _cut(views, box, folder)
+    points = initial_points(views, point_count, seed, box=box)
     _check_points(views, points, folder)
     return capture, views, points
+
+
+def _cut(views: Views, box: BuildBox, folder: Path) -> Views:
+    try:
+        return cut_to_box(views, box)
+    except CaptureFault as fault:
+        raise CaptureFault(f"{folder}: {fault}", fault.advice) from fault
 
 
 def camera_angles(views: Views, point: Float[ndarray, "3"]) -> Float[ndarray, "view view"]:

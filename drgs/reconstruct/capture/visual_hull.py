@@ -20,6 +20,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from drgs.reconstruct.capture.build_box import BuildBox
 from drgs.scene.views import Views
 from drgs.warp_torch import launch, warp_array, warp_device
 
@@ -108,15 +109,19 @@ def outvote(
     seen_by[i] = seen
 
 
-def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings()) -> VisualHull | None:
-    """Carve the hull; None where the masks have no common shape."""
+def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings(), box: BuildBox | None = None) -> VisualHull | None:
+    """Carve the hull; None where the masks have no common shape.
+
+    Args:
+        box: cuts it flat, and cells are the smaller; None where it holds nothing of the hull.
+    """
     views = _with_small_masks(views, settings.mask_side)
     carver = _Carver(views, settings)
-    box = _first_box(views)
-    if box is None:
+    first = _first_box(views)
+    if first is None:
         return None
     for _ in range(4):  # possibly the first guess cuts the object: grow it until nothing touches its sides
-        lower, upper = box
+        lower, upper = first
         cell = float((upper - lower).max()) / settings.coarse_cells
         shape = _grid_shape(lower, upper, cell)
         occupied = carver.occupied(_grid_points(lower, cell, shape), cell, settings).reshape(shape)
@@ -126,11 +131,16 @@ def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings(
         if not any(bool(side.any()) for side in sides):
             break
         center, half = (lower + upper) / 2, (upper - lower) / 2
-        box = center - 1.5 * half, center + 1.5 * half
+        first = center - 1.5 * half, center + 1.5 * half
     indices = torch.nonzero(occupied)
     lower = lower + (indices.min(0).values.double().numpy() - 1.0) * cell
     upper = lower + (indices.max(0).values - indices.min(0).values + 3).double().numpy() * cell
-    return _fine_surface(carver, lower, upper, settings)
+    if box is None:
+        return _fine_surface(carver, lower, upper, settings)
+    lower, upper = np.maximum(lower, box.low), np.minimum(upper, box.high)
+    hull = _fine_surface(carver, lower, upper, settings) if (lower < upper).all() else None
+    # Cells are whole, so the grid ends up to one of them behind the box.
+    return hull and replace(hull, vertices_world=hull.vertices_world.clip(box.low, box.high).astype(np.float32))
 
 
 def axes_meeting_point(centers: Float[ndarray, "view 3"], directions: Float[ndarray, "view 3"]) -> Float[ndarray, "3"]:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, clean_mesh, extract_mesh
 from drgs.reconstruct.geometry.extract_mesh.clean_mesh import component_labels, face_areas, used_only
@@ -60,11 +61,22 @@ def reduced_mesh(mesh: TriangleMesh, face_limit: int, radius: float) -> Triangle
     return _grey_mesh(*clean_mesh(mesh.vertices, mesh.faces, settings, shortest_edge=1e-5 * radius))
 
 
-def mesh_from_gaussians(gaussians: Gaussians, cameras: tuple[Camera, ...], points: InitialPoints, settings: MeshSettings) -> TriangleMesh:
+def mesh_from_gaussians(
+    gaussians: Gaussians, cameras: tuple[Camera, ...], points: InitialPoints, settings: MeshSettings, box: BuildBox | None = None
+) -> TriangleMesh:
     """Fuse the median depth of every training view (mean depth draws a second sheet between two surfaces).
 
     Things that stand apart are kept, where a hull says that they are the object; without one the largest alone is.
+
+    Args:
+        box: of the build, which cuts the surface flat.
+
+    Raises:
+        ValueError: as extract_mesh.
     """
+    center, radius = points.bounds_center, points.bounds_radius
+    if box is not None and box.longest_half < radius:
+        center, radius = torch.tensor(box.center), box.longest_half
     tangents, opacities = surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)
     empty = torch.zeros(len(gaussians.centers), 1, device=gaussians.centers.device)
     raster = RasterSettings(near_plane(points.bounds_radius))
@@ -74,10 +86,12 @@ def mesh_from_gaussians(gaussians: Gaussians, cameras: tuple[Camera, ...], point
         assert drawn.median_depth is not None  # asked for by RasterSettings.depth
         maps.append(DepthMap(camera.to(empty.device), drawn.median_depth, drawn.coverage))
     if points.hull_vertices is None or points.hull_faces is None:
-        return _grey_mesh(*extract_mesh(maps, points.bounds_center, points.bounds_radius, settings))
+        vertices, faces = extract_mesh(maps, center, radius, settings, box)
+        return _grey_mesh(whole_or_within(box, vertices), faces)
     settings = replace(settings, keep_component_fraction=SMALLEST_PART)
-    vertices, faces = extract_mesh(maps, points.bounds_center, points.bounds_radius, settings)
-    return _grey_mesh(*parts_in_hull(vertices, faces, points.hull_vertices, points.hull_faces, BEYOND_HULL * points.bounds_radius))
+    vertices, faces = extract_mesh(maps, center, radius, settings, box)
+    vertices, faces = parts_in_hull(vertices, faces, points.hull_vertices, points.hull_faces, BEYOND_HULL * points.bounds_radius)
+    return _grey_mesh(whole_or_within(box, vertices), faces)
 
 
 def parts_in_hull(

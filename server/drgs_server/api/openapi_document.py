@@ -96,6 +96,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
             "box_low": [-0.6, -0.4, -0.5],
             "box_high": [0.6, 0.4, 0.5],
             "box_origin": "masks",
+            "outermost": [0.6, 0.0, 0.0, 0.0, 0.4, 0.5],
             "points": [0.1, 0.2, 0.3],
             "colors": [0.8, 0.1, 0.1],
         }

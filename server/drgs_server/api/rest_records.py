@@ -90,6 +90,9 @@ class CaptureLook(_Body):
     box_high: Triple | None
     box_origin: Literal["masks", "cameras"] | None
     """Whether the box is what all masks allow, or a guess by what all cameras see."""
+    outermost: list[float] = []
+    """Three numbers for each place that tells how far the object reaches in a turned world: boxes about them hold the hull of the masks. None where
+    the box is a guess; that is as wide in all directions."""
     points: list[float]
     """Three numbers for each point on or about the object [world units]; 3000 points at most, none where nothing is known of them."""
     colors: list[float]

@@ -101,6 +101,12 @@ export interface Box {
   falloff?: number;
 }
 
+/** A box with sides along the axes, by two opposite corners [world units]. */
+export interface BoxCorners {
+  low: [number, number, number];
+  high: [number, number, number];
+}
+
 /** An edit that applies no longer, for example since its file is gone: it is skipped, and taken out like any other. */
 export interface BrokenEdit {
   /** Its place in `edits`, from 0. */
@@ -129,6 +135,11 @@ export interface BuildRequest {
   light?: "auto" | "object" | "camera";
   /** Direction of the capture's world that points up; the asset's world is turned so that it is z. Not of multipart bodies. */
   up?: [number, number, number];
+  /**
+   * Of the asset's world, which is the capture's turned by `up`: what lies outside is not built. Absent: all of the object is. Not of multipart
+   * bodies.
+   */
+  box?: BoxCorners | null;
   seed?: number;
 }
 
@@ -215,6 +226,11 @@ export interface CaptureLook {
   box_high: [number, number, number] | null;
   /** Whether the box is what all masks allow, or a guess by what all cameras see. */
   box_origin: "masks" | "cameras" | null;
+  /**
+   * Three numbers for each place that tells how far the object reaches in a turned world: boxes about them hold the hull of the masks. None where
+   * the box is a guess; that is as wide in all directions.
+   */
+  outermost?: number[];
   /** Three numbers for each point on or about the object [world units]; 3000 points at most, none where nothing is known of them. */
   points: number[];
   /** Three for each point, sRGB 0..1. */

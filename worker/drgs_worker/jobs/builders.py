@@ -16,6 +16,8 @@ from drgs_worker.jobs.capture_report import examine_capture
 from drgs_worker.jobs.progress import JobStopped, Tell
 from drgs_worker.jobs.requests import LightName
 
+Corner = tuple[float, float, float]
+
 DEFAULT_BUILDER = "drgs_worker.jobs.builders:build_with_drgs"
 BUILDER_VARIABLE = "DRGS_BUILDER"
 """Environment variable `module:function`."""
@@ -38,6 +40,8 @@ class BuildRequest:
     light: LightName = "auto"
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Of the capture's world."""
+    box: tuple[Corner, Corner] | None = None
+    """Low and high corner in the asset's world; None: all of the object is built."""
 
 
 Builder = Callable[[BuildRequest, Tell, Callable[[], bool]], Iterator[str]]
@@ -60,6 +64,7 @@ def find_builder() -> Builder:
 def build_with_drgs(request: BuildRequest, tell: Tell, should_stop: Callable[[], bool]) -> Iterator[str]:
     """drgs.evaluate.doctor's report, then drgs.reconstruct.build_asset.build_stages, resumed from its checkpoints where there are some."""
     from drgs.reconstruct import build_asset as build
+    from drgs.reconstruct.capture.build_box import BuildBox
 
     settings = build.BuildSettings(
         request.preset,
@@ -69,6 +74,7 @@ def build_with_drgs(request: BuildRequest, tell: Tell, should_stop: Callable[[],
         resume=True,
         light=request.light,
         up=request.up,
+        box=None if request.box is None else BuildBox(*request.box),
         materials=request.materials,
     )
 

@@ -75,6 +75,19 @@ class _Job(_Request):
     limits: JobLimits = JobLimits()
 
 
+class BoxCorners(_Request):
+    """A box with sides along the axes, by two opposite corners [world units]."""
+
+    low: Triple
+    high: Triple
+
+    @model_validator(mode="after")
+    def _spans_a_box(self) -> "BoxCorners":
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"box: expected each number of low below that of high; found {self.low} and {self.high}")
+        return self
+
+
 class BuildRequest(_Job):
     """A build of a capture that the server can already see. A zip may be uploaded as multipart instead, with the same fields."""
 
@@ -89,6 +102,9 @@ class BuildRequest(_Job):
     """What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."""
     up: Triple = (0.0, 0.0, 1.0)
     """Direction of the capture's world that points up; the asset's world is turned so that it is z. Not of multipart bodies."""
+    box: BoxCorners | None = None
+    """Of the asset's world, which is the capture's turned by `up`: what lies outside is not built. Absent: all of the object is. Not of multipart
+    bodies."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
 
     @model_validator(mode="after")

@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
 from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
@@ -44,6 +45,8 @@ class MoveSettings:
     """Share by which normals return to the surface's own afterwards."""
     share_rays: int = 48
     """A vertex, for the irradiance that arrives there."""
+    box: BuildBox | None = None
+    """Of the build, which the surface does not leave."""
 
 
 class MovingSurface:
@@ -77,6 +80,7 @@ class MovingSurface:
             # Of metal mirrors say where it lies.
             homes = Homes(homeward, (-parameters["metal"]).clamp(0, 1))
             moved = integrate_normals(vertices, self.faces, normals, self.edges, residuals, settings.integration, homes)
+            moved = whole_or_within(settings.box, moved)
             homeward += vertices - moved
             vertices.copy_(moved)
             self.tracer = self._tracer()

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from drgs.reconstruct.progress import POSED, STAGE_SHARES
-from drgs_worker.jobs.builders import BuildRequest
+from drgs_worker.jobs.builders import BuildRequest, Corner
 from drgs_worker.jobs.requests import LightName
 from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
@@ -30,6 +30,7 @@ class BuildRun(AbstractJobRun):
         self._light: LightName = job.parameters.get("light", "auto")
         x, y, z = job.parameters.get("up", (0.0, 0.0, 1.0))
         self._up: tuple[float, float, float] = (x, y, z)
+        self._box = _corners(job.parameters.get("box"))
         self.steps: tuple[str, ...] = (*STAGE_SHARES[self._binding], "register")
 
     def run(self, step: str) -> None:
@@ -55,7 +56,15 @@ class BuildRun(AbstractJobRun):
         given = job.parameters
         out = job.folder / "asset"
         return BuildRequest(
-            job.dataset, out, given["preset"], given["seed"], job.device, binding=self._binding, light=self._light, up=self._up
+            job.dataset,
+            out,
+            given["preset"],
+            given["seed"],
+            job.device,
+            binding=self._binding,
+            light=self._light,
+            up=self._up,
+            box=self._box,
         )
 
     def _register(self) -> None:
@@ -110,4 +119,12 @@ class RedecoupleRun(BuildRun):
         assert job.dataset is not None
         out = job.folder / "asset"
         preset, seed = given["built_preset"], given["built_seed"]
-        return BuildRequest(job.dataset, out, preset, seed, job.device, given["preset"], self._binding, self._light, self._up)
+        return BuildRequest(job.dataset, out, preset, seed, job.device, given["preset"], self._binding, self._light, self._up, self._box)
+
+
+def _corners(box: dict[str, list[float]] | None) -> tuple[Corner, Corner] | None:
+    """Of a request's box as the job's row keeps it."""
+    if box is None:
+        return None
+    (a, b, c), (d, e, f) = box["low"], box["high"]
+    return (a, b, c), (d, e, f)
