@@ -80,6 +80,63 @@ def look(viewer: Viewer, shown: Locator, folder: Path, name: str, size: tuple[in
     return faults
 
 
+def parameters_of(viewer: Viewer, name: str) -> dict:
+    """What was asked of the one job of that name."""
+    with sqlite3.connect(viewer.server.data / "app.sqlite") as database:
+        ((parameters,),) = database.execute("SELECT parameters FROM jobs WHERE name = ?", (name,)).fetchall()
+    return json.loads(parameters)
+
+
+def numbers(shown: Locator, label: str) -> list[float]:
+    return [float(shown.get_by_role("spinbutton", name=f"{label} {axis}").input_value()) for axis in "xyz"]
+
+
+def drag(viewer: Viewer, grip: Locator, right: float, down: float) -> None:
+    grip.hover()  # once it stands still, and if nothing lies over it
+    place = grip.bounding_box()
+    assert place is not None
+    x, y = place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
+    viewer.page.mouse.down()
+    viewer.page.mouse.move(x + right, y + down, steps=4)
+    viewer.page.mouse.up()
+
+
+def move_sides(viewer: Viewer, shown: Locator, folder: Path) -> tuple[list[float], list[float]]:
+    """By mouse, by keys and by numbers, and back to the found ones; the box that is left."""
+    low, high = numbers(shown, "Box from"), numbers(shown, "Box to")
+    back, top = shown.get_by_role("button", name="As found"), shown.get_by_role("slider", name="Side +z of the box")
+    expect(back).to_be_disabled()
+    drag(viewer, top, 0, 25)
+    wait_until(lambda: numbers(shown, "Box to")[2] < high[2] - 0.05, "a lower top")
+    assert numbers(shown, "Box to")[:2] == high[:2] and numbers(shown, "Box from") == low
+    lowered = numbers(shown, "Box to")[2]
+    top.press("Shift+ArrowUp")
+    wait_until(lambda: numbers(shown, "Box to")[2] > lowered + 0.05, "a higher top")
+    viewer.page.screenshot(path=folder / "capture-box.png")
+    back.click()
+    wait_until(lambda: numbers(shown, "Box to") == high, "the box as it was found")
+    shown.get_by_role("spinbutton", name="Box from z").fill("9")
+    shown.get_by_role("spinbutton", name="Box from z").press("Enter")
+    wait_until(lambda: high[2] - 0.1 < numbers(shown, "Box from")[2] < high[2], "a bottom just below the top")
+    shown.get_by_role("spinbutton", name="Box from z").fill(str(round((low[2] + high[2]) / 2, 3)))
+    shown.get_by_role("spinbutton", name="Box from z").press("Enter")
+    expect(back).to_be_enabled()
+    return numbers(shown, "Box from"), numbers(shown, "Box to")
+
+
+def turn_up(viewer: Viewer, shown: Locator) -> None:
+    """By mouse and by keys, and back to what was proposed."""
+    proposed = numbers(shown, "Direction")
+    auto, arrow = shown.get_by_role("button", name="Auto"), shown.get_by_role("slider", name="Direction that points up")
+    expect(auto).to_be_disabled()
+    for turn in (lambda: drag(viewer, arrow, 60, 10), lambda: arrow.press("Shift+ArrowLeft")):
+        turn()
+        wait_until(lambda: np.linalg.norm(np.subtract(numbers(shown, "Direction"), proposed)) > 0.1, "another up")
+        assert np.linalg.norm(numbers(shown, "Direction")) == pytest.approx(1, abs=2e-3)
+        auto.click()
+        wait_until(lambda: numbers(shown, "Direction") == proposed, "up as it was proposed")
+
+
 def test_loose_pictures_are_one_capture(viewer: Viewer) -> None:
     pictures = {f"IMG_{number}.JPG": jpeg(number) for number in range(5)}
     viewer.page.evaluate(DROP, [[name, base64.b64encode(data).decode()] for name, data in pictures.items()])
@@ -140,15 +197,19 @@ def test_a_dropped_folder_is_shown_with_its_cameras_and_its_pictures_before_a_bu
     viewer.page.mouse.up()
     wait_until(lambda: cameras.screenshot() != before, "another view of the cameras")
     faults += look(viewer, shown, folder, "capture-phone", PHONE)
-    viewer.page.set_viewport_size({"width": 760, "height": 420})
     assert faults == []
+    viewer.page.set_viewport_size(dict(zip(("width", "height"), LAPTOP, strict=True)))
+    low, high = move_sides(viewer, shown, folder)
     shown.get_by_role("radio", name="Draft").check()
+    viewer.page.set_viewport_size({"width": 760, "height": 420})
     shown.get_by_role("button", name="Build").click()
     expect(shown).to_be_hidden()
     card = viewer.page.get_by_role("listitem", name="Build Teal mug")
     expect(card).to_be_visible()
     (job,) = viewer.server.ask("/api/jobs")["jobs"]
     assert (job["name"], job["preset"]) == ("Teal mug", "draft") and captures(viewer, "Teal mug")[0]["jobs"] == [job["id"]]
+    box = parameters_of(viewer, "Teal mug")["box"]
+    assert (box["low"], box["high"]) == (pytest.approx(low, abs=0.01), pytest.approx(high, abs=0.01)), "what was seen is what is built"
     card.get_by_role("button", name="Cancel").click()
     card.get_by_role("button", name="Remove").click()
     expect(card).to_have_count(0)
@@ -173,6 +234,7 @@ def test_a_capture_that_lies_on_its_side_is_shown_upright_and_built_so(viewer: V
     expect(shown.get_by_role("radio", name="As held")).to_be_checked()
     expect(shown.get_by_text("far from how the camera was held")).to_be_visible()
     assert look(viewer, shown, folder, "capture-held", LAPTOP) == []
+    turn_up(viewer, shown)
     shown.get_by_role("spinbutton", name="Direction x").fill("0.25")
     shown.get_by_role("spinbutton", name="Direction x").press("Enter")
     expect(shown).to_be_visible()
@@ -181,9 +243,9 @@ def test_a_capture_that_lies_on_its_side_is_shown_upright_and_built_so(viewer: V
     expect(shown).to_be_hidden()
     card = viewer.page.get_by_role("listitem", name="Build Vase")
     card.get_by_role("button", name="Cancel").click()
-    with sqlite3.connect(viewer.server.data / "app.sqlite") as database:
-        ((parameters,),) = database.execute("SELECT parameters FROM jobs WHERE name = 'Vase'").fetchall()
-    x, y, z = json.loads(parameters)["up"]
+    parameters = parameters_of(viewer, "Vase")
+    x, y, z = parameters["up"]
     assert x == 0.25 and y > 0.9 and abs(z) < 0.3
+    assert "box" not in parameters, "nobody moved it"
     card.get_by_role("button", name="Remove").click()
     viewer.page.get_by_role("button", name="Remove Vase").click()

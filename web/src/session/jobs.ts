@@ -5,7 +5,7 @@ import * as api from './api';
 import { refreshAssets, refreshEnvironments } from './library';
 import { attempt, notify } from './notices';
 import { preference } from './preferences';
-import type { BuildRequest, CaptureInfo, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
+import type { BoxCorners, BuildRequest, CaptureInfo, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
 import { openAsset, session } from './session';
 import type { Vec3 } from './view';
 
@@ -96,8 +96,8 @@ async function follow(started: Promise<JobInfo>): Promise<JobInfo | null> {
 export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding' | 'light'>>;
 
 export const buildSample = (choice: BuildChoice) => follow(api.startJob({ dataset: 'sample', ...choice }));
-/** `up`: direction of the capture's world that points up. */
-export const buildCapture = (capture: CaptureInfo, choice: BuildChoice, up: Vec3) => follow(api.startJob({ dataset: `capture:${capture.id}`, ...choice, up }));
+/** `up`: direction of the capture's world that points up. `box`: of the world that is turned so; null: all of the object. */
+export const buildCapture = (capture: CaptureInfo, choice: BuildChoice, up: Vec3, box: BoxCorners | null) => follow(api.startJob({ dataset: `capture:${capture.id}`, ...choice, up, box }));
 /** What to call a job on an asset. Those of earlier versions may have slashes in their names, which names no longer have. */
 export const jobName = (asset: string, what: string) => `${asset.replaceAll(/[/\\]/g, '-').slice(0, 100 - what.length - 2)}, ${what}`;
 /** A job that makes no asset. */

@@ -1,17 +1,17 @@
 /** A capture before its build: where its pictures were taken from, what the doctor says, all pictures with their masks, and how it is to be built. */
 
-import { useEffect, useRef, useState } from 'preact/hooks';
+import { useEffect, useMemo, useRef, useState } from 'preact/hooks';
+import { foundBox, SIDES, stepOf, valueOf, withSide } from '../../capture/build_box';
 import * as api from '../../session/api';
 import { capture, captureLook, captureTrouble, closeCapture, refreshCaptures } from '../../session/captures';
 import { buildCapture } from '../../session/jobs';
 import { attempt } from '../../session/notices';
-import type { CaptureInfo, CaptureLook } from '../../session/protocol.gen';
+import type { BoxCorners, CaptureInfo, CaptureLook } from '../../session/protocol.gen';
 import type { Vec3 } from '../../session/view';
-import type { CapturePicture } from '../../stage/capture_picture';
 import { Choice, PlaceField } from '../fields';
 import { Icon } from '../icons';
-import { theme } from '../layout';
 import { build, BuildChoices } from './BuildChoices';
+import { CaptureView } from './CaptureView';
 import { Findings } from './Findings';
 
 const UPRIGHT: Vec3 = [0, 0, 1];
@@ -39,15 +39,23 @@ export function CaptureDialog() {
 }
 
 function Look({ info, look, trouble }: { info: CaptureInfo; look: CaptureLook | null; trouble: string | null }) {
-  const [chosen, setUp] = useState<Vec3 | null>(null);
-  const up = chosen ?? likelyUp(look);
+  const [chosenUp, setUp] = useState<Vec3 | null>(null);
+  const [movedBox, setBox] = useState<BoxCorners | null>(null);
+  const up = chosenUp ?? likelyUp(look);
+  const found = useMemo(() => look && foundBox(look, up), [look, ...up]);
+  const box = movedBox ?? found;
+  const turn = (to: Vec3 | null) => {
+    setUp(to);
+    setBox(null); // its sides lie along the axes of the world as it was turned before
+  };
+  const shape = look?.up && found && box ? { held: look.up, up, isAuto: chosenUp === null, onUp: turn, found, box, isFound: movedBox === null, onBox: setBox } : null;
   return (
     <>
       <div class="capture-top">
-        {look && look.cameras.length > 0 ? <Cameras look={look} up={up} /> : <p class="capture-picture hint">{look ? withoutCameras(look) : (trouble ?? 'The server is looking at the pictures…')}</p>}
+        {look && shape ? <CaptureView look={look} {...shape} /> : <p class="capture-picture hint">{look ? withoutCameras(look) : (trouble ?? 'The server is looking at the pictures…')}</p>}
         <div class="capture-side section">
           {look && <Findings report={look} said={null} open />}
-          <BuildForm info={info} look={look} ok={look?.ok ?? trouble !== null} up={up} onUp={setUp} />
+          <BuildForm info={info} ok={look?.ok ?? trouble !== null} shape={shape} />
         </div>
       </div>
       {look?.has_sheet && (
@@ -75,12 +83,30 @@ function likelyUp(look: CaptureLook | null): Vec3 {
   return held && held[2] < LEAST_UPRIGHT ? held : UPRIGHT;
 }
 
+/** Which way is up, and what is built. Null where there are no cameras yet: then nothing of it can be shown. */
+interface Shape {
+  /** The mean of the cameras' own up. */
+  held: Vec3;
+  up: Vec3;
+  /** Nobody has chosen it. */
+  isAuto: boolean;
+  /** Null: as proposed. */
+  onUp(up: Vec3 | null): void;
+  found: BoxCorners;
+  /** Of the world that is turned so that `up` is z. */
+  box: BoxCorners;
+  /** Nobody has moved it; then a build is told none. */
+  isFound: boolean;
+  /** Null: as found. */
+  onBox(box: BoxCorners | null): void;
+}
+
 /** The choices stand in a form of their own: those of the library are the same, and radio buttons are one group a form. */
-function BuildForm({ info, look, ok, up, onUp }: { info: CaptureInfo; look: CaptureLook | null; ok: boolean; up: Vec3; onUp(up: Vec3): void }) {
+function BuildForm({ info, ok, shape }: { info: CaptureInfo; ok: boolean; shape: Shape | null }) {
   const [busy, setBusy] = useState(false);
   const start = async () => {
     setBusy(true);
-    const job = await buildCapture(info, build.value, up);
+    const job = await buildCapture(info, build.value, shape?.up ?? UPRIGHT, shape && !shape.isFound ? shape.box : null);
     setBusy(false);
     if (!job) return;
     closeCapture();
@@ -100,7 +126,8 @@ function BuildForm({ info, look, ok, up, onUp }: { info: CaptureInfo; look: Capt
         event.target.blur();
       }}
     >
-      {look?.up && <Up held={look.up} up={up} onUp={onUp} />}
+      {shape && <Up {...shape} />}
+      {shape && <Box {...shape} />}
       <BuildChoices />
       <button class="primary" disabled={busy || !ok}>
         Build
@@ -109,7 +136,7 @@ function BuildForm({ info, look, ok, up, onUp }: { info: CaptureInfo; look: Capt
   );
 }
 
-function Up({ held, up, onUp }: { held: Vec3; up: Vec3; onUp(up: Vec3): void }) {
+function Up({ held, up, isAuto, onUp }: Shape) {
   const is = (other: Vec3) => other.every((value, i) => value === up[i]);
   const value = is(UPRIGHT) ? 'file' : is(held) ? 'held' : null;
   return (
@@ -125,40 +152,27 @@ function Up({ held, up, onUp }: { held: Vec3; up: Vec3; onUp(up: Vec3): void }) 
       />
       {held[2] < LEAST_UPRIGHT && <p class="hint">The file’s z is far from how the camera was held, so that is proposed.</p>}
       <PlaceField label="Direction" value={up} step={0.001} onEnter={(entered) => Math.hypot(...entered) > 0 && onUp(entered)} />
+      <button type="button" class="small" disabled={isAuto} title="As it was proposed" onClick={() => onUp(null)}>
+        Auto
+      </button>
     </div>
   );
 }
 
-function Cameras({ look, up }: { look: CaptureLook; up: Vec3 }) {
-  const canvas = useRef<HTMLCanvasElement>(null);
-  const picture = useRef<CapturePicture | null>(null);
-  const [missing, setMissing] = useState(false);
-  useEffect(() => {
-    let gone = false;
-    void import('../../stage/capture_picture').then(({ CapturePicture }) => {
-      if (gone) return;
-      try {
-        picture.current = new CapturePicture(canvas.current!);
-        picture.current.show(look, up);
-      } catch {
-        setMissing(true);
-      }
-    });
-    return () => {
-      gone = true;
-      picture.current?.dispose();
-      picture.current = null;
-    };
-  }, [look]);
-  useEffect(() => picture.current?.show(look, up), [theme.value, up]);
-  if (missing) return <p class="capture-picture hint">This browser offers no WebGL 2, so the cameras cannot be drawn.</p>;
-  const shown = look.cameras.length < look.camera_count ? `${look.cameras.length} of ${look.camera_count}` : String(look.camera_count);
+function Box({ found, box, isFound, onBox }: Shape) {
+  const enter = (high: boolean) => (entered: Vec3) => onBox(SIDES.filter((side) => side.high === high && entered[side.axis] !== shown(high)[side.axis]).reduce((moved, side) => withSide(moved, side, entered[side.axis], found), box));
+  const step = 10 ** Math.floor(Math.log10(stepOf(found)));
+  const shown = (high: boolean) => SIDES.filter((side) => side.high === high).map((side) => valueOf(box, side)) as Vec3;
   return (
-    <figure class="capture-picture">
-      <canvas ref={canvas} role="img" aria-label={`${shown} cameras around the object. Drag to turn it.`} />
-      <figcaption class="hint">
-        {shown} cameras; the box is {look.box_origin === 'masks' ? 'what the masks allow' : 'what all cameras see'}. Drag to turn, scroll to zoom.
-      </figcaption>
-    </figure>
+    <div class="up">
+      <PlaceField label="Box from" value={shown(false)} step={step} onEnter={enter(false)} />
+      <PlaceField label="Box to" value={shown(true)} step={step} onEnter={enter(true)} />
+      <div class="beside">
+        <p class="hint">{isFound ? 'All of the object is built.' : 'What lies outside is not built. Another up takes the box back.'}</p>
+        <button type="button" class="small" disabled={isFound} title="Build all of the object" onClick={() => onBox(null)}>
+          As found
+        </button>
+      </div>
+    </div>
   );
 }
