@@ -45,7 +45,7 @@ from drgs_server.client_stream import ServerError, Stream
 from drgs_server.client_upload import as_zip, send_in_parts, server_error
 from drgs_server.live.messages import EditLog, Settings
 from drgs_server.picture import Picture
-from drgs_worker.jobs.requests import BindingName, ExportRequest, LightName, RedecoupleRequest, RenderRequest, SimulateRequest
+from drgs_worker.jobs.requests import BindingName, ExportRequest, LightName, PoseRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 
 Model = TypeVar("Model", bound=BaseModel)
 Preset = Literal["draft", "fast", "full"]
@@ -138,10 +138,10 @@ class Client:
 
     def submit(
         self,
-        request: RedecoupleRequest | SimulateRequest | RenderRequest | ExportRequest | dict,
+        request: PoseRequest | RedecoupleRequest | SimulateRequest | RenderRequest | ExportRequest | dict,
         idempotency_key: str | None = None,
     ) -> JobInfo:
-        """Start a job on an asset (worker/drgs_worker/jobs/requests.py, or the same as plain data)."""
+        """Start a job on an asset, or find the poses of a capture's photographs (worker/drgs_worker/jobs/requests.py, or the same as plain data)."""
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         body = request if isinstance(request, dict) else request.model_dump(mode="json", exclude_none=True)
         return self._call("POST", "/api/jobs", JobInfo, json=body, headers=headers)

@@ -63,6 +63,7 @@ _FRAME_CONSTANTS = (
 _REQUESTS: tuple[type[BaseModel], ...] = (
     rest_records.CaptureRequest,
     rest_records.BuildRequest,
+    rest_records.PoseRequest,
     rest_records.RedecoupleRequest,
     rest_records.SimulateRequest,
     rest_records.RenderRequest,

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 from conftest import Service
+from sqlalchemy.orm import Session
 from test_rest import is_problem
 
 from drgs_worker.jobs import workflows as jobs
 from drgs_worker.jobs.builders import build_with_drgs
+from drgs_worker.store.database import CaptureRow, now
 
 ASSET = "a" * 32
 RENDER = {"kind": "render", "asset": ASSET}
@@ -25,19 +27,22 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
         {"kind": "simulate", "asset": ASSET, "scene": {"particles": 100}, "name": "fall"},
         RENDER | {"turntable": {"frames": 2}, "video_fps": 10, "priority": 3},
         {"kind": "export", "asset": ASSET, "formats": ["glb", "ply"]},
+        {"kind": "pose", "dataset": "sample", "seed": 7},
     ]
     found = [service.client.post("/api/jobs", json=request) for request in requests]
-    assert [response.status_code for response in found] == [202] * 4, [response.text for response in found]
+    assert [response.status_code for response in found] == [202] * 5, [response.text for response in found]
     infos = [built, *(response.json() for response in found)]
-    assert [info["kind"] for info in infos] == ["build", "redecouple", "simulate", "render", "export"]
-    assert [info["source_asset"] for info in infos] == [None, built["id"], ASSET, ASSET, ASSET]
+    assert [info["kind"] for info in infos] == ["build", "redecouple", "simulate", "render", "export", "pose"]
+    assert [info["source_asset"] for info in infos] == [None, built["id"], ASSET, ASSET, ASSET, None]
     assert service.client.get("/api/jobs").json()["jobs"] == infos[::-1]
     assert (infos[2]["name"], infos[3]["name"], infos[3]["priority"]) == ("fall", "ball", 3)
     steps = {info["kind"]: jobs._RUNS[info["kind"]](jobs._job_context(info["id"])).steps for info in infos}
     assert steps["build"] == ("read", "fit", "mesh", "surface", "materials", "pack", "register")
     assert steps["redecouple"] == ("copy", *steps["build"])
     assert (steps["simulate"], steps["export"]) == (("simulate",), ("export glb", "export ply"))
-    assert steps["render"] == ("render asset ",)
+    assert (steps["render"], steps["pose"]) == (("render asset ",), ("pose", "register"))
+    posing = jobs._job_context(infos[5]["id"])
+    assert (posing.dataset, posing.parameters["seed"]) == (service.settings.sample_capture.resolve(), 7)
     box = {"low": [-1, -1, 0], "high": [1, 1, 2]}
     meshed = service.client.post("/api/jobs", json={"dataset": "sample", "binding": "mesh", "box": box}).json()
     service.add_asset(meshed["id"], "meshed")
@@ -70,6 +75,8 @@ VIEW = {"eye": [0, -3, 1], "target": [0, 0, 0]}
         ({"dataset": "sample", "box": {"low": [0, 0, 0], "high": [1, 0, 1]}}, 422, "below that of high"),
         ({"dataset": "sample", "box": [0, 0, 0, 1, 1, 1]}, 422, "box"),
         ({"dataset": "capture:" + "0" * 32}, 404, "No capture"),
+        ({"kind": "pose", "dataset": "capture:" + "0" * 32}, 404, "No capture"),
+        ({"kind": "pose", "dataset": "/etc"}, 403, "not below one"),
         ({"dataset": "capture:../token"}, 404, "No capture"),
         ({"kind": "simulate", "asset": ASSET, "scene": {"gravity": "much"}}, 422, "gravity"),
         ({"kind": "export", "asset": ASSET, "formats": ["glb", "glb"]}, 422, "once"),
@@ -131,3 +138,22 @@ def test_a_render_refuses_cameras_that_are_not_rigid(matrix: list, service: Serv
     query = ",".join(str(number) for row in matrix for number in row)
     session = service.client.post("/api/sessions", json={"asset": ASSET}).json()["id"]
     assert service.client.get(f"/api/sessions/{session}/frame.jpg", params={"world_from_camera": query}).status_code == 422
+
+
+def test_a_capture_that_a_job_made_outlives_the_job(service: Service) -> None:
+    job = service.client.post("/api/jobs", json={"kind": "pose", "dataset": "sample"}).json()
+    assert job["capture_id"] is None, "not before it is done"
+    place = service.context.directory.uploads / job["id"]
+    place.mkdir()
+    (place / "transforms.json").write_text("{}")
+    with Session(service.context.engine) as session, session.begin():
+        session.add(CaptureRow(id=job["id"], name="Sample, posed", created_at=now(), folder=job["id"]))
+    service.client.post(f"/api/jobs/{job['id']}/cancel")
+    assert service.client.delete(f"/api/jobs/{job['id']}").status_code == 204
+    assert service.client.get(f"/api/captures/{job['id']}").json()["name"] == "Sample, posed" and place.is_dir()
+    # Of one whose capture came with it nothing stays.
+    other = service.client.post("/api/jobs", json={"dataset": "sample"}).json()
+    (service.context.directory.uploads / other["id"]).mkdir()
+    service.client.post(f"/api/jobs/{other['id']}/cancel")
+    service.client.delete(f"/api/jobs/{other['id']}")
+    assert not (service.context.directory.uploads / other["id"]).exists()

@@ -1,4 +1,5 @@
-"""The whole way of a newcomer: drop a capture, look at it, watch it built, change a part, the light and the shape, take all back, carry files away.
+"""The whole way of a newcomer: drop a capture, look at it, watch it built, change a part, the light and the shape, take all back, carry files away; then
+drop plain photographs, whose poses are found first, and build what of them lies in a box.
 
 A real worker process builds the sample's photographs, fewer and smaller ones, in `short_builder`'s few iterations. The tests run in this
 order on one page; each looks at the pixels of the canvas and at what the server says.
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,14 +23,17 @@ from playwright.sync_api import Browser, Download, Locator, expect
 from scipy import ndimage
 
 from tests.patience import PATIENCE_SECONDS
+from tests.reconstruct.pose.textured_scene import orbit, write_photographs
 from tests.web.browser import ROOT, RunningServer
 from tests.web.conftest import Viewer, patient_page, wait_until
+from tests.web.test_dropped_photos import drop_folder, numbers
 
 CAPTURE = ROOT / "examples" / "sample_capture"
 VIEW_STEP, SIDE = 2, 96
 """Every second view, at this many pixels a side: with half as many, the object's outline is lost."""
 BUILD_SECONDS = 900
 """Some twenty on two idle cores; others may use them, too."""
+EGG_VIEWS = 14
 SAMPLES = 64
 NOISE = 3.0
 """Mean over the object of the difference between two pictures of the same thing, sRGB 0..255, stays below this."""
@@ -278,6 +283,42 @@ def test_the_picture_is_exported_as_a_png(path: Viewer, first: np.ndarray) -> No
     assert overlap(pixels, first) > 0.98, "what is saved is what is on the canvas"
     assert change(first, pixels, silhouette(first) & silhouette(pixels)) < 3 * NOISE, "in the same colours; it has fewer samples"
     assert path.edits() == [], "saving is no edit"
+
+
+def test_a_folder_of_plain_photographs_is_posed_seen_cut_and_built(path: Viewer, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    drop_folder(path, write_photographs(tmp_path / "Egg", orbit(EGG_VIEWS), masks=True))
+    plain = path.page.get_by_role("dialog", name="Egg", exact=True)
+    expect(plain.get_by_text("is not known yet")).to_be_visible()
+    find, bar = plain.get_by_role("button", name="Find poses"), plain.get_by_role("progressbar", name="Search for the poses of Egg")
+    find.click()
+    expect(bar).to_be_visible()
+    expect(plain.get_by_role("button", name="Build")).to_be_disabled()
+    path.page.screenshot(path=tmp_path / "poses-searched.png")
+    plain.get_by_role("button", name="Cancel").click()
+    find.click()
+    expect(bar).to_be_visible()
+    posed = path.page.get_by_role("dialog", name="Egg, posed")
+    expect(posed).to_be_visible(timeout=BUILD_SECONDS * 1000)
+    expect(posed.get_by_role("img", name=f"{EGG_VIEWS} cameras around the object")).to_have_attribute("data-cameras", str(EGG_VIEWS))
+    expect(posed.get_by_text(f"{EGG_VIEWS} of {EGG_VIEWS} pictures found their place")).to_be_visible()
+    searches = [job["state"] for job in path.server.ask("/api/jobs")["jobs"] if job["kind"] == "pose"]
+    assert searches == ["done", "cancelled"]
+    low, high = numbers(posed, "Box from"), numbers(posed, "Box to")
+    cut = low[2] + (high[2] - low[2]) / 4
+    posed.get_by_role("spinbutton", name="Box from z").fill(f"{cut:.3f}")
+    posed.get_by_role("spinbutton", name="Box from z").press("Enter")
+    expect(posed.get_by_text("What lies outside is not built")).to_be_visible()
+    path.page.screenshot(path=tmp_path / "poses-found.png")
+    posed.get_by_role("radio", name="Draft").check()
+    posed.get_by_role("button", name="Build").click()
+    expect(posed).to_be_hidden()
+    expect(path.page.get_by_role("heading", name="Egg, posed", exact=True)).to_be_visible(timeout=BUILD_SECONDS * 1000)
+    path.settle()
+    path.page.screenshot(path=tmp_path / "egg.png")
+    heights = stored_mesh(path).vertices[:, 1]  # glTF's y is up
+    assert heights.min() == pytest.approx(cut, abs=0.02) and heights.min() >= round(cut, 3) - 1e-4, "its bottom is cut off"
+    assert heights.max() == pytest.approx(high[2], abs=0.1 * (high[2] - low[2]))
 
 
 def test_the_page_logged_no_errors(path: Viewer) -> None:

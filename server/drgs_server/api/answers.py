@@ -49,6 +49,7 @@ def job_info(row: JobRow | Row, status: JobStatus) -> JobInfo:
         attempts=row.attempts,
         asset_id=row.asset_id if status.state == "done" else None,
         source_asset=row.source_asset,
+        capture_id=row.id if row.kind == "pose" and status.state == "done" else None,
         clip=f"clips/{row.id}" if row.kind == "simulate" and status.state == "done" else None,
         error=error if status.state == "failed" else None,
         capture=CaptureReport.model_validate(row.capture_report) if row.capture_report is not None else None,

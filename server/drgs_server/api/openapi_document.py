@@ -31,6 +31,7 @@ _JOB: dict[str, Any] = {
     "message": "",
     "attempts": 1,
     "asset_id": None,
+    "capture_id": None,
     "source_asset": None,
     "clip": None,
     "error": None,

@@ -13,13 +13,14 @@ from drgs_worker.jobs.requests import (
     BuildRequest,
     ExportRequest,
     JobKind,
+    PoseRequest,
     RedecoupleRequest,
     RenderRequest,
     SimulateRequest,
 )
 from drgs_worker.store.user_names import PlainText, UserName
 
-__all__ = ["BuildRequest", "ExportRequest", "RedecoupleRequest", "RenderRequest", "SimulateRequest"]
+__all__ = ["BuildRequest", "ExportRequest", "PoseRequest", "RedecoupleRequest", "RenderRequest", "SimulateRequest"]
 
 JobState = Literal["queued", "running", "stalled", "done", "failed", "cancelled", "unknown"]
 """stalled: its worker died and no other took it over yet. unknown: the queue has never heard of it, which is not done."""
@@ -42,7 +43,7 @@ class CaptureInfo(_Body):
     name: str
     created_at: datetime
     jobs: list[str]
-    """Ids of builds, and of re-decouplings of what they made, that read it. Without any, it is removed a day after it came."""
+    """Ids of builds, of re-decouplings of what they made, and of searches for poses, that read it. Without any, it is removed a day after it came."""
 
 
 class CaptureList(_Body):
@@ -123,14 +124,16 @@ class JobInfo(_Body):
     """How often the work was started: 1 unless a worker died or it was retried."""
     asset_id: str | None
     """What a build or a re-decoupling made; set when done."""
+    capture_id: str | None
+    """The capture that a `pose` made; set when done."""
     source_asset: str | None
-    """What a job of another kind than `build` works on."""
+    """What a job of another kind than `build` and `pose` works on."""
     clip: str | None
     """What a `pose` edit names to show a simulation; set when done."""
     error: str | None
     """A sentence, when failed."""
     capture: CaptureReport | None
-    """What `drgs doctor` finds in the capture of a build; there soon after it began."""
+    """What `drgs doctor` finds in the capture of a build; there soon after it began. Of a `pose`, which pictures found no place."""
     preview_version: int
     """Rises with each new preview picture; 0 while there is none. Use it to get round the browser's cache."""
 

@@ -20,7 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from drgs_server.api.answers import JOB_LIST_COLUMNS, job_info, job_infos
 from drgs_server.api.context import ServerContext, context_of
 from drgs_server.api.problems import ProblemError
-from drgs_server.api.rest_records import BuildRequest, JobFile, JobFileList, JobInfo, JobList
+from drgs_server.api.rest_records import BuildRequest, JobFile, JobFileList, JobInfo, JobList, PoseRequest
 from drgs_server.api.routes_captures import CAPTURE_PREFIX, folder_of_capture
 from drgs_server.api.uploads import receive_upload
 from drgs_server.api.zip_guard import single_folder, unpack_zip
@@ -28,7 +28,7 @@ from drgs_worker.jobs.queue import JobNotInState, is_alive
 from drgs_worker.jobs.requests import JOB_REQUESTS, OWN_LIGHT, JobRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 from drgs_worker.store.artifact_store import StoreAway
 from drgs_worker.store.artifacts import has_clip, refresh_job, share_artifact, unshare_artifact
-from drgs_worker.store.database import AssetRow, JobRow, now
+from drgs_worker.store.database import AssetRow, CaptureRow, JobRow, now
 from drgs_worker.store.user_names import name_from_file
 
 router = APIRouter(prefix="/api/jobs", tags=["jobs"])
@@ -39,6 +39,7 @@ IdempotencyKey = Annotated[str | None, Header(max_length=200)]
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,250}")
 _EXAMPLES: dict[str, dict] = {
     "build": {"kind": "build", "dataset": "sample", "preset": "draft"},
+    "pose": {"kind": "pose", "dataset": f"{CAPTURE_PREFIX}{'0' * 32}"},
     "redecouple": {"kind": "redecouple", "asset": "0" * 32, "preset": "full"},
     "simulate": {"kind": "simulate", "asset": "0" * 32, "scene": {"matter": {"preset": "jelly"}, "duration": 2}},
     "render": {
@@ -96,8 +97,8 @@ _BODY: dict[str, Any] = {
 
 @router.post("", status_code=202, openapi_extra=_BODY)
 async def start_job(request: Request, context: Context, idempotency_key: IdempotencyKey = None) -> JobInfo:
-    """Build an asset from a capture (an uploaded one, a zip as multipart, the bundled sample, or a folder below an allowed root); re-decouple,
-    simulate, render or export one. Without `kind` it is a build. The same Idempotency-Key gives the same job, whatever else the request says."""
+    """Build an asset from a capture (an uploaded one, a zip as multipart, the bundled sample, or a folder below an allowed root), or find the poses of
+    its photographs; re-decouple, simulate, render or export an asset. Without `kind` it is a build. The same Idempotency-Key gives the same job, whatever else the request says."""
     known = await run_in_threadpool(_job_of_key, context, idempotency_key)
     if known is not None:
         return await run_in_threadpool(_read_job, context, known)
@@ -134,9 +135,12 @@ def _parse_request(body: bytes) -> JobRequest:
         raise _invalid(error) from error
 
 
-def _build_row(job_id: str, asked: BuildRequest, folder: Path) -> JobRow:
+def _build_row(job_id: str, asked: BuildRequest | PoseRequest, folder: Path) -> JobRow:
+    """Of a job that reads a capture."""
     row = _plain_row(job_id, asked, asked.name or (name_from_file(folder.name, "Capture") if asked.dataset != "sample" else "Sample"))
-    row.dataset, row.preset, row.seed = str(folder), asked.preset, asked.seed
+    row.dataset, row.seed = str(folder), asked.seed
+    if isinstance(asked, BuildRequest):
+        row.preset = asked.preset
     return row
 
 
@@ -157,7 +161,7 @@ def _plain_row(job_id: str, asked: JobRequest, name: str) -> JobRow:
 
 def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
     """The job of a request that was not an upload, with all that it names looked up."""
-    if isinstance(asked, BuildRequest):
+    if isinstance(asked, BuildRequest | PoseRequest):
         if asked.dataset.startswith(CAPTURE_PREFIX):
             folder, name = folder_of_capture(context, asked.dataset.removeprefix(CAPTURE_PREFIX))
             return _build_row(job_id, asked.model_copy(update={"name": asked.name or name}), folder)
@@ -328,17 +332,20 @@ def _media_type(name: str) -> str:
 
 @router.delete("/{job_id}", status_code=204)
 def delete_job(job_id: str, context: Context) -> None:
-    """Forgets a job that is over, with its files, clip, checkpoint and the capture that came with it; an asset that it made stays."""
+    """Forgets a job that is over, with its files, clip, checkpoint and the capture that came with it; an asset or a capture that it made stays."""
     row = _read_row(context, job_id)
     state = context.queue.statuses([job_id])[job_id].state
     if state not in ("done", "failed", "cancelled", "unknown"):
         raise ProblemError(409, f"This job is {state}; cancel it first.")
     _check_unused(context, row)
-    for kind in ("jobs", "clips", "captures"):
+    with Session(context.engine) as session:
+        made_capture = session.get(CaptureRow, row.id) is not None
+    for kind in ("jobs", "clips", *(() if made_capture else ("captures",))):
         unshare_artifact(context.directory, kind, row.id)
     with Session(context.engine) as session, session.begin():
         session.execute(delete(JobRow).where(JobRow.id == row.id))
-    for folder in (context.directory.job(row.id), context.directory.clip(row.id), context.directory.uploads / row.id):
+    capture = () if made_capture else (context.directory.uploads / row.id,)
+    for folder in (context.directory.job(row.id), context.directory.clip(row.id), *capture):
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -1,7 +1,7 @@
 /** The REST calls of the viewer, each once. Every failure is an ApiError whose message is a sentence for the user. */
 
 import { STILL_BOUNCES, type DownloadFormat } from './constants.gen';
-import type { AssetInfo, AssetList, BuildRequest, CaptureInfo, CaptureList, CaptureLook, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest, TrainingViewList, WeightsInfo } from './protocol.gen';
+import type { AssetInfo, AssetList, BuildRequest, CaptureInfo, CaptureList, CaptureLook, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, PoseRequest, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest, TrainingViewList, WeightsInfo } from './protocol.gen';
 import type { View } from './view';
 
 export class ApiError extends Error {
@@ -104,6 +104,7 @@ export function uploadEnvironment(file: File, onProgress?: (share: number) => vo
 
 export const makeCapture = (upload: string) => call<CaptureInfo>('POST', '/api/captures', { upload });
 export const listCaptures = () => call<CaptureList>('GET', '/api/captures');
+export const readCapture = (id: string) => call<CaptureInfo>('GET', `/api/captures/${part(id)}`);
 export const deleteCapture = (id: string) => call<void>('DELETE', `/api/captures/${part(id)}`);
 /** Takes seconds to minutes when it is asked for the first time. */
 export const lookAtCapture = (id: string) => call<CaptureLook>('GET', `/api/captures/${part(id)}/look`);
@@ -150,7 +151,7 @@ export async function sendPart(address: string, offset: number, bytes: Blob, onS
 }
 
 export const listJobs = () => call<JobList>('GET', '/api/jobs');
-export const startJob = (request: BuildRequest | RenderRequest | SimulateRequest) => call<JobInfo>('POST', '/api/jobs', request);
+export const startJob = (request: BuildRequest | PoseRequest | RenderRequest | SimulateRequest) => call<JobInfo>('POST', '/api/jobs', request);
 export const cancelJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/cancel`);
 export const resumeJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/resume`);
 export const retryJob = (id: string) => call<JobInfo>('POST', `/api/jobs/${part(id)}/retry`);

@@ -2,6 +2,7 @@
 
 import { signal } from '@preact/signals';
 import * as api from './api';
+import { capture, openCapture, refreshCaptures } from './captures';
 import { refreshAssets, refreshEnvironments } from './library';
 import { attempt, notify } from './notices';
 import { preference } from './preferences';
@@ -21,6 +22,16 @@ export const workersAlive = signal(1);
 export const psnrCurves = preference<Record<string, [number, number][]>>('psnr', {});
 
 export const isActive = (job: JobInfo) => job.state === 'queued' || job.state === 'running' || job.state === 'stalled';
+
+export const STATE_TEXT: Record<JobInfo['state'], string> = {
+  queued: 'Waiting for a worker',
+  running: 'Running',
+  stalled: 'Its worker stopped; another will take it over',
+  done: 'Done',
+  failed: 'Failed',
+  cancelled: 'Cancelled',
+  unknown: 'Lost: the queue no longer knows it',
+};
 
 /** Builds started from this page open their asset when it is ready. */
 const toOpen = new Set<string>();
@@ -55,11 +66,19 @@ function recordPsnr(list: JobInfo[]): void {
 }
 
 async function finished(job: JobInfo): Promise<void> {
+  if (job.capture_id) return posed(job, job.capture_id);
   if (!job.asset_id) return notify(job.kind === 'simulate' ? `“${job.name}” is simulated: play it under Shape.` : `“${job.name}” is done: its files are in the list.`, 'info');
   await refreshAssets();
   const wanted = toOpen.delete(job.id);
   if (job.asset_id && (wanted || !session.value)) await openAsset(job.asset_id);
   else notify(`“${job.name}” is built: find it under Assets.`, 'info');
+}
+
+/** Whoever looks at the photographs is shown the capture that has their poses. */
+async function posed(job: JobInfo, made: string): Promise<void> {
+  await refreshCaptures();
+  if (capture.value?.jobs.includes(job.id)) void openCapture(await api.readCapture(made));
+  else notify(`The poses of “${job.name}” are found: look at them under Captures.`, 'info');
 }
 
 /** Ask for jobs for as long as the page lives: often while one runs, seldom otherwise, not at all while hidden. */
@@ -98,6 +117,12 @@ export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding' | 'li
 export const buildSample = (choice: BuildChoice) => follow(api.startJob({ dataset: 'sample', ...choice }));
 /** `up`: direction of the capture's world that points up. `box`: of the world that is turned so; null: all of the object. */
 export const buildCapture = (capture: CaptureInfo, choice: BuildChoice, up: Vec3, box: BoxCorners | null) => follow(api.startJob({ dataset: `capture:${capture.id}`, ...choice, up, box }));
+/** Look for the poses of a capture's photographs; the capture then knows of the job. */
+export async function findPoses(photographs: CaptureInfo): Promise<void> {
+  const job = await follow(api.startJob({ kind: 'pose', dataset: `capture:${photographs.id}` }));
+  if (job && capture.value?.id === photographs.id) capture.value = await api.readCapture(photographs.id);
+  await attempt(refreshCaptures());
+}
 /** What to call a job on an asset. Those of earlier versions may have slashes in their names, which names no longer have. */
 export const jobName = (asset: string, what: string) => `${asset.replaceAll(/[/\\]/g, '-').slice(0, 100 - what.length - 2)}, ${what}`;
 /** A job that makes no asset. */

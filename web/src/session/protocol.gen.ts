@@ -196,7 +196,7 @@ export interface CaptureInfo {
   id: string;
   name: string;
   created_at: string;
-  /** Ids of builds, and of re-decouplings of what they made, that read it. Without any, it is removed a day after it came. */
+  /** Ids of builds, of re-decouplings of what they made, and of searches for poses, that read it. Without any, it is removed a day after it came. */
   jobs: string[];
 }
 
@@ -415,7 +415,7 @@ export interface JobFileList {
 
 export interface JobInfo {
   id: string;
-  kind: "build" | "redecouple" | "simulate" | "render" | "export";
+  kind: "build" | "pose" | "redecouple" | "simulate" | "render" | "export";
   name: string;
   /** Empty where the kind has none. */
   preset: string;
@@ -437,13 +437,15 @@ export interface JobInfo {
   attempts: number;
   /** What a build or a re-decoupling made; set when done. */
   asset_id: string | null;
-  /** What a job of another kind than `build` works on. */
+  /** The capture that a `pose` made; set when done. */
+  capture_id: string | null;
+  /** What a job of another kind than `build` and `pose` works on. */
   source_asset: string | null;
   /** What a `pose` edit names to show a simulation; set when done. */
   clip: string | null;
   /** A sentence, when failed. */
   error: string | null;
-  /** What `drgs doctor` finds in the capture of a build; there soon after it began. */
+  /** What `drgs doctor` finds in the capture of a build; there soon after it began. Of a `pose`, which pictures found no place. */
   capture: CaptureReport | null;
   /** Rises with each new preview picture; 0 while there is none. Use it to get round the browser's cache. */
   preview_version: number;
@@ -545,6 +547,19 @@ export interface PoseEdit {
   clip: string;
   time: number;
   rig?: RigBinding | null;
+}
+
+/** Find where plain photographs, or the frames of a film, were taken from: a new capture, with the job's id, of those that found their place. */
+export interface PoseRequest {
+  /** Shown in lists. */
+  name?: string | null;
+  /** Lower runs first; jobs of one priority run in the order in which they came. */
+  priority?: number;
+  limits?: JobLimits;
+  kind: "pose";
+  /** As of a build. */
+  dataset: string;
+  seed?: number;
 }
 
 /** RFC 9457 problem details; `detail` is a sentence a user can act on. */

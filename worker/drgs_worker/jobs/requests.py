@@ -14,7 +14,7 @@ from drgs.scene.edits import Coordinate, Edit, Triple
 from drgs.scene.tone_curve import ToneCurve
 from drgs_worker.store.user_names import PlainText, UserName
 
-JobKind = Literal["build", "redecouple", "simulate", "render", "export"]
+JobKind = Literal["build", "pose", "redecouple", "simulate", "render", "export"]
 PresetName = Literal["draft", "fast", "full"]
 BindingName = Literal["particles", "mesh"]
 LightName = Literal["auto", "object", "camera"]
@@ -112,6 +112,15 @@ class BuildRequest(_Job):
         if math.hypot(*self.up) < SHORTEST_UP:
             raise ValueError(f"up: expected a direction, three numbers that are not all 0; found {self.up}")
         return self
+
+
+class PoseRequest(_Job):
+    """Find where plain photographs, or the frames of a film, were taken from: a new capture, with the job's id, of those that found their place."""
+
+    kind: Literal["pose"]
+    dataset: Annotated[str, Field(max_length=1000), PlainText]
+    """As of a build."""
+    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
 
 
 class RedecoupleRequest(_Job):
@@ -252,9 +261,10 @@ class ExportRequest(_Job):
         return self
 
 
-JobRequest = BuildRequest | RedecoupleRequest | SimulateRequest | RenderRequest | ExportRequest
+JobRequest = BuildRequest | PoseRequest | RedecoupleRequest | SimulateRequest | RenderRequest | ExportRequest
 JOB_REQUESTS: dict[str, type[JobRequest]] = {
     "build": BuildRequest,
+    "pose": PoseRequest,
     "redecouple": RedecoupleRequest,
     "simulate": SimulateRequest,
     "render": RenderRequest,

@@ -29,6 +29,7 @@ from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
 from drgs_worker.jobs.steps.build import BuildRun, RedecoupleRun
 from drgs_worker.jobs.steps.export import ExportRun
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
+from drgs_worker.jobs.steps.pose import PoseRun
 from drgs_worker.jobs.steps.render import RenderRun
 from drgs_worker.jobs.steps.simulate import SimulateRun
 from drgs_worker.store.artifact_store import ArtifactError
@@ -47,6 +48,7 @@ ASSET_KINDS = ("build", "redecouple")
 
 _RUNS: dict[str, Callable[[JobContext], AbstractJobRun]] = {
     "build": BuildRun,
+    "pose": PoseRun,
     "redecouple": RedecoupleRun,
     "simulate": SimulateRun,
     "render": RenderRun,

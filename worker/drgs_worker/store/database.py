@@ -55,12 +55,13 @@ class AssetRow(Base):
 
 
 class CaptureRow(Base):
-    """An uploaded capture that builds can be made of. Those that came with their build (multipart) have none; they are their job's."""
+    """A capture that builds can be made of: an uploaded one, or what a search for poses made of one. Those that came with their build (multipart)
+    have none; they are their job's."""
 
     __tablename__ = "captures"
 
     id: Mapped[str] = mapped_column(primary_key=True)
-    """That of its upload."""
+    """That of its upload, or of the job that made it."""
     name: Mapped[str]
     created_at: Mapped[float] = mapped_column(index=True)
     folder: Mapped[str]

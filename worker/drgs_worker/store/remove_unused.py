@@ -80,7 +80,7 @@ def remove_unused_captures(directory: DataDirectory, engine: Engine, keep_second
 
 
 def jobs_of_capture(session: Session, capture_id: str) -> list[str]:
-    """Ids of the builds and re-decouplings that read this capture."""
+    """Ids of the builds, re-decouplings and searches for poses that read this capture."""
     return list(session.scalars(select(JobRow.id).where(JobRow.dataset.contains(f"/uploads/{capture_id}"))))
 
 

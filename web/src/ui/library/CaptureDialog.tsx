@@ -4,7 +4,7 @@ import { useEffect, useMemo, useRef, useState } from 'preact/hooks';
 import { foundBox, SIDES, stepOf, valueOf, withSide } from '../../capture/build_box';
 import * as api from '../../session/api';
 import { capture, captureLook, captureTrouble, closeCapture, refreshCaptures } from '../../session/captures';
-import { buildCapture } from '../../session/jobs';
+import { buildCapture, isActive, jobs } from '../../session/jobs';
 import { attempt } from '../../session/notices';
 import type { BoxCorners, CaptureInfo, CaptureLook } from '../../session/protocol.gen';
 import type { Vec3 } from '../../session/view';
@@ -13,6 +13,7 @@ import { Icon } from '../icons';
 import { build, BuildChoices } from './BuildChoices';
 import { CaptureView } from './CaptureView';
 import { Findings } from './Findings';
+import { Poses, searchOf } from './Poses';
 
 const UPRIGHT: Vec3 = [0, 0, 1];
 /** Cosine of the lean beyond which a capture's z is probably not up: cameras that look steeply down lean by up to this. */
@@ -22,8 +23,8 @@ export function CaptureDialog() {
   const dialog = useRef<HTMLDialogElement>(null);
   const info = capture.value;
   useEffect(() => {
-    if (info) dialog.current?.showModal();
-    else dialog.current?.close();
+    if (info && !dialog.current?.open) dialog.current?.showModal();
+    else if (!info) dialog.current?.close();
   }, [info]);
   return (
     <dialog ref={dialog} class="capture" aria-labelledby="capture-title" onClose={closeCapture} onClick={(event) => event.target === dialog.current && dialog.current?.close()}>
@@ -33,7 +34,7 @@ export function CaptureDialog() {
           <Icon name="close" />
         </button>
       </header>
-      {info && <Look info={info} look={captureLook.value} trouble={captureTrouble.value} />}
+      {info && <Look key={info.id} info={info} look={captureLook.value} trouble={captureTrouble.value} />}
     </dialog>
   );
 }
@@ -48,14 +49,24 @@ function Look({ info, look, trouble }: { info: CaptureInfo; look: CaptureLook | 
     setUp(to);
     setBox(null); // its sides lie along the axes of the world as it was turned before
   };
+  const poses = jobs.value.find((job) => job.capture_id === info.id)?.capture;
+  const search = searchOf(info);
+  const searching = search !== undefined && isActive(search);
   const shape = look?.up && found && box ? { held: look.up, up, isAuto: chosenUp === null, onUp: turn, found, box, isFound: movedBox === null, onBox: setBox } : null;
   return (
     <>
       <div class="capture-top">
-        {look && shape ? <CaptureView look={look} {...shape} /> : <p class="capture-picture hint">{look ? withoutCameras(look) : (trouble ?? 'The server is looking at the pictures…')}</p>}
+        {look && shape ? (
+          <CaptureView look={look} {...shape} />
+        ) : look?.ok ? (
+          <Poses info={info} />
+        ) : (
+          <p class="capture-picture hint">{look ? 'Where the pictures were taken from cannot be shown.' : (trouble ?? 'The server is looking at the pictures…')}</p>
+        )}
         <div class="capture-side section">
+          {poses && (poses.findings.length > 0 ? <Findings report={poses} said={null} open /> : <p class="facts">{poses.summary}</p>)}
           {look && <Findings report={look} said={null} open />}
-          <BuildForm info={info} ok={look?.ok ?? trouble !== null} shape={shape} />
+          <BuildForm info={info} ok={(look?.ok ?? trouble !== null) && !searching} shape={shape} />
         </div>
       </div>
       {look?.has_sheet && (
@@ -71,10 +82,6 @@ function Look({ info, look, trouble }: { info: CaptureInfo; look: CaptureLook | 
       )}
     </>
   );
-}
-
-function withoutCameras(look: CaptureLook): string {
-  return look.ok ? 'Where the pictures were taken from is found as the first step of a build.' : 'Where the pictures were taken from cannot be shown.';
 }
 
 /** As the file has it; as the cameras were held, where that is quite another direction. */

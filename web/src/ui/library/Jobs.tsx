@@ -2,7 +2,8 @@
 
 import { useEffect, useState } from 'preact/hooks';
 import * as api from '../../session/api';
-import { cancel, isActive, jobs, psnrCurves, remove, resume, retry, workersAlive } from '../../session/jobs';
+import { captures, openCapture } from '../../session/captures';
+import { cancel, isActive, jobs, psnrCurves, remove, resume, retry, STATE_TEXT, workersAlive } from '../../session/jobs';
 import { attempt } from '../../session/notices';
 import type { JobFile, JobInfo } from '../../session/protocol.gen';
 import { openAsset, session } from '../../session/session';
@@ -25,16 +26,6 @@ export function Jobs() {
   );
 }
 
-const STATE_TEXT: Record<JobInfo['state'], string> = {
-  queued: 'Waiting for a worker',
-  running: 'Running',
-  stalled: 'Its worker stopped; another will take it over',
-  done: 'Done',
-  failed: 'Failed',
-  cancelled: 'Cancelled',
-  unknown: 'Lost: the queue no longer knows it',
-};
-
 export function duration(seconds: number): string {
   const whole = Math.max(0, Math.round(seconds));
   if (whole < 60) return `${whole} s`;
@@ -42,7 +33,7 @@ export function duration(seconds: number): string {
   return minutes < 90 ? `${minutes} min` : `${(whole / 3600).toFixed(1)} h`;
 }
 
-const KIND_TEXT: Record<JobInfo['kind'], string> = { build: 'Build', redecouple: 'Materials again', simulate: 'Simulation', render: 'Pictures', export: 'Files' };
+const KIND_TEXT: Record<JobInfo['kind'], string> = { build: 'Build', pose: 'Poses', redecouple: 'Materials again', simulate: 'Simulation', render: 'Pictures', export: 'Files' };
 
 function Job({ job }: { job: JobInfo }) {
   const active = isActive(job);
@@ -53,6 +44,7 @@ function Job({ job }: { job: JobInfo }) {
     job.eta_seconds !== null && `${duration(job.eta_seconds)} left`,
     job.attempts > 1 && `attempt ${job.attempts}`,
   ].filter(Boolean);
+  const made = captures.value.find((capture) => capture.id === job.capture_id);
   const again = job.state === 'failed' || job.state === 'cancelled' || job.state === 'unknown';
   return (
     <li class={`job ${job.state}`} aria-label={`${KIND_TEXT[job.kind]} ${job.name}: ${STATE_TEXT[job.state]}`}>
@@ -75,6 +67,7 @@ function Job({ job }: { job: JobInfo }) {
         {job.state === 'stalled' && <button onClick={() => void resume(job)}>Resume</button>}
         {again && <button onClick={() => void retry(job)}>Retry</button>}
         {job.state === 'done' && job.asset_id && job.asset_id !== session.value?.asset && <button onClick={() => void openAsset(job.asset_id!)}>Open</button>}
+        {made && <button onClick={() => void openCapture(made)}>Look</button>}
         {!active && <button onClick={() => void remove(job)}>Remove</button>}
       </div>
     </li>

@@ -28,7 +28,7 @@ class JobContext:
     parameters: dict
     """Its request, as plain data."""
     dataset: Path | None
-    """Folder of the capture; builds have one."""
+    """Folder of the capture; builds and searches for poses have one."""
     directory: DataDirectory
     engine: Engine
     builder: Builder
