@@ -74,8 +74,28 @@ class Grid:
         return self.side + self.letter + 3 * GAP
 
 
-def contact_sheet(folder: Path, report: dict[str, Any], out: Path) -> None:
-    """Write the sheet.
+@dataclass(frozen=True)
+class SheetLayout:
+    """Where the tiles of a sheet lie, so that a page can show them in rows of its own. All lengths are shares of the sheet's width or height."""
+
+    count: int
+    """Of tiles."""
+    columns: int
+    left: float
+    """Of the first tile."""
+    top: float
+    across: float
+    """From one tile to the next in its row."""
+    down: float
+    """From one row to the next; a tile with its label is as high."""
+    width: float
+    """Of a tile."""
+    aspect: float
+    """A tile's width over its height [of its pixels]."""
+
+
+def contact_sheet(folder: Path, report: dict[str, Any], out: Path) -> SheetLayout:
+    """Write the sheet, and say how its tiles lie.
 
     Args:
         report: the doctor's, on this folder. out: its suffix says whether it becomes a PNG or a JPEG.
@@ -105,6 +125,21 @@ def contact_sheet(folder: Path, report: dict[str, Any], out: Path) -> None:
     draft = out.with_name(f".{out.name}.part")
     draft.write_bytes(_encoded(sheet, kind))
     os.replace(draft, out)
+    return _layout(grid, len(tiles), sheet.size, head.height)
+
+
+def _layout(grid: Grid, count: int, size: tuple[int, int], head: int) -> SheetLayout:
+    width, height = size
+    return SheetLayout(
+        count=count,
+        columns=grid.columns,
+        left=GAP / width,
+        top=head / height,
+        across=(grid.side + GAP) / width,
+        down=grid.tile_height / height,
+        width=grid.side / width,
+        aspect=grid.side / grid.tile_height,
+    )
 
 
 def grid_for(count: int) -> Grid:

@@ -5,6 +5,7 @@ pictures, a sheet; photographs that are not posed yet have no cameras.
 """
 
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,25 +29,28 @@ DIGITS = 5
 """Of coordinates, a ten-thousandth of the object or finer where its world is of the usual size."""
 
 
-def look_at_capture(folder: Path, sheet: Path) -> dict[str, Any]:
+def look_at_capture(folder: Path, sheet: Path, name: str) -> dict[str, Any]:
     """Write the sheet, where there are pictures, and return the rest.
 
     Args:
         sheet: as contact_sheet's `out`; not there yet.
+        name: of the capture. Sentences call it so, and its files by their places in it: where it lies on this machine is for nobody else.
 
-    Keys: ok, summary and findings as of the doctor; has_sheet; camera_count (0: not posed yet, or unreadable); cameras, as the asset's training views
+    Keys: ok, summary and findings as of the doctor; has_sheet; sheet, its SheetLayout, or None; camera_count (0: not posed yet, or unreadable); cameras, as the asset's training views
     are told (docs/protocol.md); up, the mean of the cameras' own, or None; box_low and box_high, corners of the object's box [world units] or None; box_origin, masks or cameras (a guess: what all
     cameras see); outermost, three numbers for each place that tells how far the hull reaches [world units], none without masks; points and colors, three numbers for each point [world units; sRGB 0..1].
     """
     examined = examine(folder)
-    report, views, points = examined.report, examined.views, examined.points
+    report, views, points = _by_name(examined.report, folder, name), examined.views, examined.points
+    layout = None
     with suppress(ValueError):  # a film, or nothing that is a picture: the findings say so
-        contact_sheet(folder, report, sheet)
+        layout = asdict(contact_sheet(folder, report, sheet))
     look: dict[str, Any] = {
         "ok": report["ok"],
         "summary": report["summary"],
         "findings": report["findings"],
         "has_sheet": sheet.is_file(),
+        "sheet": layout,
         "camera_count": 0,
         "cameras": [],
         "up": None,
@@ -63,6 +67,16 @@ def look_at_capture(folder: Path, sheet: Path) -> dict[str, Any]:
     shown = views.cameras if count <= MOST_CAMERAS else [views.cameras[k * count // MOST_CAMERAS] for k in range(MOST_CAMERAS)]
     up = up_of_cameras(np.stack([opengl_from_camera(camera).numpy() for camera in views.cameras])).round(DIGITS).tolist()
     return look | {"camera_count": count, "cameras": [_told_camera(camera) for camera in shown], "up": up} | _told_points(points)
+
+
+def _by_name(report: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:
+    """The doctor's report without paths of this machine."""
+
+    def told(sentence: str) -> str:
+        return sentence.replace(f"{folder}/", "").replace(str(folder), name)
+
+    findings = [finding | {key: told(finding[key]) for key in ("sentence", "advice")} for finding in report["findings"]]
+    return report | {"folder": name, "summary": told(report["summary"]), "findings": findings}
 
 
 def _told_camera(camera: Camera) -> dict[str, Any]:

@@ -76,6 +76,8 @@ def look(viewer: Viewer, shown: Locator, folder: Path, name: str, size: tuple[in
     faults = [f"{name}: {fault}" for fault in viewer.page.evaluate(FIND_FAULTS)]
     shown.evaluate("(dialog) => dialog.scrollTo(0, dialog.scrollHeight)")
     viewer.page.screenshot(path=folder / f"{name}-end.png")
+    expect(shown.get_by_role("heading")).to_be_in_viewport()
+    expect(shown.get_by_role("button", name="Close")).to_be_in_viewport()
     shown.evaluate("(dialog) => dialog.scrollTo(0, 0)")
     return faults
 
@@ -196,8 +198,17 @@ def test_a_dropped_folder_is_shown_with_its_cameras_and_its_pictures_before_a_bu
     viewer.page.mouse.move(place["x"] + 200, place["y"] + 120, steps=4)
     viewer.page.mouse.up()
     wait_until(lambda: cameras.screenshot() != before, "another view of the cameras")
+    tiles = shown.get_by_role("list", name="Pictures of Teal mug")
+    expect(tiles).to_be_hidden()
     faults += look(viewer, shown, folder, "capture-phone", PHONE)
     assert faults == []
+    expect(sheet).to_be_hidden()
+    expect(tiles.get_by_role("listitem")).to_have_count(56)
+    first = tiles.get_by_role("listitem").first
+    size = first.bounding_box()
+    assert size is not None and 100 < size["width"] < 150, "three beside each other"
+    first.scroll_into_view_if_needed()
+    assert drawn_share(first) > 0.2
     viewer.page.set_viewport_size(dict(zip(("width", "height"), LAPTOP, strict=True)))
     low, high = move_sides(viewer, shown, folder)
     shown.get_by_role("radio", name="Draft").check()

@@ -70,6 +70,25 @@ class TrainingView(_Body):
     top: float
 
 
+class SheetLayout(_Body):
+    """Where the tiles of a capture's sheet lie, so that a page can show them in rows of its own. Lengths are shares of the sheet's width or height."""
+
+    count: int
+    """Of tiles."""
+    columns: int
+    left: float
+    """Of the first tile."""
+    top: float
+    across: float
+    """From one tile to the next in its row."""
+    down: float
+    """From one row to the next; a tile with its label is as high."""
+    width: float
+    """Of a tile."""
+    aspect: float
+    """A tile's width over its height."""
+
+
 class CaptureLook(_Body):
     """What can be seen of a capture before a build."""
 
@@ -80,6 +99,8 @@ class CaptureLook(_Body):
     findings: list[CaptureFinding]
     has_sheet: bool
     """Whether there are pictures to show (GET .../sheet.jpg)."""
+    sheet: SheetLayout | None = None
+    """None where there are none."""
     camera_count: int
     """0 where a build finds them first, or the capture cannot be read."""
     cameras: list[TrainingView]

@@ -1,6 +1,5 @@
 """REST: captures that were uploaded before anything is built of them. A build names one as `capture:ID`, and any number of builds may."""
 
-import json
 import shutil
 import tempfile
 import uuid
@@ -149,12 +148,9 @@ async def _make_look(context: ServerContext, caller: Caller, row: CaptureRow, pl
         draft = Path(folder) / "look"
         try:
             async with context.admission.place("file", caller, await run_in_threadpool(look_bytes, capture)):
-                await run_file_tool("look", str(capture), str(draft))
+                await run_file_tool("look", str(capture), str(draft), row.name)
         except FileToolError as error:
             raise ProblemError(422, str(error)) from error
-        # Findings name files by their place in the capture, not on this machine.
-        text = (draft / LOOK_NAME).read_text().replace(f"{json.dumps(str(capture))[1:-1]}/", "").replace(str(capture), row.name)
-        (draft / LOOK_NAME).write_text(text)
         draft.rename(place)
 
 

@@ -215,6 +215,8 @@ export interface CaptureLook {
   findings: CaptureFinding[];
   /** Whether there are pictures to show (GET .../sheet.jpg). */
   has_sheet: boolean;
+  /** None where there are none. */
+  sheet?: SheetLayout | null;
   /** 0 where a build finds them first, or the capture cannot be read. */
   camera_count: number;
   /** All, or 400 evenly chosen. */
@@ -731,6 +733,24 @@ export interface Settings {
 export interface SettingsMessage {
   type: "settings";
   settings: Settings;
+}
+
+/** Where the tiles of a capture's sheet lie, so that a page can show them in rows of its own. Lengths are shares of the sheet's width or height. */
+export interface SheetLayout {
+  /** Of tiles. */
+  count: number;
+  columns: number;
+  /** Of the first tile. */
+  left: number;
+  top: number;
+  /** From one tile to the next in its row. */
+  across: number;
+  /** From one row to the next; a tile with its label is as high. */
+  down: number;
+  /** Of a tile. */
+  width: number;
+  /** A tile's width over its height. */
+  aspect: number;
 }
 
 export interface Similar {

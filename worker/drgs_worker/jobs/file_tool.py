@@ -4,7 +4,7 @@ The server calls it (`run_file_tool`), so that a decoder that crashes or swallow
 Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full. Commands:
     asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
     environment SOURCE OUT      EXR or Radiance HDR -> EXR
-    look CAPTURE OUT            folder of a capture -> folder with look.json and, where it has pictures, sheet.jpg (drgs/evaluate/look_at_capture.py)
+    look CAPTURE OUT NAME       folder of a capture, which sentences call NAME -> folder with look.json and, where it has pictures, sheet.jpg (drgs/evaluate/look_at_capture.py)
     export ASSET OUT FORMAT [EDITS ENVIRONMENTS N]      asset folder, with the edits put into it -> a format of drgs/exchange/export_formats.py, or zip (the asset itself)
     version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
 """
@@ -168,13 +168,13 @@ def edited_asset(asset_folder: Path, edits: Path, environments: Path, version: i
     return bake_edits(load_asset(asset_folder), load_edits(edits), environments, version)
 
 
-def make_look(capture: Path, out: Path) -> None:
+def make_look(capture: Path, out: Path, name: str) -> None:
     """The folder `out` is there when all of it is."""
     from drgs.evaluate.look_at_capture import look_at_capture
 
     draft = out.with_name(f"{out.name}.part")
     draft.mkdir()
-    look = look_at_capture(capture, draft / SHEET_NAME)
+    look = look_at_capture(capture, draft / SHEET_NAME, name)
     (draft / LOOK_NAME).write_text(json.dumps(look, allow_nan=False))
     draft.rename(out)
 
@@ -221,8 +221,8 @@ def main(arguments: list[str]) -> int:
                 make_asset(Path(source), Path(out))
             case ["environment", source, out]:
                 make_environment(Path(source), Path(out))
-            case ["look", capture, out]:
-                make_look(Path(capture), Path(out))
+            case ["look", capture, out, name]:
+                make_look(Path(capture), Path(out), name)
             case ["export", asset, out, format]:
                 export(Path(asset), Path(out), format)
             case ["export", asset, out, format, edits, environments, version]:

@@ -2,11 +2,12 @@
 
 import { useEffect, useMemo, useRef, useState } from 'preact/hooks';
 import { foundBox, SIDES, stepOf, valueOf, withSide } from '../../capture/build_box';
+import { tileStyle } from '../../capture/sheet_tiles';
 import * as api from '../../session/api';
 import { capture, captureLook, captureTrouble, closeCapture, refreshCaptures } from '../../session/captures';
 import { buildCapture, isActive, jobs } from '../../session/jobs';
 import { attempt } from '../../session/notices';
-import type { BoxCorners, CaptureInfo, CaptureLook } from '../../session/protocol.gen';
+import type { BoxCorners, CaptureInfo, CaptureLook, SheetLayout } from '../../session/protocol.gen';
 import type { Vec3 } from '../../session/view';
 import { Choice, PlaceField } from '../fields';
 import { Icon } from '../icons';
@@ -77,10 +78,22 @@ function Look({ info, look, trouble }: { info: CaptureInfo; look: CaptureLook | 
               Larger
             </a>
           </p>
-          <img class="sheet" src={api.captureSheet(info.id)} alt={`All pictures of ${info.name}, with the outlines of their masks`} />
+          <img class={look.sheet ? 'sheet tiled' : 'sheet'} src={api.captureSheet(info.id)} alt={`All pictures of ${info.name}, with the outlines of their masks`} />
+          {look.sheet && <Tiles layout={look.sheet} sheet={api.captureSheet(info.id)} name={info.name} />}
         </>
       )}
     </>
+  );
+}
+
+/** The sheet's pictures in as many columns as a narrow window has room for. */
+function Tiles({ layout, sheet, name }: { layout: SheetLayout; sheet: string; name: string }) {
+  return (
+    <ul class="tiles" aria-label={`Pictures of ${name}`}>
+      {Array.from({ length: layout.count }, (_, number) => (
+        <li key={number} style={tileStyle(layout, sheet, number)} />
+      ))}
+    </ul>
   );
 }
 
