@@ -11,7 +11,8 @@ from typing import Any
 from drgs.evaluate.doctor.findings import Finding, few
 from drgs.evaluate.doctor.picture_looks import PictureLook, picture_looks
 from drgs.evaluate.doctor.pictures import FEW_VIEWS, looks
-from drgs.reconstruct.capture.load_views.checks import HEIC_SUFFIXES, image_size
+from drgs.reconstruct.capture.camera_files import is_header_readable
+from drgs.reconstruct.capture.load_views.checks import image_size
 from drgs.reconstruct.capture.small_picture import PictureFile
 from drgs.reconstruct.pose.explain_failure import FEWEST_FEATURES
 from drgs.reconstruct.pose.list_photos import FEWEST_PHOTOS, Photo, list_photos
@@ -113,7 +114,7 @@ def _sizes(photos: list[Photo]) -> Counter[tuple[int, int]]:
     sizes: Counter[tuple[int, int]] = Counter()
     for photo in photos:
         try:
-            sizes[(0, 0) if photo.path.suffix.lower() in HEIC_SUFFIXES else image_size(photo.path)] += 1
+            sizes[image_size(photo.path) if is_header_readable(photo.path) else (0, 0)] += 1
         except ValueError:
             sizes[(0, 0)] += 1
     return sizes

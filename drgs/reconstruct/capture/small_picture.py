@@ -13,10 +13,10 @@ from numpy import ndarray
 from PIL import Image
 
 from drgs.exchange.pictures import as_eight_bits, orientation_of, upright
-from drgs.reconstruct.capture.load_views.checks import HEIC_SUFFIXES, CaptureFault, check_least_side, damaged
+from drgs.reconstruct.capture.camera_files import opened_photograph
+from drgs.reconstruct.capture.load_views.checks import CaptureFault, check_least_side, damaged
 from drgs.reconstruct.capture.load_views.read_pictures import mask_channel, mask_of_depth
 
-FORMATS = ("PNG", "JPEG", "WEBP")
 OPAQUE = 128
 FIRST_TURNED = 5
 """Of EXIF's eight orientations: from this on width and height change places."""
@@ -51,7 +51,8 @@ def small_picture(file: PictureFile, side: int) -> SmallPicture:
         ValueError: it, or its mask, cannot be read, or they do not fit each other.
     """
     try:
-        with Image.open(file.image, formats=_formats(file.image)) as image:
+        # A mask is as large as the whole picture.
+        with opened_photograph(file.image, side if file.mask is None else None) as image:
             orientation = orientation_of(image) if file.turned_by_exif else 1
             width, height = reversed(image.size) if orientation >= FIRST_TURNED else image.size
             image.draft(None, (side, side))  # a JPEG is not decoded any larger
@@ -73,12 +74,3 @@ def small_picture(file: PictureFile, side: int) -> SmallPicture:
         raise ValueError(f"{file.mask}: the mask is {mask.shape[1]}x{mask.shape[0]}, but its image {file.image.name} is {width}x{height}.")
     small = np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX))
     return SmallPicture(pixels[..., :3], small if alpha is None else np.minimum(alpha, small))
-
-
-def _formats(path: Path) -> tuple[str, ...]:
-    if path.suffix.lower() not in HEIC_SUFFIXES:
-        return FORMATS
-    import pillow_heif
-
-    pillow_heif.register_heif_opener()
-    return ("HEIF",)

@@ -1,22 +1,22 @@
 """What a folder of photographs holds: its pictures, in folders or not, and the mask of each. No pixel is decoded here.
 
-Pictures are png, jpg, jpeg or webp, and heic where pillow-heif is installed. Masks lie in masks/ inside the folder, or, where the folder
+Pictures are png, jpg, jpeg or webp, and where the extras are installed heic and RAW (capture/camera_files.py). Masks lie in masks/ inside the folder, or, where the folder
 is called images, in masks/ beside it; load_views/checks.py says how they are named.
 """
 
 from collections import Counter
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
-from drgs.reconstruct.capture.load_views.checks import HEIC_SUFFIXES, IMAGE_SUFFIXES, find_masks, is_folder
+from drgs.reconstruct.capture.camera_files import check_readers, is_photograph, without_developed
+from drgs.reconstruct.capture.load_views.checks import find_masks, is_folder
 from drgs.reconstruct.capture.load_views.colmap import find_model
 from drgs.reconstruct.capture.load_views.metashape import find_cameras_file
 
 FEWEST_PHOTOS = 8
 """With fewer, hardly anything is seen from enough sides, whatever their poses."""
 CAMERA_FILES = ("transforms.json", "transforms_train.json", "*-camera.pkl")
-OTHER_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".tif", ".tiff", ".mp4", ".mov", ".avi", ".mkv")
+OTHER_SUFFIXES = (".tif", ".tiff", ".mp4", ".mov", ".avi", ".mkv")
 """What people have in place of pictures, named in the sentence when nothing else is there."""
 
 
@@ -41,12 +41,8 @@ def list_photos(folder: Path) -> list[Photo]:
         raise ValueError(f"{folder}: no such folder, expected one with photographs.")
     _refuse_posed(folder)
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not _is_aside(path.relative_to(folder))]
-    heic = [path for path in files if path.suffix.lower() in HEIC_SUFFIXES]
-    if heic and find_spec("pillow_heif") is None:
-        raise ValueError(
-            f"{heic[0]}: {len(heic)} pictures are HEIC, expected PNG, JPEG or WebP; export them as JPEG in full size, or pip install pillow-heif."
-        )
-    images = [path for path in files if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)]
+    images = without_developed([path for path in files if is_photograph(path)])
+    check_readers(images)
     if len(images) < FEWEST_PHOTOS:
         others = Counter(path.suffix.lower() for path in files if path.suffix.lower() in OTHER_SUFFIXES)
         beside = f" (and {', '.join(f'{count} {suffix} files' for suffix, count in others.most_common())})" if others else ""
@@ -61,8 +57,7 @@ def list_photos(folder: Path) -> list[Photo]:
 
 def any_photo(folder: Path) -> bool:
     """Whether pictures are there at all."""
-    suffixes = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
-    return any(path.suffix.lower() in suffixes and not _is_aside(path.relative_to(folder)) for path in folder.rglob("*"))
+    return any(is_photograph(path) and not _is_aside(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
 def _refuse_posed(folder: Path) -> None:

@@ -18,8 +18,9 @@ from numpy import ndarray
 from PIL import Image
 
 from drgs.exchange.pictures import as_eight_bits, exif_number, orientation_of, read_exif, upright
+from drgs.reconstruct.capture.camera_files import is_header_readable, opened_photograph
 from drgs.reconstruct.capture.laplacian_variance import laplacian_variance
-from drgs.reconstruct.capture.load_views.checks import HEIC_SUFFIXES, check_least_side, image_size
+from drgs.reconstruct.capture.load_views.checks import check_least_side, image_size
 from drgs.reconstruct.pose.backdrop_masks import backdrop_mask
 from drgs.reconstruct.pose.list_photos import Photo
 from drgs.reconstruct.progress import BuildStopped
@@ -127,13 +128,9 @@ def with_backdrop_masks(
 def _prepare(photo: Photo, work: Path) -> PreparedPhoto | str:
     """The record, or why there is none."""
     try:
-        if photo.path.suffix.lower() in HEIC_SUFFIXES:
-            import pillow_heif
-
-            pillow_heif.register_heif_opener()
-        else:
+        if is_header_readable(photo.path):
             image_size(photo.path)  # which refuses what is too large, too
-        with Image.open(photo.path) as image:
+        with opened_photograph(photo.path) as image:
             image.load()
             focal_35mm = exif_number(read_exif(image, EXIF_FOLDER), EXIF_FOCAL_35MM)
             usable_as_it_is = image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and orientation_of(image) == 1

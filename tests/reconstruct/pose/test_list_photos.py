@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from drgs.reconstruct.pose import list_photos as module
+from drgs.reconstruct.capture import camera_files
 from drgs.reconstruct.pose.list_photos import FEWEST_PHOTOS, list_photos
 
 
@@ -47,16 +47,16 @@ def test_too_few_pictures_and_what_is_there_instead(tmp_path: Path):
     with pytest.raises(ValueError, match="nothing: no such folder, expected one with photographs"):
         list_photos(tmp_path / "nothing")
     write_pictures(tmp_path, 2)
-    (tmp_path / "a.DNG").touch()
-    (tmp_path / "b.dng").touch()
-    with pytest.raises(ValueError, match=r"2 pictures \(and 2 \.dng files\), expected at least 8 PNG"):
+    (tmp_path / "a.TIF").touch()
+    (tmp_path / "b.tif").touch()
+    with pytest.raises(ValueError, match=r"2 pictures \(and 2 \.tif files\), expected at least 8 PNG"):
         list_photos(tmp_path)
 
 
 def test_heic_needs_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     write_pictures(tmp_path)
     (tmp_path / "IMG_1.HEIC").touch()
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr(camera_files, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"IMG_1\.HEIC: 1 pictures are HEIC, expected PNG, JPEG or WebP; export them as JPEG"):
         list_photos(tmp_path)
 

@@ -2,7 +2,7 @@
 
 import type { PlacedFile } from './zip';
 
-const PICTURE = /\.(jpe?g|png|webp|hei[cf])$/i;
+const PICTURE = /\.(jpe?g|png|webp|hei[cf]|dng|cr[23]|nef|arw|raf|orf|rw2)$/i;
 const FILM = /\.(mp4|mov|m4v|webm|mkv|avi)$/i;
 
 /** All files of a drop, those of dropped folders by their paths. Hidden files stay behind. */

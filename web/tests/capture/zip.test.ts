@@ -51,9 +51,9 @@ it('a zip of what is too much is refused with a sentence', async () => {
 });
 
 it('loose pictures, a film and a folder are one capture, other files are themselves', () => {
-  const pictures = captureAmong([placed('a.JPG'), placed('b.heic'), placed('sky.exr')]);
+  const pictures = captureAmong([placed('a.JPG'), placed('b.heic'), placed('c.CR3'), placed('sky.exr')]);
   expect(pictures.name).toBe('photographs');
-  expect(pictures.capture.map(({ path }) => path)).toEqual(['a.JPG', 'b.heic']);
+  expect(pictures.capture.map(({ path }) => path)).toEqual(['a.JPG', 'b.heic', 'c.CR3']);
   expect(pictures.others.map(({ name }) => name)).toEqual(['sky.exr']);
   expect(captureAmong([placed('walk.mov')]).name).toBe('walk');
   const folder = captureAmong([placed('cup/transforms.json'), placed('cup/images/a.png')]);

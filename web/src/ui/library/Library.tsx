@@ -66,7 +66,7 @@ function NewBuild() {
         ref={file}
         class="visually-hidden"
         type="file"
-        accept=".zip,.glb,.obj,.ply,.jpg,.jpeg,.png,.webp,.heic,.heif,.mp4,.mov,.m4v,.webm,.mkv,.avi"
+        accept=".zip,.glb,.obj,.ply,.jpg,.jpeg,.png,.webp,.heic,.heif,.dng,.cr2,.cr3,.nef,.arw,.raf,.orf,.rw2,.mp4,.mov,.m4v,.webm,.mkv,.avi"
         multiple
         tabIndex={-1}
         aria-label="Capture or mesh"
