@@ -234,6 +234,7 @@ def build_stages(
         fit_settings = replace(preset.fit, seed=settings.seed)
         if not views.has_masks:
             masked = masks_stage(place, views, points, fit_settings, device, settings.box)
+            views = views_of(views, masked)  # without those in which the box's content is hidden
             points = points_of_found_masks(masked, points, preset.points, settings.seed, settings.box)
         else:
             masked = views

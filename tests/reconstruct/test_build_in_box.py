@@ -65,12 +65,12 @@ def test_without_masks_the_surfels_in_the_box_are_the_object(tmp_path: Path, mon
     monkeypatch.setitem(PRESETS, "tiny", replace(TINY, fit=replace(TINY.fit, iterations=80)))
     monkeypatch.setattr(find_masks_module, "ITERATIONS", 120)
     capture = write_nerf_synthetic(tmp_path / "capture", [before_surroundings(view) for view in sphere_views(24, square=True)])
-    asset = build_asset(capture, tmp_path / "half", SETTINGS)
+    asked = iter(range(10**6))
+    with pytest.raises(BuildStopped):  # between two steps of stage 1, after the search
+        build_asset(capture, tmp_path / "half", SETTINGS, should_stop=lambda: next(asked) > 160)
+    asset = build_asset(capture, tmp_path / "half", replace(SETTINGS, resume=True))
     assert bool(UPPER.holds(asset.mesh.vertices).all())
     top = asset.mesh.vertices.amax(0) - torch.tensor([X, Y, Z])
     assert float(top[2]) == pytest.approx(SPHERE_RADIUS, rel=0.25)
-    stops = iter(range(10**6))
-    with pytest.raises(BuildStopped):
-        build_asset(capture, tmp_path / "again", SETTINGS, should_stop=lambda: next(stops) > 160)
-    resumed = build_asset(capture, tmp_path / "again", replace(SETTINGS, resume=True))
-    assert [camera.name for camera in resumed.cameras] == [camera.name for camera in asset.cameras]
+    # Views from below see what was not to be built in front of the rest.
+    assert 8 <= len(asset.cameras) < 24
