@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from drgs.exchange.export_formats import EXPORT_FORMATS, FILE_KINDS, ExportFormat, export_format_of
+from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, FEWEST_FACES, FILE_KINDS, ExportFormat, export_format_of
 from drgs.installation import missing_package, unsupported_system
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.openmp import spin_briefly
@@ -309,7 +309,7 @@ def export(
     format: Annotated[ExportFormat | None, typer.Option(help=EXPORT_HELP, show_default="by OUT's suffix")] = None,
     faces: Annotated[
         int | None,
-        typer.Option(help="The most that a textured mesh (glb, mesh, usdz, usd) has.", show_default="30000", min=4),
+        typer.Option(help="The most that a textured mesh (glb, mesh, usdz, usd) has.", show_default=str(DEFAULT_FACES), min=FEWEST_FACES),
     ] = None,
 ) -> None:
     """Write an asset as a file that other programs read."""

@@ -22,14 +22,13 @@ from torch import Tensor
 
 from drgs.convert.bake_transfer import bake_transfer
 from drgs.convert.shrink_mesh import shrink_mesh
+from drgs.exchange.export_formats import DEFAULT_FACES
 from drgs.exchange.texture_atlas import TEXELS_PER_FACE, Atlas, paint, unwrap
 from drgs.maths.color import srgb_from_linear
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.mesh import TriangleMesh
 
-DEFAULT_FACES = 30_000
-"""Charts of so many take some ten seconds of a core, of twice as many a minute."""
 TEXELS_PER_VERTEX = 16
 """Of the large mesh: four from one to the next along either side."""
 LEAST_CORNERS = 5_000

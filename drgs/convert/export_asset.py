@@ -22,9 +22,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.convert.bake_textures import DEFAULT_FACES, TexturedMesh, bake_textures
+from drgs.convert.bake_textures import TexturedMesh, bake_textures
 from drgs.convert.page.encode_page import encode_page
-from drgs.exchange.export_formats import EXPORT_FORMATS, ExportFormat
+from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, TEXTURED_FORMATS, ExportFormat, refuse_faces
 from drgs.exchange.exr import encode_environment
 from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
 from drgs.exchange.glb import GlbMesh, GlbPoints, encode_glb
@@ -41,10 +41,6 @@ from drgs.scene.mesh import on_cpu
 
 _UPRIGHT_FROM_WORLD = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
 """z up to y up."""
-TEXTURED_FORMATS: tuple[ExportFormat, ...] = ("glb", "mesh", "usdz", "usd")
-"""Those whose number of faces can be chosen."""
-FEWEST_FACES = 4
-"""Of a tetrahedron."""
 
 
 def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int | None = None) -> str:
@@ -68,12 +64,7 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int
         raise ValueError(f"{out}: is a folder; expected the name of a file")
     if format in ("ply", "ply3", "spz") and asset.gaussians is None:
         raise ValueError(f"format {format!r} needs Gaussians, and this asset has only a mesh; export it as glb")
-    if faces is not None and format not in TEXTURED_FORMATS:
-        raise ValueError(
-            f"{faces} faces were asked for of format {format!r}, which has no textures; expected {', '.join(TEXTURED_FORMATS)}"
-        )
-    if faces is not None and faces < FEWEST_FACES:
-        raise ValueError(f"{faces} faces were asked for; expected at least {FEWEST_FACES}")
+    refuse_faces(faces, (format,))
     if format in ("usd", "usdz"):
         refuse_unwritable(out, for_ar=format == "usdz")
     out.parent.mkdir(parents=True, exist_ok=True)

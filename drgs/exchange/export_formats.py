@@ -3,6 +3,7 @@
 The one table for `drgs export`, export jobs, downloads of the service and the viewer (which reads it from web/src/session/constants.gen.ts).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,6 +12,12 @@ ExportFormat = Literal["ply", "ply3", "spz", "glb", "mesh", "usdz", "usd", "env"
 """What `drgs.export_asset` writes."""
 DownloadFormat = Literal[ExportFormat, "zip"]
 """What the service gives out: these, and the asset itself."""
+DEFAULT_FACES = 30_000
+"""The most that a textured mesh has where nobody says. Charts of so many take some ten seconds of a core, of twice as many a minute."""
+FEWEST_FACES = 4
+"""Of a tetrahedron."""
+MOST_FACES = 2**31 - 1
+"""That a service takes: as good as all of them."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +32,8 @@ class FileKind:
     """What is in it and who reads it, in one line."""
     other_suffixes: tuple[str, ...] = ()
     """Suffixes of the user's choice that mean the same format."""
+    textured: bool = False
+    """Holds a mesh with textures, whose number of faces can be chosen."""
 
 
 FILE_KINDS: dict[DownloadFormat, FileKind] = {
@@ -32,8 +41,9 @@ FILE_KINDS: dict[DownloadFormat, FileKind] = {
         ".glb",
         "Mesh and Gaussians (GLB)",
         "Mesh with textures, occlusion and normals among them: Blender, three.js, Unreal, Unity; in a second scene the Gaussians (KHR_gaussian_splatting)",
+        textured=True,
     ),
-    "mesh": FileKind(".glb", "Mesh (GLB)", "The same mesh alone, in a smaller file"),
+    "mesh": FileKind(".glb", "Mesh (GLB)", "The same mesh alone, in a smaller file", textured=True),
     "html": FileKind(
         ".html", "Page (HTML)", "One file that any browser opens, without a server: the object to turn, relight and recolour", (".htm",)
     ),
@@ -48,12 +58,14 @@ FILE_KINDS: dict[DownloadFormat, FileKind] = {
         ".usdz",
         "Object for AR (USDZ)",
         "Mesh with textures, upright and in metres: AR Quick Look on iPhone and iPad, and what else reads USD",
+        textured=True,
     ),
     "usd": FileKind(
         ".usdz",
         "Scene (USD)",
         "Mesh with textures, Gaussians as splats of OpenUSD 26 and the light as a dome, in one package; a .usda has its pictures beside it",
         (".usda", ".usd", ".usdc"),
+        textured=True,
     ),
     "env": FileKind(
         ".exr", "Light (EXR)", "The environment: with edits the chosen one, turned and dimmed; else the one recovered with the object"
@@ -62,6 +74,24 @@ FILE_KINDS: dict[DownloadFormat, FileKind] = {
 }
 """In the order in which they are offered. Of two formats with one suffix the first is what the suffix stands for."""
 EXPORT_FORMATS: tuple[ExportFormat, ...] = tuple(name for name in FILE_KINDS if name != "zip")
+TEXTURED_FORMATS: tuple[ExportFormat, ...] = tuple(name for name in EXPORT_FORMATS if FILE_KINDS[name].textured)
+
+
+def refuse_faces(faces: int | None, formats: Sequence[str]) -> None:
+    """
+    Args:
+        faces: the most that textured meshes are asked to have; None where nobody says.
+
+    Raises:
+        ValueError: it is no such number, or none of the formats has a use for it.
+    """
+    if faces is None:
+        return
+    if not set(formats) & set(TEXTURED_FORMATS):
+        found = ", ".join(map(repr, formats))
+        raise ValueError(f"{faces} faces were asked for of format {found}, which has no textures; expected {', '.join(TEXTURED_FORMATS)}")
+    if faces < FEWEST_FACES:
+        raise ValueError(f"{faces} faces were asked for; expected at least {FEWEST_FACES}")
 
 
 def export_format_of(path: Path) -> ExportFormat:

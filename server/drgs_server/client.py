@@ -242,9 +242,13 @@ class Client:
     def undelete_asset(self, asset_id: str) -> AssetInfo:
         return self._call("POST", f"/api/assets/{asset_id}/undelete", AssetInfo)
 
-    def export(self, asset_id: str, format: DownloadFormat, out: Path) -> None:
-        """Write the asset to the file `out`, in another program's format."""
-        self._download(f"/api/assets/{asset_id}/export", out, params={"format": format})
+    def export(self, asset_id: str, format: DownloadFormat, out: Path, faces: int | None = None) -> None:
+        """Write the asset to the file `out`, in another program's format.
+
+        Args:
+            faces: the most that a textured mesh (glb, mesh, usdz, usd) has; None: 30 000.
+        """
+        self._download(f"/api/assets/{asset_id}/export", out, params=_export_query(format, faces))
 
     def environments(self) -> list[EnvironmentInfo]:
         return self._call("GET", "/api/environments", EnvironmentList).environments
@@ -294,6 +298,10 @@ class Client:
     def _connect(self, session_id: str) -> ClientConnection:
         address = self.address.replace("http", "ws", 1) + f"/api/sessions/{session_id}/stream"
         return connect(address, additional_headers=self._headers, compression=None, max_size=64 << 20)
+
+
+def _export_query(format: DownloadFormat, faces: int | None) -> dict[str, str | int]:
+    return {"format": format} if faces is None else {"format": format, "faces": faces}
 
 
 class RemoteSession:
@@ -349,9 +357,13 @@ class RemoteSession:
         """A new version of the asset with the edits in force put into it."""
         return self._client._call("POST", f"/api/sessions/{self.id}/save", AssetInfo, json={"name": name}, timeout=600)
 
-    def export(self, format: DownloadFormat, out: Path) -> None:
-        """Write the object with the edits in force put into it as a file for other programs; the server keeps nothing of it."""
-        self._client._download(f"/api/sessions/{self.id}/export", out, params={"format": format})
+    def export(self, format: DownloadFormat, out: Path, faces: int | None = None) -> None:
+        """Write the object with the edits in force put into it as a file for other programs; the server keeps nothing of it.
+
+        Args:
+            faces: the most that a textured mesh (glb, mesh, usdz, usd) has; None: 30 000.
+        """
+        self._client._download(f"/api/sessions/{self.id}/export", out, params=_export_query(format, faces))
 
     def frame(
         self,

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
+from drgs.exchange import export_formats
 from drgs.exchange.export_formats import FILE_KINDS
 from drgs.maths import constants
 from drgs.scene.edits import Edit
@@ -39,6 +40,7 @@ _VIEWER_CONSTANTS = (
     "MIDDLE_GREY",
     "STILL_BOUNCES",
 )
+_EXPORT_CONSTANTS = ("DEFAULT_FACES", "FEWEST_FACES", "MOST_FACES")
 _CONSTANTS = (
     "PROTOCOL_VERSION",
     "MAX_FRAMES_IN_FLIGHT",
@@ -222,11 +224,15 @@ def constants_text() -> str:
     text = "// Written by `python -m drgs_server.generate_types` from drgs/maths/constants.py and drgs/exchange/export_formats.py. Do not edit.\n\n"
     for constant in _VIEWER_CONSTANTS:
         text += f"export const {constant} = {getattr(constants, constant)!r};\n"
+    for constant in _EXPORT_CONSTANTS:
+        text += f"export const {constant} = {getattr(export_formats, constant)!r};\n"
     text += f"\nexport type DownloadFormat = {_union(json.dumps(name) for name in FILE_KINDS)};\n\n"
     text += _comment("In the order in which they are offered.", "")
-    text += "export const FILE_KINDS: { format: DownloadFormat; suffix: string; title: string; description: string }[] = [\n"
+    text += (
+        "export const FILE_KINDS: { format: DownloadFormat; suffix: string; title: string; description: string; textured: boolean }[] = [\n"
+    )
     for name, kind in FILE_KINDS.items():
-        fields = {"format": name, "suffix": kind.suffix, "title": kind.title, "description": kind.description}
+        fields = {"format": name, "suffix": kind.suffix, "title": kind.title, "description": kind.description, "textured": kind.textured}
         text += "  { " + ", ".join(f"{key}: {json.dumps(value)}" for key, value in fields.items()) + " },\n"
     return text + "];\n"
 

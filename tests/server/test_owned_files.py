@@ -134,7 +134,7 @@ def test_exports_and_versions_leave_broken_edits_out(service: Service, monkeypat
     written: list[list[dict]] = []
 
     async def tool(_: object, __: object, ___: object, kind: str, source: str, out: str, *rest: str) -> None:
-        written.append(json.loads(Path(rest[0] if kind == "version" else rest[1]).read_text()))
+        written.append(json.loads(Path(rest[0] if kind == "version" else rest[2]).read_text()))
         if kind == "version":
             shutil.copytree(source, out)
         else:

@@ -58,6 +58,26 @@ def test_an_export_leaves_no_draft_whatever_range_is_asked_for(
     assert list(service.context.scratch.folder.glob(".export-*")) == []
 
 
+def test_a_download_passes_on_how_many_faces_were_asked_for(service: Service, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    told: list[tuple[str, ...]] = []
+
+    async def tool(_: object, __: object, ___: object, kind: str, source: str, out: str, *rest: str) -> None:
+        told.append(rest)
+        Path(out).write_bytes(b"glTF")
+
+    asset, session = opened(service, tmp_path)
+    monkeypatch.setattr(routes_assets, "_run_tool", tool)
+    for address in (f"/api/assets/{asset}/export", f"/api/sessions/{session}/export"):
+        assert service.client.get(address, params={"format": "usdz"}).status_code == 200
+        assert service.client.get(address, params={"format": "usdz", "faces": 500}).status_code == 200
+        is_problem(service.client.get(address, params={"format": "glb", "faces": 3}), 422)
+        refused = service.client.get(address, params={"format": "ply", "faces": 500})
+        is_problem(refused, 422)
+        assert "no textures; expected glb, mesh, usdz, usd" in refused.json()["detail"]
+    assert [rest[:2] for rest in told] == [("usdz", "0"), ("usdz", "500")] * 2
+    assert [len(rest) for rest in told] == [2, 2, 5, 5], "the session's come with its edits"
+
+
 def test_an_export_leaves_no_draft_where_sending_fails(tmp_path: Path) -> None:
     folder = tmp_path / ".export-1"
     folder.mkdir()

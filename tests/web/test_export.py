@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import zipfile
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from drgs.convert.import_mesh import import_mesh
+from drgs.exchange.export_formats import DEFAULT_FACES
 from drgs.exchange.exr import decode_exr
 from drgs.reconstruct.capture.load_views import load_cameras
+from drgs_server.client import Client
 from tests.web.conftest import Viewer, wait_until
 
 VIEWS = "Views of the film"
@@ -96,6 +99,21 @@ def test_what_was_made_gold_is_exported_as_gold_or_as_captured(ball: Viewer, tmp
     kilobytes = math.ceil((tmp_path / "ball.usdz").stat().st_size / 1e3)
     expect(ball.page.get_by_role("link", name=f"Object for AR (USDZ) {kilobytes} kB")).to_be_visible()
     ball.page.get_by_role("switch", name="With this session’s edits").check()
+
+
+def test_a_mesh_is_exported_with_the_faces_that_were_asked_for(ball: Viewer, ball_asset: str, tmp_path: Path) -> None:
+    """By the page and by the client, whose file is the same."""
+    link = ball.page.get_by_role("link", name="Mesh (GLB)")
+    expect(ball.page.get_by_label("Faces of textured meshes", exact=True)).to_have_value(str(DEFAULT_FACES))
+    enter(ball.page, "Faces of textured meshes", "300")
+    few = downloaded(ball, "link", "Mesh (GLB)", tmp_path / "few.glb")
+    assert 200 < len(import_mesh(few).mesh.faces) <= 300
+    expect(link).to_have_accessible_name(f"Mesh (GLB) {math.ceil(few.stat().st_size / 1e3)} kB")
+    with Client(ball.server.address, token=ball.server.token) as client:
+        client.export(ball_asset, "mesh", tmp_path / "same.glb", faces=300)
+    assert (tmp_path / "same.glb").read_bytes() == few.read_bytes()
+    enter(ball.page, "Faces of textured meshes", str(DEFAULT_FACES))
+    expect(link).not_to_have_accessible_name(re.compile(rf" {math.ceil(few.stat().st_size / 1e3)} kB"))
 
 
 def test_a_file_that_cannot_be_written_says_why(ball: Viewer) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from drgs.convert.import_mesh import import_mesh
 from drgs.deform.clip import open_clip
 from drgs.exchange.exr import encode_environment
 from drgs.reconstruct.progress import POSED, Progress
@@ -179,6 +180,14 @@ def test_an_export_writes_each_format(job: Callable[..., JobContext]) -> None:
     with pytest.raises(ValueError, match="Gaussians"):
         run(ExportRun(job({"kind": "export", "asset": ASSET, "formats": ["ply"]})))
     assert len(list(context.files.iterdir())) == 3
+
+
+@pytest.mark.slow
+def test_an_export_gives_textured_meshes_the_faces_that_were_asked_for(job: Callable[..., JobContext]) -> None:
+    context = job({"kind": "export", "asset": ASSET, "formats": ["mesh", "env"], "faces": 20})
+    run(ExportRun(context))
+    assert (context.files / "asset-env.exr").stat().st_size > 0
+    assert 12 <= len(import_mesh(context.files / "asset-mesh.glb").mesh.faces) <= 20
 
 
 def test_an_asset_without_its_build_cannot_be_re_decoupled(job: Callable[..., JobContext]) -> None:

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 from starlette.types import Receive, Scope, Send
 
-from drgs.exchange.export_formats import FILE_KINDS, DownloadFormat
+from drgs.exchange.export_formats import FEWEST_FACES, FILE_KINDS, MOST_FACES, DownloadFormat, refuse_faces
 from drgs.scene.edits import Edit, plain_edit
 from drgs_server.api.answers import asset_info
 from drgs_server.api.context import ServerContext, caller_of, context_of
@@ -35,6 +35,7 @@ from drgs_worker.store.register_asset import register_asset
 router = APIRouter(prefix="/api", tags=["assets"])
 
 Context = Annotated[ServerContext, Depends(context_of)]
+FacesQuery = Annotated[int | None, Query(ge=FEWEST_FACES, le=MOST_FACES)]
 
 
 @router.get("/assets")
@@ -191,9 +192,13 @@ def read_asset_environment(asset_id: str, context: Context) -> FileResponse:
 
 
 @router.get("/assets/{asset_id}/export")
-async def export_asset(asset_id: str, format: DownloadFormat, context: Context, call: Request) -> FileResponse:
-    """A download in another program's format, or the asset itself as a zip."""
-    return await while_connected(call, write_export(context, asset_id, format, (), caller_of(call)))
+async def export_asset(asset_id: str, format: DownloadFormat, context: Context, call: Request, faces: FacesQuery = None) -> FileResponse:
+    """A download in another program's format, or the asset itself as a zip.
+
+    Args:
+        faces: the most that a textured mesh (glb, mesh, usdz, usd) has; 30 000 without it.
+    """
+    return await while_connected(call, write_export(context, asset_id, format, faces, (), caller_of(call)))
 
 
 class DraftResponse(FileResponse):
@@ -208,13 +213,17 @@ class DraftResponse(FileResponse):
 
 
 async def write_export(
-    context: ServerContext, asset_id: str, format: DownloadFormat, edits: Sequence[Edit], caller: Caller
+    context: ServerContext, asset_id: str, format: DownloadFormat, faces: int | None, edits: Sequence[Edit], caller: Caller
 ) -> FileResponse:
     """A download of an asset with edits put into it.
 
     Raises:
-        ProblemError: no such asset, it has nothing that the format holds, or the edits no longer apply.
+        ProblemError: no such asset, it has nothing that the format holds, the format has no use for `faces`, or the edits no longer apply.
     """
+    try:
+        refuse_faces(faces, (format,))
+    except ValueError as error:
+        raise ProblemError(422, f"faces: {error}.") from error
     row = await run_in_threadpool(_read_row, context, asset_id)
     folder = Path(tempfile.mkdtemp(prefix=".export-", dir=context.scratch.folder))
     out, listed = folder / f"asset{FILE_KINDS[format].suffix}", folder / "edits.json"
@@ -225,7 +234,7 @@ async def write_export(
             listed.write_text(json.dumps([plain_edit(edit) for edit in edits]))
             await run_in_threadpool(fetch_edit_files, context.directory, edits)
             changes = (str(listed), str(context.directory.environments), str(row.version + 1))
-        await _run_tool(context, caller, asset, "export", str(asset), str(out), format, *changes)
+        await _run_tool(context, caller, asset, "export", str(asset), str(out), format, str(faces or 0), *changes)
     except (ProblemError, ArtifactError, OSError, asyncio.CancelledError):
         shutil.rmtree(folder, ignore_errors=True)
         raise

@@ -26,7 +26,7 @@ from drgs_server.api.rest_records import (
     SnapshotInfo,
     SnapshotList,
 )
-from drgs_server.api.routes_assets import save_version, write_export
+from drgs_server.api.routes_assets import FacesQuery, save_version, write_export
 from drgs_server.api.while_connected import while_connected
 from drgs_server.live.admission import Caller
 from drgs_server.live.edit_log import ChangeRequest
@@ -137,12 +137,18 @@ async def save_session(session_id: str, context: Context, call: Request, body: S
 
 
 @router.get("/{session_id}/export")
-async def export_session(session_id: str, format: DownloadFormat, context: Context, call: Request) -> FileResponse:
-    """A download of the object as it is now, with the edits in force put into it. Nothing of it is kept; `save` keeps a version."""
+async def export_session(
+    session_id: str, format: DownloadFormat, context: Context, call: Request, faces: FacesQuery = None
+) -> FileResponse:
+    """A download of the object as it is now, with the edits in force put into it. Nothing of it is kept; `save` keeps a version.
+
+    Args:
+        faces: the most that a textured mesh (glb, mesh, usdz, usd) has; 30 000 without it.
+    """
     session, caller = await context.sessions.get(session_id), caller_of(call, session_id)
 
     async def write() -> FileResponse:
-        return await write_export(context, session.asset_id, format, await context.sessions.applied(session, caller), caller)
+        return await write_export(context, session.asset_id, format, faces, await context.sessions.applied(session, caller), caller)
 
     return await while_connected(call, write())
 

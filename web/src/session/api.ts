@@ -80,9 +80,11 @@ export const listAssets = () => call<AssetList>('GET', '/api/assets');
 export const assetThumb = (asset: AssetInfo) => `/api/assets/${part(asset.id)}/thumb.jpg`;
 export const assetMesh = (id: string) => `/api/assets/${part(id)}/mesh.glb`;
 export const assetEnvironment = (id: string) => `/api/assets/${part(id)}/environment.exr`;
-export const assetExport = (id: string, format: DownloadFormat) => `/api/assets/${part(id)}/export?format=${format}`;
+/** `faces`: the most that a textured mesh has; null where the server knows, or the format has none. */
+export const assetExport = (id: string, format: DownloadFormat, faces: number | null) => `/api/assets/${part(id)}/export?${exportQuery(format, faces)}`;
 /** The same with the session's edits put into it. */
-export const sessionExport = (id: string, format: DownloadFormat) => `/api/sessions/${part(id)}/export?format=${format}`;
+export const sessionExport = (id: string, format: DownloadFormat, faces: number | null) => `/api/sessions/${part(id)}/export?${exportQuery(format, faces)}`;
+const exportQuery = (format: DownloadFormat, faces: number | null) => `format=${format}${faces === null ? '' : `&faces=${faces}`}`;
 export const listTrainingViews = (asset: string) => call<TrainingViewList>('GET', `/api/assets/${part(asset)}/views`);
 export const photograph = (asset: string, view: number) => `/api/assets/${part(asset)}/views/${view}/photograph.webp`;
 

@@ -380,6 +380,8 @@ export interface ExportRequest {
   kind: "export";
   asset: string;
   formats: ("ply" | "ply3" | "spz" | "glb" | "mesh" | "usdz" | "usd" | "env" | "html" | "zip")[];
+  /** The most that textured meshes (glb, mesh, usdz, usd) have; 30 000 where nothing is said. */
+  faces?: number | null;
 }
 
 /** A part of the surface that is held: some vertices by number, or those around a picked point. */

@@ -5,7 +5,8 @@ Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full
     asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
     environment SOURCE OUT      EXR or Radiance HDR -> EXR
     look CAPTURE OUT NAME       folder of a capture, which sentences call NAME -> folder with look.json and, where it has pictures, sheet.jpg (drgs/evaluate/look_at_capture.py)
-    export ASSET OUT FORMAT [EDITS ENVIRONMENTS N]      asset folder, with the edits put into it -> a format of drgs/exchange/export_formats.py, or zip (the asset itself)
+    export ASSET OUT FORMAT FACES [EDITS ENVIRONMENTS N]    asset folder, with the edits put into it -> a format of drgs/exchange/export_formats.py, or zip
+                                (the asset itself); FACES: the most that a textured mesh has, 0 where nobody says
     version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
 """
 
@@ -189,19 +190,19 @@ def make_environment(source: Path, out: Path) -> None:
     out.write_bytes(encode_environment(decode_environment(source.read_bytes(), source.name, limits=limits)))
 
 
-def export(asset_folder: Path, out: Path, format: Any) -> None:
+def export(asset_folder: Path, out: Path, format: Any, faces: int) -> None:
     from drgs.scene.asset import load_asset
 
     picture = asset_folder / "thumb.jpg"
-    write_export(load_asset(asset_folder), asset_folder, out, format, lambda: picture.read_bytes() if picture.exists() else None)
+    write_export(load_asset(asset_folder), asset_folder, out, format, faces, lambda: picture.read_bytes() if picture.exists() else None)
 
 
-def export_edited(asset_folder: Path, out: Path, format: Any, edits: Path, environments: Path, version: int) -> None:
+def export_edited(asset_folder: Path, out: Path, format: Any, faces: int, edits: Path, environments: Path, version: int) -> None:
     made = edited_asset(asset_folder, edits, environments, version)
-    write_export(made, asset_folder, out, format, lambda: thumbnail(made))
+    write_export(made, asset_folder, out, format, faces, lambda: thumbnail(made))
 
 
-def write_export(asset: "Asset", source: Path, out: Path, format: Any, picture: Callable[[], bytes | None]) -> None:
+def write_export(asset: "Asset", source: Path, out: Path, format: Any, faces: int, picture: Callable[[], bytes | None]) -> None:
     """`picture` is asked for where the format keeps one; photographs are those of the folder `source`."""
     if format == "zip":
         from drgs.scene.asset import load_photographs, save_asset
@@ -210,7 +211,7 @@ def write_export(asset: "Asset", source: Path, out: Path, format: Any, picture: 
     else:
         from drgs.convert.export_asset import export_asset
 
-        export_asset(asset, out, format)
+        export_asset(asset, out, format, faces or None)
 
 
 def main(arguments: list[str]) -> int:
@@ -223,10 +224,10 @@ def main(arguments: list[str]) -> int:
                 make_environment(Path(source), Path(out))
             case ["look", capture, out, name]:
                 make_look(Path(capture), Path(out), name)
-            case ["export", asset, out, format]:
-                export(Path(asset), Path(out), format)
-            case ["export", asset, out, format, edits, environments, version]:
-                export_edited(Path(asset), Path(out), format, Path(edits), Path(environments), int(version))
+            case ["export", asset, out, format, faces]:
+                export(Path(asset), Path(out), format, int(faces))
+            case ["export", asset, out, format, faces, edits, environments, version]:
+                export_edited(Path(asset), Path(out), format, int(faces), Path(edits), Path(environments), int(version))
             case ["version", asset, out, edits, environments, version]:
                 make_version(Path(asset), Path(out), Path(edits), Path(environments), int(version))
             case _:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from drgs.exchange.export_formats import FILE_KINDS, DownloadFormat
+from drgs.exchange.export_formats import FEWEST_FACES, FILE_KINDS, MOST_FACES, DownloadFormat, refuse_faces
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.scene.edits import Coordinate, Edit, Triple
 from drgs.scene.tone_curve import ToneCurve
@@ -253,11 +253,18 @@ class ExportRequest(_Job):
     kind: Literal["export"]
     asset: Annotated[str, Field(max_length=64), PlainText]
     formats: Annotated[list[DownloadFormat], Field(min_length=1, max_length=len(FILE_KINDS))]
+    faces: Annotated[int, Field(ge=FEWEST_FACES, le=MOST_FACES)] | None = None
+    """The most that textured meshes (glb, mesh, usdz, usd) have; 30 000 where nothing is said."""
 
     @model_validator(mode="after")
     def _names_each_once(self) -> "ExportRequest":
         if len(set(self.formats)) < len(self.formats):
             raise ValueError(f"each format is written once; found {self.formats}")
+        return self
+
+    @model_validator(mode="after")
+    def _has_a_use_for_faces(self) -> "ExportRequest":
+        refuse_faces(self.faces, self.formats)
         return self
 
 

@@ -1,19 +1,23 @@
 /** The object as files for other programs, with or without what was done to it here. */
 
 import { signal } from '@preact/signals';
-import { FILE_KINDS, type DownloadFormat } from '../../session/constants.gen';
+import { DEFAULT_FACES, FEWEST_FACES, FILE_KINDS, MOST_FACES, type DownloadFormat } from '../../session/constants.gen';
 import * as api from '../../session/api';
 import { log } from '../../session/edit_log';
 import { refreshAssets } from '../../session/library';
 import { attempt, notify } from '../../session/notices';
 import { session } from '../../session/session';
 import { download } from '../download';
-import { Section, Switch } from '../fields';
+import { NumberField, Section, Switch } from '../fields';
 import { Icon } from '../icons';
 
 const withEdits = signal(true);
+/** The most that textured meshes have. */
+const mostFaces = signal(DEFAULT_FACES);
 /** The file that the server is writing; null while there is none. */
 const writing = signal<{ format: DownloadFormat; leaving: AbortController } | null>(null);
+
+const textured = new Set(FILE_KINDS.filter((kind) => kind.textured).map((kind) => kind.format));
 
 /** Bytes of the files written so far, by address; after further edits a file may take some more or less. */
 const sizes = signal<Record<string, number>>({});
@@ -21,7 +25,10 @@ const sizes = signal<Record<string, number>>({});
 export function Files() {
   const open = session.value!;
   const edited = log.value.edits.length > 0;
-  const address = (format: DownloadFormat) => (edited && withEdits.value ? api.sessionExport(open.id, format) : api.assetExport(open.asset, format));
+  const address = (format: DownloadFormat) => {
+    const faces = textured.has(format) && mostFaces.value !== DEFAULT_FACES ? mostFaces.value : null;
+    return edited && withEdits.value ? api.sessionExport(open.id, format, faces) : api.assetExport(open.asset, format, faces);
+  };
   const save = async (format: DownloadFormat) => {
     if (writing.value) return;
     const leaving = new AbortController();
@@ -37,6 +44,15 @@ export function Files() {
       {edited && (
         <Switch label="With this session’s edits" title="VertexMaterials, light and shape as they are on screen; off: as captured" value={withEdits.value} onChange={(value) => (withEdits.value = value)} />
       )}
+      <NumberField
+        label="Faces of textured meshes"
+        title="The most that the mesh of a GLB or USDZ has; the detail of those left out goes into its textures"
+        value={mostFaces.value}
+        min={FEWEST_FACES}
+        max={MOST_FACES}
+        step={1}
+        onEnter={(count) => (mostFaces.value = Math.round(count))}
+      />
       <ul class="files">
         {FILE_KINDS.map(({ format, title, description }) => (
           <li>

@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 
-from drgs.exchange.export_formats import FILE_KINDS
+from drgs.exchange.export_formats import FILE_KINDS, TEXTURED_FORMATS
 from drgs.reconstruct.progress import Progress
 from drgs_worker.jobs.progress import JobStopped
 from drgs_worker.jobs.requests import ExportRequest
@@ -28,8 +28,9 @@ class ExportRun(AbstractJobRun):
         out = job.files / f"asset-{format}{FILE_KINDS[format].suffix}"
         draft = out.with_name(f"draft-{out.name}")
         source = job.fetch_asset(self._asked.asset)
+        faces = self._asked.faces if format in TEXTURED_FORMATS else None
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "drgs_worker.jobs.file_tool", "export", str(source), str(draft), format],
+            [sys.executable, "-P", "-m", "drgs_worker.jobs.file_tool", "export", str(source), str(draft), format, str(faces or 0)],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
