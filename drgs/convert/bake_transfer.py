@@ -51,5 +51,15 @@ def bake_transfer(mesh: TriangleMesh) -> Float[Tensor, "vertex 9"]:
     return total
 
 
+def open_transfer(mesh: TriangleMesh) -> Float[Tensor, "vertex 9"]:
+    """The same of places that nothing is in the way of, by the same directions."""
+    directions = sphere_lattice(DIRECTIONS).to(mesh.vertices)
+    total, whole = torch.zeros(len(mesh.vertices), (DEGREE + 1) ** 2), torch.full((len(mesh.vertices), 1), 1e-6)
+    for direction, values in zip(directions, sh_basis(directions, DEGREE), strict=True):
+        cosines = _cosines(mesh, direction)[:, None]
+        total, whole = total + cosines * values, whole + cosines
+    return total / whole
+
+
 def _cosines(mesh: TriangleMesh, direction: Float[Tensor, "3"]) -> Float[Tensor, "vertex"]:
     return (mesh.normals @ direction).clamp(min=0)

@@ -15,6 +15,7 @@ Viewers of Gaussians show colours as they stand in the file, so there the linear
 
 import os
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drgs.convert.bake_textures import TexturedMesh, bake_textures
+from drgs.convert.gltf_reflectance import BASE_COLOR_MARK, gltf_base_color
 from drgs.convert.page.encode_page import encode_page
 from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, TEXTURED_FORMATS, ExportFormat, refuse_faces
 from drgs.exchange.exr import encode_environment
@@ -37,7 +39,7 @@ from drgs.maths.frames import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import map_radiance, rotate_sh
 from drgs.scene.asset import Asset
 from drgs.scene.gaussians import Gaussians
-from drgs.scene.mesh import on_cpu
+from drgs.scene.mesh import TriangleMesh, on_cpu
 
 _UPRIGHT_FROM_WORLD = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
 """z up to y up."""
@@ -74,7 +76,8 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int
     left_out = ""
     try:
         if format in TEXTURED_FORMATS:
-            textured = bake_textures(on_cpu(asset.mesh), faces or DEFAULT_FACES)
+            mesh = on_cpu(asset.mesh)
+            textured = bake_textures(_with_gltf_colors(mesh) if format in ("glb", "mesh") else mesh, faces or DEFAULT_FACES)
             kept, all_faces = len(textured.mesh.faces), len(asset.mesh.faces)
             left_out = "" if kept == all_faces else f"{kept} of the mesh's {all_faces} faces, the detail of the others in its textures"
             if format == "usd":
@@ -127,9 +130,13 @@ def _textured_glb(asset: Asset, textured: TexturedMesh, with_splats: bool) -> by
         attributes["TANGENT"] = textured.tangents
         textures["normalTexture"] = {"index": len(images)}
         images.append(encode_png(textured.normal))
-    material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
+    material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}, "extras": BASE_COLOR_MARK}
     points = _splat_points(asset.gaussians) if with_splats and asset.gaussians is not None and len(asset.gaussians.centers) else None
     return encode_glb(GlbMesh(attributes, atlas.faces, material, textures, tuple(images)), asset.meters_per_unit, points)
+
+
+def _with_gltf_colors(mesh: TriangleMesh) -> TriangleMesh:
+    return replace(mesh, albedo=gltf_base_color(mesh.albedo, mesh.roughness, mesh.metallic))
 
 
 def _usd_scene(asset: Asset, textured: TexturedMesh) -> UsdScene:

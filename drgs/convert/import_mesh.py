@@ -26,6 +26,7 @@ from PIL import Image
 from torch import Tensor
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from drgs.convert.gltf_reflectance import BASE_COLOR_MARK, albedo_from_gltf
 from drgs.convert.import_splats import import_splats
 from drgs.convert.sample_textures import Textures
 from drgs.exchange.gltf_accessors import open_gltf
@@ -253,6 +254,8 @@ def _vertex_materials(
         if colors is not None:
             scale = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1.0
             albedo *= np.asarray(colors, np.float64)[:, :3] / scale  # COLOR_0 is linear
+        if exact.get("extras") == BASE_COLOR_MARK:
+            albedo = albedo_from_gltf(*map(torch.from_numpy, (albedo, roughness, metallic))).numpy()
     elif isinstance(material, SimpleMaterial) and visual.defined:
         if uv is not None and material.image is not None:
             albedo = _linear(textures.sample(material.image, uv))
