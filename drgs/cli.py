@@ -19,7 +19,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, FEWEST_FACES, FILE_KINDS, ExportFormat, export_format_of
+from drgs.exchange.export_formats import (
+    DEFAULT_FACES,
+    EXPORT_FORMATS,
+    FEWEST_FACES,
+    FILE_KINDS,
+    SPLAT_KINDS,
+    CommandFormat,
+    command_format_of,
+    refuse_faces,
+)
 from drgs.installation import missing_package, unsupported_system
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.openmp import spin_briefly
@@ -97,7 +106,9 @@ class Denoiser(StrEnum):
     oidn = "oidn"
 
 
-EXPORT_HELP = "; ".join(f"{name}: {FILE_KINDS[name].title}" for name in EXPORT_FORMATS)
+EXPORT_HELP = "; ".join(
+    f"{name}: {kind.title}" for name, kind in (*((name, FILE_KINDS[name]) for name in EXPORT_FORMATS), *SPLAT_KINDS.items())
+)
 AssetPath = Annotated[Path, typer.Argument(metavar="ASSET", help="Asset folder, or the same zipped.")]
 DatasetPath = Annotated[
     Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP, Metashape or NeRO folder; pictures or a film.")
@@ -306,7 +317,7 @@ def import_(
 def export(
     asset: AssetPath,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write.")],
-    format: Annotated[ExportFormat | None, typer.Option(help=EXPORT_HELP, show_default="by OUT's suffix")] = None,
+    format: Annotated[CommandFormat | None, typer.Option(help=EXPORT_HELP, show_default="by OUT's suffix")] = None,
     faces: Annotated[
         int | None,
         typer.Option(help="The most that a textured mesh (glb, mesh, usdz, usd) has.", show_default=str(DEFAULT_FACES), min=FEWEST_FACES),
@@ -314,14 +325,19 @@ def export(
 ) -> None:
     """Write an asset as a file that other programs read."""
     try:
-        chosen = format or export_format_of(out)
+        chosen = format or command_format_of(out)
     except ValueError as error:
         raise UsageError(str(error)) from error
 
     from drgs.convert.export_asset import export_asset
+    from drgs.convert.transform_splats import transform_splats
     from drgs.scene.asset import load_asset
 
-    left_out = export_asset(load_asset(asset), out, chosen, faces)
+    if chosen == "sog" or chosen == "compressed":
+        refuse_faces(faces, (chosen,))
+        left_out = transform_splats(load_asset(asset), out, chosen)
+    else:
+        left_out = export_asset(load_asset(asset), out, chosen, faces)
     print(f"Wrote {out}: {out.stat().st_size / 1e6:.1f} MB{', ' if left_out else ''}{left_out}", file=sys.stderr)
 
 

@@ -12,6 +12,10 @@ ExportFormat = Literal["ply", "ply3", "spz", "glb", "mesh", "usdz", "usd", "env"
 """What `drgs.export_asset` writes."""
 DownloadFormat = Literal[ExportFormat, "zip"]
 """What the service gives out: these, and the asset itself."""
+SplatFormat = Literal["sog", "compressed"]
+"""What the command alone writes, by another program (drgs/convert/transform_splats.py)."""
+CommandFormat = Literal[ExportFormat, SplatFormat]
+"""What `drgs export` writes."""
 DEFAULT_FACES = 30_000
 """The most that a textured mesh has where nobody says. Charts of so many take some ten seconds of a core, of twice as many a minute."""
 FEWEST_FACES = 4
@@ -74,7 +78,28 @@ FILE_KINDS: dict[DownloadFormat, FileKind] = {
 }
 """In the order in which they are offered. Of two formats with one suffix the first is what the suffix stands for."""
 EXPORT_FORMATS: tuple[ExportFormat, ...] = tuple(name for name in FILE_KINDS if name != "zip")
+SPLAT_KINDS: dict[SplatFormat, FileKind] = {
+    "sog": FileKind(
+        ".sog", "Gaussians (SOG)", "The Gaussians in a ninth of the bytes, for SuperSplat and PlayCanvas; takes minutes without a GPU"
+    ),
+    "compressed": FileKind(
+        ".compressed.ply", "Gaussians (compressed PLY)", "The Gaussians in a quarter of the bytes, for SuperSplat and PlayCanvas"
+    ),
+}
+"""By splat-transform, where it is installed."""
 TEXTURED_FORMATS: tuple[ExportFormat, ...] = tuple(name for name in EXPORT_FORMATS if FILE_KINDS[name].textured)
+
+
+def command_format_of(path: Path) -> CommandFormat:
+    """As export_format_of, with the endings of SPLAT_KINDS.
+
+    Raises:
+        ValueError: it stands for none.
+    """
+    for name, kind in SPLAT_KINDS.items():
+        if path.name.lower().endswith(kind.suffix):
+            return name
+    return export_format_of(path)
 
 
 def refuse_faces(faces: int | None, formats: Sequence[str]) -> None:

@@ -5,12 +5,27 @@ from typing import get_args
 
 import pytest
 
-from drgs.exchange.export_formats import EXPORT_FORMATS, FILE_KINDS, DownloadFormat, ExportFormat, export_format_of
+from drgs.exchange.export_formats import (
+    EXPORT_FORMATS,
+    FILE_KINDS,
+    SPLAT_KINDS,
+    DownloadFormat,
+    ExportFormat,
+    SplatFormat,
+    command_format_of,
+    export_format_of,
+)
 
 
 def test_the_table_holds_every_format_once():
     assert set(FILE_KINDS) == set(get_args(DownloadFormat))
     assert set(EXPORT_FORMATS) == set(get_args(ExportFormat))
+    assert set(SPLAT_KINDS) == set(get_args(SplatFormat))
+
+
+@pytest.mark.parametrize(("name", "expected"), [("a.sog", "sog"), ("A.compressed.PLY", "compressed"), ("a.b.ply", "ply"), ("a.glb", "glb")])
+def test_the_command_knows_two_endings_more(name: str, expected: str):
+    assert command_format_of(Path(name)) == expected
 
 
 @pytest.mark.parametrize(

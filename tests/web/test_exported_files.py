@@ -8,6 +8,7 @@ import json
 import shutil
 import struct
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -180,6 +181,25 @@ def test_splat_transform_reads_an_exported_spz_as_it_was_meant(run_node, tmp_pat
     directions = np.random.default_rng(0).normal(size=given["centers"].shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     assert np.allclose(radiance({"sh": sh}, directions @ turn.T), radiance(given, directions), atol=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["a.sog", "a.compressed.ply"])
+def test_the_command_has_splat_transform_write_what_it_reads_back(run_node, tmp_path, name):
+    """Where Node is there; of the file its own reader gets as many splats as the asset has, at their places."""
+    asset = ball_asset()
+    save_asset(asset, tmp_path / "asset")
+    said = subprocess.run(
+        [sys.executable, "-m", "drgs.cli", "export", str(tmp_path / "asset"), str(tmp_path / name)],
+        check=True, capture_output=True, text=True, timeout=PATIENCE_SECONDS, cwd=ROOT,
+    ).stderr  # fmt: skip
+    assert f"Wrote {tmp_path / name}" in said and "materials left out" in said
+    run_node("node_modules/@playcanvas/splat-transform/bin/cli.mjs", "--quiet", tmp_path / name, tmp_path / "back.ply")
+    read = parse_ply((tmp_path / "back.ply").read_bytes()).elements["vertex"].scalars
+    found = np.stack([read[axis] for axis in "xyz"], -1).astype(float)
+    given = meant(asset)["centers"]
+    nearest = np.linalg.norm(found[:, None] - given[None], axis=-1).min(0)
+    assert len(found) == len(given) and nearest.max() < 0.01 * np.ptp(given)
 
 
 def check_splats(run_node: Callable[..., str], path: Path, given: dict[str, np.ndarray], model: str) -> None:
