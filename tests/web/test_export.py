@@ -157,6 +157,12 @@ def test_a_film_is_made_of_views_previewed_and_ordered_as_previewed(ball: Viewer
     eye = asked["path"]["keyframes"][0]["eye"]
     np.testing.assert_allclose(cameras[0].center_world.numpy(), eye, atol=1e-5)
 
+    page.get_by_role("switch", name="Closed path").check()
+    enter(page, "Seconds to view 1", "1")
+    expect(page.get_by_text("36 pictures, 24 a second.")).to_be_visible()
+    assert len(load_cameras(downloaded(ball, "button", "Save cameras", tmp_path / "closed.json"))) == 36, "the first view comes once"
+    page.get_by_role("switch", name="Closed path").uncheck()
+
     card = page.get_by_role("listitem", name="Pictures ball, film")
     card.get_by_role("button", name="Cancel").click()
     card.get_by_role("button", name="Remove").click()

@@ -9,8 +9,8 @@ import pytest
 from drgs_worker.jobs.camera_path import path_views
 from drgs_worker.jobs.requests import CameraKeyframe, CameraPath, path_frames
 
-FIXTURE = Path(__file__).parents[2] / "web" / "tests" / "stage" / "camera" / "camera_path.json"
-"""Keyframes and the cameras between them; vitest holds the page's twin to the same file."""
+FIXTURES = Path(__file__).parents[2] / "web" / "tests" / "stage" / "camera"
+"""Keyframes and the cameras between them; vitest holds the page's twin to the same files."""
 
 
 def path_of(*keyframes: tuple) -> CameraPath:
@@ -67,9 +67,38 @@ def test_a_view_that_is_held_stands_still_and_none_is_overshot() -> None:
     assert way[:, 2].max() < 2 + 1e-9 and way[:, 2].min() > -1e-9
 
 
-def test_the_numbers_are_those_that_the_page_previews() -> None:
-    stored = json.loads(FIXTURE.read_text())
-    views = path_views(CameraPath(keyframes=stored["keyframes"]), stored["fps"])
+def closed_path(*keyframes: tuple) -> CameraPath:
+    return path_of(*keyframes).model_copy(update={"closed": True})
+
+
+def test_a_closed_path_comes_back_to_its_first_view_which_it_shows_once() -> None:
+    path = closed_path(UP, SIDE, TURN)
+    way = eyes(path, 4)
+    assert len(way) == path_frames(path, 4) == 16, "four seconds, one of them back to the first view"
+    for index, keyframe in zip((0, 4, 12), path.keyframes, strict=True):
+        np.testing.assert_allclose(way[index], keyframe.eye, atol=1e-9)
+
+
+def test_a_closed_path_goes_through_its_seam_as_through_any_view() -> None:
+    """Four views a quarter of a turn apart, a second each: a circle at one speed, seam included."""
+    corners = [((3 * np.cos(a), 3 * np.sin(a), 1), (0, 0, 1), 1) for a in np.radians([0, 90, 180, 270])]
+    way = eyes(closed_path(*corners), 50)
+    once_more = np.concatenate([way, way[:2]])
+    speed = np.linalg.norm(np.diff(once_more, axis=0), axis=1) * 50
+    assert len(way) == 200
+    np.testing.assert_allclose(speed, 3 * np.pi / 2, rtol=1e-3)
+
+
+def test_a_closed_path_of_two_views_goes_there_and_back() -> None:
+    way = eyes(closed_path(((0, -2, 0), (0, 0, 0), 1), ((0, -2, 2), (0, 0, 0), 1)), 10)
+    assert len(way) == 20
+    np.testing.assert_allclose(way[1:10], way[11:][::-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["camera_path.json", "camera_path_closed.json"])
+def test_the_numbers_are_those_that_the_page_previews(name: str) -> None:
+    stored = json.loads((FIXTURES / name).read_text())
+    views = path_views(CameraPath(keyframes=stored["keyframes"], closed=stored.get("closed", False)), stored["fps"])
     assert len(views) == len(stored["views"]) > 10
     for (matrix, fov), wanted in zip(views, stored["views"], strict=True):
         np.testing.assert_allclose(matrix, wanted["world_from_camera"], atol=1e-9)

@@ -149,7 +149,7 @@ export interface CameraKeyframe {
   /** Straight ahead: what the camera goes round on its way to the next view [world units]. */
   target: [number, number, number];
   fov_y_degrees?: number;
-  /** From the view before to this one; that of the first does not count. */
+  /** From the view before to this one; that of the first counts on a closed path alone, from the last. */
   seconds?: number;
 }
 
@@ -172,6 +172,8 @@ export interface CameraMessage {
 /** A film: the camera passes these views, smoothly in time and around what it looks at. */
 export interface CameraPath {
   keyframes: CameraKeyframe[];
+  /** Go on from the last view to the first without resting there, so that the film can be shown over and over. */
+  closed?: boolean;
 }
 
 /**

@@ -3,7 +3,7 @@
 In: keyframes and a frame rate. Out: OpenGL camera-to-world of each picture. A view is taken apart into the point it looks at, azimuth,
 elevation and logarithm of the distance around that point, and field of view; each of them is a monotone cubic of time. So the camera
 goes round an object instead of through it, passes every view at its time, never goes beyond the views on either side, and rests at both
-ends. Up is z. web/src/stage/camera/camera_path.ts is its twin for the preview, and a test holds both to the same numbers.
+ends, unless the path is closed: then it goes on through the first view as through any other. Up is z. web/src/stage/camera/camera_path.ts is its twin for the preview, and a test holds both to the same numbers.
 Source: Fritsch & Butland 1984, "A method for constructing local monotone piecewise cubic interpolants", for the slopes.
 """
 
@@ -17,11 +17,12 @@ HALF_TURN = 1e-9
 
 def path_views(path: CameraPath, fps: float) -> list[tuple[np.ndarray, float]]:
     """(4, 4) OpenGL camera-to-world and vertical field of view [degrees] of the picture at each 1 / fps seconds."""
-    times = np.cumsum([0.0, *(keyframe.seconds for keyframe in path.keyframes[1:])])
-    values = np.stack([_coordinates(keyframe) for keyframe in path.keyframes])
+    keyframes = [*path.keyframes, path.keyframes[0]] if path.closed else path.keyframes
+    times = np.cumsum([0.0, *(keyframe.seconds for keyframe in keyframes[1:])])
+    values = np.stack([_coordinates(keyframe) for keyframe in keyframes])
     for k in range(1, len(values)):  # the shorter way round
         values[k, 3] -= 2 * np.pi * np.floor((values[k, 3] - values[k - 1, 3]) / (2 * np.pi) + 0.5 - HALF_TURN)
-    slopes = _slopes(times, values)
+    slopes = _slopes(times, values, path.closed)
     return [_view(_interpolate(times, values, slopes, k / fps)) for k in range(path_frames(path, fps))]
 
 
@@ -32,16 +33,18 @@ def _coordinates(keyframe: CameraKeyframe) -> np.ndarray:
     return np.array([*keyframe.target, np.arctan2(y, x), np.arctan2(z, across), np.log(np.linalg.norm(offset)), keyframe.fov_y_degrees])
 
 
-def _slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(keyframe, coordinate) per second: weighted harmonic means of the secants on both sides; 0 at the ends and where they differ in sign."""
+def _slopes(times: np.ndarray, values: np.ndarray, closed: bool) -> np.ndarray:
+    """(keyframe, coordinate) per second: weighted harmonic means of the secants on both sides; 0 where they differ in sign, and at open ends."""
     steps = np.diff(times)[:, None]
-    before, after = (secants := np.diff(values, axis=0) / steps)[:-1], secants[1:]
+    secants = np.diff(values, axis=0) / steps
+    if closed:  # behind the last comes the first
+        steps, secants = (np.concatenate([array[-1:], array, array[:1]]) for array in (steps, secants))
+    before, after = secants[:-1], secants[1:]
     weight_before, weight_after = 2 * steps[1:] + steps[:-1], steps[1:] + 2 * steps[:-1]
     goes_on = before * after > 0
     inverse = weight_before / np.where(goes_on, before, 1) + weight_after / np.where(goes_on, after, 1)
-    slopes = np.zeros_like(values)
-    slopes[1:-1] = np.where(goes_on, (weight_before + weight_after) / np.where(goes_on, inverse, 1), 0)
-    return slopes
+    slopes = np.where(goes_on, (weight_before + weight_after) / np.where(goes_on, inverse, 1), 0)
+    return slopes if closed else np.pad(slopes, ((1, 1), (0, 0)))
 
 
 def _interpolate(times: np.ndarray, values: np.ndarray, slopes: np.ndarray, time: float) -> np.ndarray:

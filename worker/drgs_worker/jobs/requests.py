@@ -169,7 +169,7 @@ class CameraKeyframe(_Request):
     """Straight ahead: what the camera goes round on its way to the next view [world units]."""
     fov_y_degrees: Annotated[float, Field(gt=0.1, lt=175)] = 40.0
     seconds: Annotated[float, Field(ge=0.05, le=600)] = 2.0
-    """From the view before to this one; that of the first does not count."""
+    """From the view before to this one; that of the first counts on a closed path alone, from the last."""
 
     @model_validator(mode="after")
     def _looks_somewhere(self) -> "CameraKeyframe":
@@ -182,11 +182,14 @@ class CameraPath(_Request):
     """A film: the camera passes these views, smoothly in time and around what it looks at."""
 
     keyframes: Annotated[list[CameraKeyframe], Field(min_length=2, max_length=200)]
+    closed: bool = False
+    """Go on from the last view to the first without resting there, so that the film can be shown over and over."""
 
 
 def path_frames(path: CameraPath, fps: float) -> int:
-    """Pictures of a film, both ends among them."""
-    return math.floor(sum(keyframe.seconds for keyframe in path.keyframes[1:]) * fps + 1e-6) + 1
+    """Pictures of a film, both ends among them; on a closed path the first view is not shown again."""
+    seconds = sum(keyframe.seconds for keyframe in path.keyframes[0 if path.closed else 1 :])
+    return math.ceil(seconds * fps - 1e-6) if path.closed else math.floor(seconds * fps + 1e-6) + 1
 
 
 class RenderVariant(_Request):

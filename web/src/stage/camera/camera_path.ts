@@ -13,21 +13,28 @@ const FOV_Y_DEGREES = 40;
 /** Half a turn goes counter-clockwise, even where rounding makes it this much more [turns]. */
 const HALF_TURN = 1e-9;
 
+/** On a closed path the first view is the last one, too. */
+const passed = (keyframes: CameraKeyframe[], closed: boolean) => (closed && keyframes.length > 1 ? [...keyframes, keyframes[0]!] : keyframes);
+
 /** Of each keyframe, from the first one on [s]. */
 function keyframeTimes(keyframes: CameraKeyframe[]): number[] {
   let time = 0;
   return keyframes.map((keyframe, k) => (time += k === 0 ? 0 : (keyframe.seconds ?? SECONDS)));
 }
 
-export const pathSeconds = (keyframes: CameraKeyframe[]) => keyframeTimes(keyframes).at(-1) ?? 0;
+export const pathSeconds = (keyframes: CameraKeyframe[], closed: boolean) => keyframeTimes(passed(keyframes, closed)).at(-1) ?? 0;
 
-/** Pictures of the film, both ends among them. */
-export const pathFrames = (keyframes: CameraKeyframe[], fps: number) => Math.floor(pathSeconds(keyframes) * fps + 1e-6) + 1;
+/** Pictures of the film, both ends among them; on a closed path the first view is not shown again. */
+export function pathFrames(keyframes: CameraKeyframe[], fps: number, closed: boolean): number {
+  const steps = pathSeconds(keyframes, closed) * fps;
+  return closed ? Math.max(1, Math.ceil(steps - 1e-6)) : Math.floor(steps + 1e-6) + 1;
+}
 
 /** Where the camera is at a time; at least one keyframe. */
-export function viewAt(keyframes: CameraKeyframe[], time: number): Aim {
-  const times = keyframeTimes(keyframes);
-  const values = keyframes.map(coordinates);
+export function viewAt(keyframes: CameraKeyframe[], time: number, closed: boolean): Aim {
+  const all = passed(keyframes, closed);
+  const times = keyframeTimes(all);
+  const values = all.map(coordinates);
   for (let k = 1; k < values.length; k++) {
     const turn = values[k]![3]! - values[k - 1]![3]!;
     values[k]![3]! -= 2 * Math.PI * Math.floor(turn / (2 * Math.PI) + 0.5 - HALF_TURN); // the shorter way round
@@ -39,7 +46,7 @@ export function viewAt(keyframes: CameraKeyframe[], time: number): Aim {
   const rise = u * u * (3 - 2 * u);
   return view(
     values[k]!.map((value, i) => {
-      const bends = step * u * (1 - u) * ((1 - u) * slope(times, values, k, i) - u * slope(times, values, k + 1, i));
+      const bends = step * u * (1 - u) * ((1 - u) * slope(times, values, k, i, closed) - u * slope(times, values, k + 1, i, closed));
       return value + rise * (values[k + 1]![i]! - value) + bends;
     }),
   );
@@ -51,12 +58,14 @@ function coordinates({ eye, target, fov_y_degrees }: CameraKeyframe): number[] {
   return [...target, Math.atan2(y, x), Math.atan2(z, Math.hypot(x, y)), Math.log(Math.hypot(x, y, z)), fov_y_degrees ?? FOV_Y_DEGREES];
 }
 
-/** Slope of coordinate i at keyframe k, per second: a weighted harmonic mean of the secants on both sides; 0 at the ends and where they differ in sign. */
-function slope(times: number[], values: number[][], k: number, i: number): number {
-  if (k === 0 || k === times.length - 1) return 0;
-  const [stepBefore, stepAfter] = [times[k]! - times[k - 1]!, times[k + 1]! - times[k]!];
-  const before = (values[k]![i]! - values[k - 1]![i]!) / stepBefore;
-  const after = (values[k + 1]![i]! - values[k]![i]!) / stepAfter;
+/** Slope of coordinate i at keyframe k, per second: a weighted harmonic mean of the secants on both sides; 0 where they differ in sign, and at open ends. */
+function slope(times: number[], values: number[][], k: number, i: number, closed: boolean): number {
+  const last = times.length - 1;
+  if (!closed && (k === 0 || k === last)) return 0;
+  const [from, to] = [k === 0 ? last - 1 : k - 1, k === last ? 0 : k];
+  const [stepBefore, stepAfter] = [times[from + 1]! - times[from]!, times[to + 1]! - times[to]!];
+  const before = (values[from + 1]![i]! - values[from]![i]!) / stepBefore;
+  const after = (values[to + 1]![i]! - values[to]![i]!) / stepAfter;
   if (before * after <= 0) return 0;
   const [weightBefore, weightAfter] = [2 * stepAfter + stepBefore, stepAfter + 2 * stepBefore];
   return (weightBefore + weightAfter) / (weightBefore / before + weightAfter / after);
@@ -86,9 +95,9 @@ export function worldFromCamera({ eye, target }: Aim): [Row, Row, Row, Row] {
 }
 
 /** The film's cameras as the transforms.json that `drgs render --cameras` takes. */
-export function asTransforms(keyframes: CameraKeyframe[], fps: number, { width, height }: { width: number; height: number }): string {
-  const frames = Array.from({ length: pathFrames(keyframes, fps) }, (_, k) => {
-    const seen = viewAt(keyframes, k / fps);
+export function asTransforms(keyframes: CameraKeyframe[], fps: number, { width, height }: { width: number; height: number }, closed: boolean): string {
+  const frames = Array.from({ length: pathFrames(keyframes, fps, closed) }, (_, k) => {
+    const seen = viewAt(keyframes, k / fps, closed);
     const focal = height / 2 / Math.tan((seen.fov_y_degrees * Math.PI) / 360);
     return { file_path: String(k).padStart(4, '0'), fl_x: focal, fl_y: focal, transform_matrix: worldFromCamera(seen) };
   });

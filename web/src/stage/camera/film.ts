@@ -10,7 +10,7 @@ import { pathSeconds, viewAt } from './camera_path';
 export interface FilmView extends Aim {
   /** Within its film. */
   id: number;
-  /** From the view before to this one; that of the first does not count. */
+  /** From the view before to this one; to the first one from the last, on a closed path. */
   seconds: number;
 }
 
@@ -22,7 +22,10 @@ const SECONDS = 2;
 /** By asset. */
 const films = preference<Record<string, FilmView[]>>('films', {});
 export const filmViews = computed<FilmView[]>(() => films.value[session.value?.asset ?? ''] ?? []);
-export const filmSeconds = computed(() => pathSeconds(filmViews.value));
+/** By asset: whether its film goes on from the last view to the first. */
+const closed = preference<Record<string, boolean>>('closedFilms', {});
+export const filmClosed = computed(() => closed.value[session.value?.asset ?? ''] ?? false);
+export const filmSeconds = computed(() => pathSeconds(filmViews.value, filmClosed.value));
 export const filmPlaying = signal(false);
 /** Of the preview [s]. */
 export const filmTime = signal(0);
@@ -33,6 +36,14 @@ function setViews(views: FilmView[]): void {
   stopFilm();
   const { [asset]: _, ...others } = films.value;
   films.value = views.length ? { ...others, [asset]: views } : others;
+  filmTime.value = Math.min(filmTime.value, filmSeconds.value);
+}
+
+export function closeFilm(value: boolean): void {
+  const asset = session.value?.asset;
+  if (!asset) return;
+  stopFilm();
+  closed.value = { ...closed.value, [asset]: value };
   filmTime.value = Math.min(filmTime.value, filmSeconds.value);
 }
 
@@ -67,10 +78,10 @@ export function seekFilm(time: number): void {
   filmTime.value = Math.min(Math.max(time, 0), filmSeconds.value);
   if (filmViews.value.length === 0) return;
   flying.value = false;
-  wantedAim.value = { ...viewAt(filmViews.value, filmTime.value), smooth: false };
+  wantedAim.value = { ...viewAt(filmViews.value, filmTime.value, filmClosed.value), smooth: false };
 }
 
-/** From where the preview is; from the start once it has come to the end. */
+/** From where the preview is; from the start once it has come to the end, where a closed one goes on. */
 export function playFilm(): void {
   if (filmViews.value.length < 2 || filmPlaying.value) return;
   filmPlaying.value = true;
@@ -82,7 +93,8 @@ export function playFilm(): void {
   const step = (now: number) => {
     if (!filmPlaying.value) return;
     if (session.value?.asset !== asset) return stopFilm();
-    seekFilm(filmTime.value + Math.max(0, now - before) / 1000);
+    const time = filmTime.value + Math.max(0, now - before) / 1000;
+    seekFilm(filmClosed.value ? time % filmSeconds.value : time);
     before = now;
     if (filmTime.value >= filmSeconds.value) stopFilm();
     else requestAnimationFrame(step);

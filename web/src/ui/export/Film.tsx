@@ -9,9 +9,9 @@ import { stillBounces } from '../../session/api';
 import { session, settings } from '../../session/session';
 import { aimNow } from '../../session/view';
 import { asTransforms, pathFrames } from '../../stage/camera/camera_path';
-import { addView, filmPlaying, filmSeconds, filmTime, filmViews, LEAST_SECONDS, MOST_SECONDS, moveView, playFilm, removeView, seekFilm, setViewSeconds, showView, stopFilm, type FilmView } from '../../stage/camera/film';
+import { addView, closeFilm, filmClosed, filmPlaying, filmSeconds, filmTime, filmViews, LEAST_SECONDS, MOST_SECONDS, moveView, playFilm, removeView, seekFilm, setViewSeconds, showView, stopFilm, type FilmView } from '../../stage/camera/film';
 import { download } from '../download';
-import { Choice, NumberField, Section, Slider } from '../fields';
+import { Choice, NumberField, Section, Slider, Switch } from '../fields';
 import { Icon } from '../icons';
 import { libraryOpen } from '../layout';
 
@@ -45,7 +45,7 @@ async function renderFilm(what: string, way: Pick<RenderRequest, 'turntable' | '
 const keyframes = () => filmViews.value.map(({ eye, target, fov_y_degrees, seconds }) => ({ eye, target, fov_y_degrees, seconds }));
 
 function saveCameras(): void {
-  const cameras = asTransforms(keyframes(), FPS, SIZES[size.value]);
+  const cameras = asTransforms(keyframes(), FPS, SIZES[size.value], filmClosed.value);
   download(new Blob([cameras], { type: 'application/json' }), 'transforms.json');
   notify('These cameras are what `drgs render --cameras` takes.', 'info');
 }
@@ -72,6 +72,7 @@ export function Film() {
           </button>
         )}
       </div>
+      {ready && <Switch label="Closed path" title="From the last view back to the first without resting there: a film to show over and over" value={filmClosed.value} onChange={closeFilm} />}
       {ready && (
         <Slider
           label="Moment"
@@ -107,7 +108,7 @@ export function Film() {
         onChange={(value) => (quality.value = value)}
       />
       <div class="buttons">
-        <button class="primary" disabled={!ready} title="The camera on its way through the views; a job" onClick={() => void renderFilm('film', { path: { keyframes: keyframes() } })}>
+        <button class="primary" disabled={!ready} title="The camera on its way through the views; a job" onClick={() => void renderFilm('film', { path: { keyframes: keyframes(), closed: filmClosed.value } })}>
           <Icon name="film" /> Render film (MP4)
         </button>
         <button title={`${TURNTABLE_FRAMES} pictures round the object, as MP4; a job`} onClick={() => void renderFilm('turntable', { turntable: { frames: TURNTABLE_FRAMES } })}>
@@ -121,7 +122,7 @@ export function Film() {
       </div>
       <p class="hint">
         {ready
-          ? `${pathFrames(views, FPS)} pictures, ${FPS} a second. The camera goes round what it looks at, and rests at both ends.`
+          ? `${pathFrames(views, FPS, filmClosed.value)} pictures, ${FPS} a second. The camera goes round what it looks at, and ${filmClosed.value ? 'comes back to where it began.' : 'rests at both ends.'}`
           : 'Add two views or more: the camera goes from one to the next. Film and turntable show the object with its edits.'}
       </p>
     </Section>
@@ -135,8 +136,8 @@ function ViewRow({ view, index, count }: { view: FilmView; index: number; count:
       <button class="name" title="Look from there" aria-label={`Go to ${name}`} onClick={() => showView(view)}>
         View {index + 1}
       </button>
-      {index > 0 ? (
-        <NumberField bare label={`Seconds to ${name}`} title={`From view ${index} to here`} unit="s" value={view.seconds} min={LEAST_SECONDS} max={MOST_SECONDS} step={0.1} onEnter={(seconds) => setViewSeconds(view.id, seconds)} />
+      {index > 0 || (filmClosed.value && count > 1) ? (
+        <NumberField bare label={`Seconds to ${name}`} title={`From view ${index > 0 ? index : count} to here`} unit="s" value={view.seconds} min={LEAST_SECONDS} max={MOST_SECONDS} step={0.1} onEnter={(seconds) => setViewSeconds(view.id, seconds)} />
       ) : (
         <span class="dim">Start</span>
       )}
