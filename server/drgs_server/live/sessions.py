@@ -234,7 +234,7 @@ class SessionRegistry:
 
     def loaded_bytes(self) -> int:
         """Of assets in memory, of the frames of their simulations, of the environments that they are shown under, and of poses: each about as
-        much as its asset (18 MB of a tracer and its faces for an asset of 28 MB, and up to 4 MB of light kept for whoever moves)."""
+        much as its asset (18 MB of a tracer and its faces for an asset of 28 MB, and 32 bytes a face of light kept for whoever moves)."""
         assets = sum(self._asset_bytes[name] + loaded.simulation_bytes() for name, loaded in self._loaded.items())
         poses = sum(self._asset_bytes.get(session.asset_id, 0) for session in self._posed.values())
         return assets + poses + self._renderer.environment_bytes()
