@@ -335,7 +335,7 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
     place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
     with timed("surface"):
         passes = built.preset.surface
-        moves = replace(passes.surface.moves, box=built.settings.box)
+        moves = replace(passes.surface.moves, texture_radius=built.radius, box=built.settings.box)
         passes = replace(passes, surface=replace(passes.surface, seed=seed, moves=moves))
         surface = surface_stage(place, views, built.gaussians, built.mesh, built.fit.parameters, built.radius, passes)
     yield "surface", None

@@ -4,10 +4,11 @@ Each vertex moves along its own normal by s, which minimises
 
     sum_edges w_e ((x_i - x_j) . n_e / |x_i - x_j|)^2  +  w_outline sum_outlines w_o l_o d_o(x)^2  +  anchor sum_vertices (s / mean edge)^2
     +  even sum_edges ((s_i - s_j) / |x_i - x_j|)^2  +  home sum_vertices w_h ((s - h) / mean edge)^2
+    +  texture sum_vertices w_t ((s - t) / mean edge)^2
 
-with n_e the mean of the wanted normals at the edge's ends, d_o the outlines' distances in pixels and h how far behind or before the vertex its home
-lies, by a sparse linear solve in float64. Homes matter where nothing else says how deep a place is: a floor within a rim may sink as a whole without
-turning any normal, and does so solve by solve if each starts from where the one before ended.
+with n_e the mean of the wanted normals at the edge's ends, d_o the outlines' distances in pixels, h how far behind or before the vertex its home
+lies and t how far its texture (matched_texture), by a sparse linear solve in float64. Homes matter where nothing else says how deep a place is: a
+floor within a rim may sink as a whole without turning any normal, and does so solve by solve if each starts from where the one before ended.
 Weights are robust (Cauchy's), so that creases, where no normal fits an edge, and wrong outlines do not pull their surroundings along.
 Source: Nehab et al. 2005 (positions from normals), with outlines in place of measured depths (docs/sources.md: nehab2005).
 """
@@ -39,6 +40,9 @@ class IntegrationSettings:
     """Of a mean edge's length moved."""
     home: float = 1e-3
     """Of a mean edge's length away from home."""
+    texture: float = 0.5
+    """Of a mean edge's length away from where texture lies. With 0.02 outlines of masks that were drawn too wide hold the tankard's walls where they
+    are; with 0.5 half of what texture says is left of it after a pass."""
     even: float = 0.02
     """Of a difference between neighbours' moves, as an edge's tilt: keeps slivers, which hardly know their normal, with their surroundings."""
     crease_angle: float = 0.2
@@ -51,11 +55,11 @@ class IntegrationSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Homes:
-    """Where the vertices of a surface that moves in many solves began."""
+class Places:
+    """Where vertices should lie: where a surface that moves in many solves began, or where its texture was found."""
 
-    homeward: Tensor
-    """(vertex, 3) from each vertex to its home."""
+    towards: Tensor
+    """(vertex, 3) from each vertex to its place."""
     weight: Tensor
     """(vertex,) 0..1: how much each is held."""
 
@@ -67,13 +71,14 @@ def integrate_normals(
     edges: MeshEdges,
     outlines: OutlineResiduals,
     settings: IntegrationSettings,
-    homes: Homes | None = None,
+    homes: Places | None = None,
+    texture: Places | None = None,
 ) -> Tensor:
     """(vertex, 3) positions after one solve.
 
     Args:
         vertices: (vertex, 3). faces: (face, 3). wanted_normals: (vertex, 3) unit. outlines: of these vertices.
-        homes: None: there are none.
+        homes, texture: None: there are none.
     """
     direction = vertex_normals(vertices, faces)
     start, end = edges.vertices.unbind(1)
@@ -95,9 +100,14 @@ def integrate_normals(
     outline_length = settings.outline_weight * _numpy(outlines.length.double())
     edge2 = float(length.mean()) ** 2
     anchor, pull = settings.anchor / edge2 * identity(count), np.zeros(count)
-    if homes is not None:
-        hold = settings.home / edge2 * _numpy(homes.weight.double())
-        anchor, pull = anchor + diags(hold), hold * _numpy((homes.homeward * direction).sum(1).double())
+    reach = settings.longest_move * _mean_of_edges(length, edges, count)
+    for places, strength in ((homes, settings.home), (texture, settings.texture)):
+        if places is not None:
+            hold = strength / edge2 * _numpy(places.weight.double())
+            away = (places.towards * direction).sum(1)
+            if places is texture:
+                away = torch.maximum(torch.minimum(away, reach), -reach)
+            anchor, pull = anchor + diags(hold), pull + hold * _numpy(away.double())
     inverse = _numpy((1 / length).double())
     differences = csr_matrix(
         (np.concatenate([inverse, -inverse]), (np.tile(np.arange(edge_count), 2), _numpy(torch.cat([start, end])))),
@@ -116,7 +126,6 @@ def integrate_normals(
         normal_matrix = (jacobian.T @ diags(weight) @ jacobian + fixed).tocsc()
         factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         moved = factors.solve(pull - jacobian.T @ (weight * residual))
-    reach = settings.longest_move * _mean_of_edges(length, edges, count)
     step = torch.maximum(torch.minimum(torch.from_numpy(moved).to(vertices), reach), -reach)
     return vertices + unfolded(vertices, direction, step, faces, edges)[:, None] * direction
 

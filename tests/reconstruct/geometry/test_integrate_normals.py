@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from drgs.reconstruct.geometry.integrate_normals import Homes, IntegrationSettings, integrate_normals
+from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outline, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
@@ -72,12 +72,28 @@ def test_what_nothing_holds_goes_home():
     for homeward in (None, -0.03 * true.vertices):
         vertices = true.vertices
         for _ in range(6):
-            homes = None if homeward is None else Homes(homeward, torch.ones(len(vertices)))
+            homes = None if homeward is None else Places(homeward, torch.ones(len(vertices)))
             moved = integrate_normals(vertices, true.faces, true.normals, edges, none, IntegrationSettings(home=1e-2), homes)
             homeward = None if homeward is None else homeward + vertices - moved
             vertices = moved
         radii.append(float(vertices.norm(dim=1).mean()))
     assert abs(radii[0] - 1) < 2e-3 and abs(radii[1] - 0.97) < 5e-3, radii
+
+
+def test_texture_that_lies_deeper_is_followed_though_half_of_it_is_noise():
+    """Places three hundredths deeper, each off by as much again and half of the vertices without any: the surface sinks evenly."""
+    true = sphere_mesh(subdivisions=4)
+    edges, count = mesh_edges(true.faces), len(true.vertices)
+    none = outline_residuals(build_tracer(true), (), [])
+    generator = torch.Generator().manual_seed(0)
+    depth = 0.03 + 0.03 * torch.randn(count, 1, generator=generator)
+    places, weight = true.vertices * (1 - depth), (torch.rand(count, generator=generator) > 0.5).float()
+    vertices = true.vertices
+    for _ in range(4):
+        texture = Places(places - vertices, weight)
+        vertices = integrate_normals(vertices, true.faces, true.normals, edges, none, IntegrationSettings(), texture=texture)
+    radii = vertices.norm(dim=1)
+    assert abs(float(radii.mean()) - 0.97) < 3e-3 and float(radii.std()) < 0.01, (radii.mean(), radii.std())
 
 
 def test_a_mesh_of_any_size_is_moved_in_proportion():

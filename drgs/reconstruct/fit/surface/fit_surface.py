@@ -33,7 +33,7 @@ from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 
-NOT_FITTED = ("vertices", "homeward", "open_share", "metal")
+NOT_FITTED = ("vertices", "homeward", "to_texture", "texture_weight", "open_share", "metal")
 """Parameters that no gradient moves."""
 
 
@@ -50,6 +50,9 @@ class SurfaceRates:
     """Moved by the solve alone."""
     homeward: float = 0.0
     """From each vertex to where the surface began, or was carved to."""
+    to_texture: float = 0.0
+    """From each vertex to where the photographs show its pattern, and how much that is believed."""
+    texture_weight: float = 0.0
     open_share: float = 0.0
     """Traced, not fitted."""
     metal: float = 0.0
@@ -103,6 +106,8 @@ def start_surface(
         "metallic_logits": logits_of_shares(average_surfels(gaussians.metallic, *weights)),
         "vertices": mesh.vertices,
         "homeward": torch.zeros_like(mesh.vertices),
+        "to_texture": torch.zeros_like(mesh.vertices),
+        "texture_weight": torch.zeros_like(mesh.roughness),
         "open_share": torch.ones_like(mesh.vertices),
         "metal": torch.zeros_like(mesh.roughness),
     } | light_parameters(stage_one)
@@ -155,6 +160,7 @@ class _Steps:
 
     def step(self, iteration: int) -> StepLoss:
         if iteration == 0:
+            self.surface.look_for_texture(self.settings.moves)
             self.move_surface()
         target = self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
         parameters = self.state.parameters

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
+from drgs.reconstruct.fit.evidence.matched_texture import matched_texture
 from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
@@ -19,7 +20,7 @@ from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
-from drgs.reconstruct.geometry.integrate_normals import Homes, IntegrationSettings, integrate_normals
+from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outlines, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
@@ -45,6 +46,8 @@ class MoveSettings:
     """Share by which normals return to the surface's own afterwards."""
     share_rays: int = 48
     """A vertex, for the irradiance that arrives there."""
+    texture_radius: float = 0.0
+    """Of the object [world units], in shares of which texture is looked for before and behind the surface; 0: it is not looked for."""
     box: BuildBox | None = None
     """Of the build, which the surface does not leave."""
 
@@ -78,16 +81,29 @@ class MovingSurface:
             residuals = outline_residuals(self.tracer, self._cameras, self._outlines)
             vertices, homeward = parameters["vertices"], parameters["homeward"]
             # Of metal mirrors say where it lies.
-            homes = Homes(homeward, (-parameters["metal"]).clamp(0, 1))
-            moved = integrate_normals(vertices, self.faces, normals, self.edges, residuals, settings.integration, homes)
+            homes = Places(homeward, (-parameters["metal"]).clamp(0, 1))
+            texture = Places(parameters["to_texture"], parameters["texture_weight"])
+            moved = integrate_normals(vertices, self.faces, normals, self.edges, residuals, settings.integration, homes, texture)
             moved = whole_or_within(settings.box, moved)
-            homeward += vertices - moved
+            for place in (homeward, parameters["to_texture"]):
+                place += vertices - moved
             vertices.copy_(moved)
             self.tracer = self._tracer()
         own = vertex_normals(parameters["vertices"], self.faces)
         back = (1 - settings.to_surface) * normals + settings.to_surface * own
         parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))
         self.relight(settings.share_rays)
+
+    @torch.no_grad()
+    def look_for_texture(self, settings: MoveSettings) -> None:
+        """Where the photographs show now that the surface's pattern lies. Not before metal was looked for: what mirrors would be taken for a pattern."""
+        parameters = self._state.parameters
+        if not settings.texture_radius or not bool(parameters["metal"].any()):
+            return
+        normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
+        found = matched_texture(self.tracer, normals, parameters["metal"], self.edges, self._views, settings.texture_radius)
+        parameters["texture_weight"].copy_(found.weight)
+        parameters["to_texture"].copy_(found.places - parameters["vertices"])
 
     @torch.no_grad()
     def relight(self, share_rays: int) -> None:

@@ -99,6 +99,7 @@ def carve_hollows(fit: SurfaceFit, targets: list[ViewTarget], settings: CarveSet
     parameters["vertices"] += step
     # What was carved is at home there; what was only carried along is not.
     parameters["homeward"].copy_(torch.where(moved, torch.zeros_like(step), parameters["homeward"] - step))
+    parameters["to_texture"] -= step
     parameters["normals"].copy_(torch.where(moved, vertex_normals(parameters["vertices"], fit.faces), parameters["normals"]))
 
 
@@ -123,6 +124,7 @@ def move_to_tried_depths(
     # What moved is at home where it is now.
     moved = (found.depth.abs() > settings.trials.still * radius)[:, None]
     found.parameters["homeward"] = torch.where(moved, torch.zeros_like(step), before["homeward"] - step)
+    found.parameters["to_texture"] = before["to_texture"] - step
     with torch.no_grad():
         for name, value in found.parameters.items():
             parameters[name].copy_(value)

@@ -32,6 +32,8 @@ def two_spheres() -> tuple[FitState, torch.Tensor]:
         "metallic_logits": logits_of_shares(torch.full((count,), 0.01)),
         "vertices": vertices,
         "homeward": torch.zeros(count, 3),
+        "to_texture": torch.zeros(count, 3),
+        "texture_weight": torch.zeros(count),
         "open_share": torch.ones(count, 3),
         "metal": torch.zeros(count),
     } | light_parameters(grey_light())

@@ -1,0 +1,232 @@
+"""How far before or behind the surface its texture lies, by what several photographs show alike: where paint has a pattern, parallax tells depth.
+
+Shading knows which way a surface faces and masks know where it ends; neither knows how deep the floor of a recess lies, and masks that are drawn by
+hand are a few pixels wide. A small patch at a vertex, across its normal, is laid at several depths along that normal and looked up in the photographs
+that see it best. Where their patterns agree (zero-mean normalised cross-correlation, the better half of the pairs, so that a view that is hidden there
+does not count) at one depth and at no other, the texture lies there. Plain places agree everywhere or nowhere, mirrors at depths that depend on
+the pair: neither says anything. A scene of which hardly any place says something is not asked further.
+
+In: the mesh through its tracer, normals, photographs. Out: MatchedDepths. Source: Furukawa and Ponce 2010 (patches along normals;
+docs/sources.md: furukawa2010).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
+from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.views import Views
+
+PATCH = 7
+"""Side of a patch [samples]."""
+SPACING = 2.0
+"""Of its samples [pixels of the nearest camera]."""
+STEP = 1.5
+"""From one depth to the next [pixels of the nearest camera]: between views 20 degrees apart half a pixel of parallax."""
+BEHIND, BEFORE = 0.12, 0.05
+"""Shares of the radius that are searched. A hull is too large where it errs, not too small."""
+VIEWS = 8
+"""That are compared at a vertex: those that it faces most."""
+FEWEST_PAIRS = 3
+FACING = 0.4
+"""Least cosine between normal and view."""
+NEAREST, FARTHEST = 0.105, 0.78
+"""Angles between the views of a pair [radians]: from 6 degrees there is parallax, up to 45 patterns look alike."""
+MARGIN = 8
+"""Pixels of a photograph's border where no patch is looked up."""
+FAINT = 0.01
+"""Standard deviation of a patch, of display values 0..1, that is noise."""
+ALIKE, WELL_ALIKE = 0.5, 0.8
+"""Correlation from which a depth is believed, and fully."""
+APART = 5.0
+"""Pixels, as STEP, from the best depth within which others may agree as well."""
+DISTINCT, WELL_DISTINCT = 0.05, 0.2
+"""By how much the best depth must agree better than those farther away, to be believed, and fully. Of places of the finished tankard (textured wood)
+69 of 100 pass the two lower bounds, of the teapot, the bunny and still_life 1 or less, whose depths are wrong (docs/decisions/0003-fitting.md)."""
+LEAST_BELIEF = 0.14
+"""Mean over the places that views see, below which nothing is believed at all: the bunny's, 0.09, scatter by 0.6 % of the radius around a surface that
+is right to 0.1 %; still_life has 0.11, metal counted as 0, and the tankard's textured wood 0.21 (docs/decisions/0003-fitting.md)."""
+ASKED_FIRST, ASKED = 2000, 30_000
+"""Vertices, at most, by which a scene's belief is estimated, and that are looked at where it suffices: the others hear their neighbours."""
+SIDE = 512
+"""Of photographs, at most [pixels]: in finer ones patches are smaller, and fewer are alike (of the tankard's 0.15 at 1024 pixels are believed)."""
+VERTICES_AT_ONCE = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedDepths:
+    """Where texture says that the surface lies."""
+
+    places: Float[Tensor, "vertex 3"]
+    """World; where nothing is said, the vertex itself."""
+    weight: Float[Tensor, "vertex"]
+    """0..1: how much it is believed."""
+
+
+def matched_texture(
+    tracer: AbstractTracer,
+    normals: Float[Tensor, "vertex 3"],
+    metal: Float[Tensor, "vertex"],
+    edges: MeshEdges,
+    views: Views,
+    radius: float,
+) -> MatchedDepths:
+    """Of the tracer's mesh; all weights are 0 where the photographs show too little texture.
+
+    Args:
+        normals: unit. metal: evidence in -1 .. 1 (metal_evidence): what mirrors shows the texture of other things. radius: of the object [world units].
+    """
+    search = _Search(tracer, torch.nn.functional.normalize(normals, dim=-1), views, radius)
+    count = len(normals)
+    paint = 1 - metal.clamp(0, 1)
+
+    def every(most: int) -> tuple[Tensor, _Scores]:
+        some = torch.arange(0, count, -(-count // most), device=normals.device)
+        return some, search.scores(some)
+
+    some, found = every(ASKED_FIRST)
+    if float((_believed(found.score) * paint[some]).sum()) < LEAST_BELIEF * max(float(found.seen.sum()), 1.0):
+        return MatchedDepths(tracer.mesh.vertices, torch.zeros_like(metal))
+    some, found = every(ASKED)
+    # The surroundings lie about as deep: what chance makes agree at one vertex it does not at the next.
+    rings = 1 if len(some) == count else 2
+    sums = search.vertices.new_zeros(count, len(search.depths) + 1)
+    sums[some] = torch.cat([found.score, found.seen[:, None].to(found.score)], -1)
+    sums = averaged(averaging_matrix(edges, count), sums, rings)
+    score = sums[:, :-1] / sums[:, -1:].clamp(min=1e-6)
+    weight = _believed(score) * paint
+    depth = torch.where(weight > 0, _best_depth(score, search.depths), 0.0)
+    return MatchedDepths(tracer.mesh.vertices + depth[:, None] * search.normals, weight)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    score: Float[Tensor, "asked depth"]
+    """Correlation, -1..1."""
+    seen: Bool[Tensor, "asked"]
+    """By enough pairs of views."""
+
+
+class _Search:
+    """Final. Patches of a mesh's vertices, looked up in the photographs."""
+
+    def __init__(self, tracer: AbstractTracer, normals: Tensor, views: Views, radius: float) -> None:
+        self.tracer, self.normals, self.vertices = tracer, normals, tracer.mesh.vertices
+        device = normals.device
+        factors = [min(1.0, SIDE / max(camera.width, camera.height)) for camera in views.cameras]
+        self.cameras = [scaled_camera(camera.to(device), factor) for camera, factor in zip(views.cameras, factors, strict=True)]
+        self.pictures = [
+            _resized(image.to(device).float().mean(-1) / 255, camera) for image, camera in zip(views.images_srgb, self.cameras, strict=True)
+        ]
+        self.coverage = [_resized(mask.to(device).float(), camera) for mask, camera in zip(views.coverage, self.cameras, strict=True)]
+        centers = torch.stack([camera.center_world for camera in self.cameras])
+        middle = self.vertices.mean(0)
+        focal = torch.stack([camera.intrinsics[0, 0] for camera in self.cameras])
+        self.pixel = float(((centers - middle).norm(dim=1) / focal).median())
+        """What a pixel spans at the object [world units]."""
+        self.step = STEP * self.pixel
+        first, last = -round(BEHIND * radius / self.step), round(BEFORE * radius / self.step)
+        self.depths = torch.arange(first, last + 1, device=device) * self.step
+        self.towards = torch.nn.functional.normalize(centers[None] - self.vertices[:, None], dim=-1)
+        """(vertex, view, 3) unit."""
+        axis = torch.arange(PATCH, device=device) - (PATCH - 1) / 2
+        self.patch = SPACING * self.pixel * torch.cartesian_prod(axis, axis)
+
+    def scores(self, index: Int[Tensor, "asked"]) -> _Scores:
+        parts = [self._scores_of(some) for some in index.split(VERTICES_AT_ONCE)]
+        return _Scores(torch.cat([part.score for part in parts]), torch.cat([part.seen for part in parts]))
+
+    def _scores_of(self, index: Int[Tensor, "asked"]) -> _Scores:
+        facing = self._facing(index)
+        facing, view = facing.topk(min(VIEWS, len(self.cameras)), dim=1)
+        patterns = self._patterns(index, view, facing > 0)
+        one, other = torch.triu_indices(view.shape[1], view.shape[1], 1, device=index.device)
+        towards = self.towards[index[:, None], view]
+        apart = (towards[:, one] * towards[:, other]).sum(-1).clamp(-1, 1).acos()
+        counts = (facing[:, one] > 0) & (facing[:, other] > 0) & (apart > NEAREST) & (apart < FARTHEST)
+        alike = (patterns @ patterns.transpose(-1, -2))[:, :, one, other].masked_fill(~counts[:, None], -1.0)
+        pairs = counts.sum(1)
+        ranked = alike.sort(dim=-1, descending=True).values
+        half = (pairs + 1) // 2
+        kept = torch.arange(len(one), device=index.device) < half[:, None]
+        score = (ranked * kept[:, None]).sum(-1) / half.clamp(min=1)[:, None]
+        seen = pairs >= FEWEST_PAIRS
+        return _Scores(torch.where(seen[:, None], score, 0.0), seen)
+
+    def _facing(self, index: Int[Tensor, "asked"]) -> Float[Tensor, "asked view"]:
+        """Cosine between normal and view, 0 where the view does not see the vertex."""
+        facing = torch.zeros(len(index), len(self.cameras), device=index.device)
+        for view, camera in enumerate(self.cameras):
+            cosine = (self.towards[index, view] * self.normals[index]).sum(-1)
+            place, ahead = _pixels(camera, self.vertices[index])
+            size = torch.tensor([camera.width, camera.height], device=index.device)
+            sees = ((cosine > FACING) & ahead & (place > MARGIN).all(-1) & (place < size - MARGIN).all(-1)).nonzero().squeeze(1)
+            column, row = place[sees].long().unbind(-1)
+            sees = sees[self.coverage[view][row, column] > 0]
+            origin = self.vertices[index[sees]] + 4 * self.tracer.lift * self.normals[index[sees]]
+            open_ = ~trace_rays(origin, self.towards[index[sees], view].contiguous(), self.tracer).hit
+            facing[sees[open_], view] = cosine[sees[open_]]
+        return facing
+
+    def _patterns(
+        self, index: Int[Tensor, "asked"], view: Int[Tensor, "asked chosen"], counts: Bool[Tensor, "asked chosen"]
+    ) -> Float[Tensor, "asked depth chosen sample"]:
+        """Patches of mean 0 and length 1, at each depth and in each of the chosen views."""
+        normal = self.normals[index]
+        helper = torch.where(normal[:, 2:].abs() < 0.9, normal.new_tensor([0.0, 0.0, 1.0]), normal.new_tensor([1.0, 0.0, 0.0]))
+        tangent = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=-1)
+        bitangent = torch.linalg.cross(normal, tangent)
+        across = self.patch[:, :1] * tangent[:, None] + self.patch[:, 1:] * bitangent[:, None]
+        patterns = normal.new_zeros(len(index), len(self.depths), view.shape[1], len(self.patch))
+        for number, (camera, picture) in enumerate(zip(self.cameras, self.pictures, strict=True)):
+            vertex, slot = ((view == number) & counts).nonzero().unbind(1)
+            if len(vertex) == 0:
+                continue
+            at = self.vertices[index[vertex]][:, None] + self.depths[:, None] * normal[vertex][:, None]
+            place, _ = _pixels(camera, at[:, :, None] + across[vertex][:, None])
+            grid = 2 * place / place.new_tensor([camera.width, camera.height]) - 1
+            looked_up = torch.nn.functional.grid_sample(
+                picture[None, None], grid.reshape(1, -1, 1, 2), padding_mode="border", align_corners=False
+            ).reshape(grid.shape[:-1])
+            looked_up = looked_up - looked_up.mean(-1, keepdim=True)
+            patterns[vertex, :, slot] = looked_up / (looked_up.norm(dim=-1, keepdim=True) + FAINT * PATCH)
+        return patterns
+
+
+def _resized(picture: Float[Tensor, "_height _width"], camera: Camera) -> Float[Tensor, "_rows _columns"]:
+    """At the camera's size, by means over areas."""
+    if picture.shape == (camera.height, camera.width):
+        return picture
+    return torch.nn.functional.interpolate(picture[None, None], (camera.height, camera.width), mode="area")[0, 0]
+
+
+def _pixels(camera: Camera, places: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
+    """Where they are in the picture [pixels], and whether they lie before the camera."""
+    at = places @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    homogeneous = at @ camera.intrinsics.T
+    return homogeneous[..., :2] / homogeneous[..., 2:], at[..., 2] > 1e-6
+
+
+def _believed(score: Float[Tensor, "asked depth"]) -> Float[Tensor, "asked"]:
+    """0..1: how much the best depth is believed; 0 at either end of what was searched, where the best may lie beyond."""
+    best, at = score.max(1)
+    number = torch.arange(score.shape[1], device=score.device)
+    elsewhere = score.masked_fill((number - at[:, None]).abs() <= APART / STEP, -1.0).amax(1)
+    alike = (best - ALIKE) / (WELL_ALIKE - ALIKE)
+    distinct = (best - elsewhere - DISTINCT) / (WELL_DISTINCT - DISTINCT)
+    inside = (at > 0) & (at < score.shape[1] - 1)
+    return alike.clamp(0, 1) * distinct.clamp(0, 1) * inside
+
+
+def _best_depth(score: Float[Tensor, "asked depth"], depths: Float[Tensor, "depth"]) -> Float[Tensor, "asked"]:
+    """Along the normal [world units], between two of those searched by the parabola through three scores."""
+    at = score.argmax(1).clamp(1, score.shape[1] - 2)
+    before, best, after = (score.gather(1, (at + k)[:, None]).squeeze(1) for k in (-1, 0, 1))
+    bend = (before - 2 * best + after).clamp(max=-1e-6)
+    return depths[at] + ((before - after) / (2 * bend)).clamp(-0.5, 0.5) * (depths[1] - depths[0])

@@ -1,0 +1,100 @@
+"""Depths that several photographs agree on, of a floor whose pattern, place and photographs are known in closed form."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from drgs.reconstruct.fit.evidence.matched_texture import matched_texture
+from drgs.reconstruct.geometry.mesh_edges import mesh_edges
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.scene.camera import Camera
+from drgs.scene.mesh import TriangleMesh
+from drgs.scene.views import Views
+
+SIZE, FOCAL, FAR = 128, 240.0, 4.0
+DEPTH = 0.04
+
+
+def pattern(x: Tensor, y: Tensor) -> Tensor:
+    """0..1, finer than a patch and without period: a sum of waves whose lengths have no common multiple."""
+    waves = [(31.0, 7.0, 0.3), (-11.0, 29.0, 1.1), (19.3, 23.7, 2.0), (41.0, -17.0, 0.7), (-13.1, -37.3, 2.9), (5.3, 47.1, 1.7)]
+    return 0.5 + sum(torch.sin(a * x + b * y + c) for a, b, c in waves) / (2 * len(waves))
+
+
+def cameras_above(count: int = 9) -> tuple[Camera, ...]:
+    """At 12 to 30 degrees from the z axis, looking at the origin."""
+    cameras = []
+    intrinsics = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
+    for k in range(count):
+        tilt, turn = math.radians(12 + 18 * (k % 3) / 2), 2 * math.pi * k / count
+        back = torch.tensor([math.sin(tilt) * math.cos(turn), math.sin(tilt) * math.sin(turn), math.cos(tilt)])
+        right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), back), dim=0)
+        rotation = torch.stack([right, -torch.linalg.cross(back, right), -back])
+        pose = torch.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ (FAR * back)
+        cameras.append(Camera(pose, intrinsics, SIZE, SIZE, f"{k}"))
+    return tuple(cameras)
+
+
+def photographs_of_a_floor(kind: str) -> Views:
+    """A floor at z = -DEPTH."""
+    cameras, images = cameras_above(), []
+    row, column = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    for number, camera in enumerate(cameras):
+        rotation, center = camera.camera_from_world[:3, :3], camera.center_world
+        ray = torch.stack([(column - SIZE / 2) / FOCAL, (row - SIZE / 2) / FOCAL, torch.ones_like(row)], -1) @ rotation
+        at = center + ray * ((-DEPTH - center[2]) / ray[..., 2:])
+        if kind == "patterned":
+            value = pattern(at[..., 0], at[..., 1])
+        elif kind == "mirror":  # each view sees another part of far surroundings
+            value = pattern(ray[..., 0] * 9 + 3.0 * number, ray[..., 1] * 9 - 5.0 * number)
+        else:
+            value = 0.5 + 0.1 * at[..., 0]
+        # As bright as another exposure and a veil make it.
+        images.append(((0.1 + (0.7 + 0.02 * number) * value)[..., None].expand(-1, -1, 3) * 255).round().to(torch.uint8))
+    coverage = tuple(torch.full((SIZE, SIZE), 255, dtype=torch.uint8) for _ in cameras)
+    return Views(cameras, tuple(images), coverage, None, None, True, "test")
+
+
+def sheet(side: int = 24) -> TriangleMesh:
+    """At z = 0 over [-0.6, 0.6] squared."""
+    axis = torch.linspace(-0.6, 0.6, side)
+    x, y = torch.meshgrid(axis, axis, indexing="ij")
+    vertices = torch.stack([x.flatten(), y.flatten(), torch.zeros(side * side)], -1)
+    corner = (torch.arange(side - 1)[:, None] * side + torch.arange(side - 1)).flatten()
+    faces = torch.cat(
+        [torch.stack([corner, corner + side, corner + side + 1], -1), torch.stack([corner, corner + side + 1, corner + 1], -1)]
+    ).int()
+    count = len(vertices)
+    normals = torch.tensor([0.0, 0.0, 1.0]).expand(count, 3).contiguous()
+    return TriangleMesh(vertices, faces, normals, torch.full((count, 3), 0.5), torch.full((count,), 0.5), torch.zeros(count))
+
+
+def depths_found(kind: str, metal: float = 0.0):
+    mesh = sheet()
+    return mesh, matched_texture(
+        build_tracer(mesh),
+        mesh.normals,
+        torch.full((len(mesh.vertices),), metal),
+        mesh_edges(mesh.faces),
+        photographs_of_a_floor(kind),
+        1.0,
+    )
+
+
+def test_a_pattern_is_found_at_its_depth_whatever_the_exposure():
+    mesh, found = depths_found("patterned")
+    believed = found.weight > 0.2
+    assert float(believed.float().mean()) > 0.4, float(believed.float().mean())
+    off = found.places[believed, 2] + DEPTH
+    assert abs(float(off.median())) < 0.002 and float(off.abs().quantile(0.9)) < 0.01, (off.median(), off.abs().quantile(0.9))
+    unsaid = found.weight == 0
+    assert torch.equal(found.places[unsaid], mesh.vertices[unsaid])
+
+
+@pytest.mark.parametrize(("kind", "metal"), [("plain", 0.0), ("mirror", 0.0), ("patterned", 1.0)])
+def test_plain_floors_mirrors_and_metal_say_nothing(kind: str, metal: float):
+    mesh, found = depths_found(kind, metal)
+    assert not found.weight.any() and torch.equal(found.places, mesh.vertices)
