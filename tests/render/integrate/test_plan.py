@@ -160,7 +160,20 @@ def test_dropping_a_strategy_keeps_the_mean(metallic: float, roughness: float, w
 def test_strategies_are_dropped_for_what_reflections_show_too() -> None:
     """Facts are those of all surfaces: one metal vertex on the far side is in them."""
     mesh = with_one_vertex(sphere_mesh(2, roughness=0.8), metallic=1.0)
-    assert scene_facts(PosedScene(None, mesh, sunny_sky())) == SceneFacts(pytest.approx(0.7), 1.0, pytest.approx(0.8))
+    paint = 1 - 1 / len(mesh.vertices)
+    expected = SceneFacts(pytest.approx(0.7), 1.0, pytest.approx(0.8), diffuse_share=pytest.approx(paint))
+    assert scene_facts(PosedScene(None, mesh, sunny_sky())) == expected
+
+
+@pytest.mark.parametrize(("painted", "asks"), [(0.05, False), (0.2, True)])
+def test_kept_light_is_asked_where_enough_of_the_surface_is_diffuse(painted: float, asks: bool) -> None:
+    mesh = sphere_mesh(3, roughness=0.8)
+    metallic = torch.ones_like(mesh.metallic)
+    metallic[: round(painted * len(metallic))] = 0
+    facts = scene_facts(PosedScene(None, dataclasses.replace(mesh, metallic=metallic), sunny_sky()))
+    assert facts.diffuse_share == pytest.approx(painted, abs=2e-3)
+    plan = plan_frame(constant_sky(), 1.0, SampleCounts(2, 1, 1), 0, True, facts, kept_light=True)
+    assert plan.kept_light == asks
 
 
 def test_a_triangle_smaller_than_a_pixel_is_in_no_empty_tile() -> None:

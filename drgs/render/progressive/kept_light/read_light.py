@@ -21,6 +21,7 @@ from torch import Tensor
 
 from drgs.maths.constants import F0
 from drgs.render.color_warp import luminance_of
+from drgs.render.integrate import plan
 from drgs.render.integrate.sample_rays import PointArrays, point_arrays
 from drgs.render.intersect.mesh_surface import MeshArrays, mesh_arrays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -30,8 +31,7 @@ from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
 
-LEAST_DIFFUSE = wp.constant(0.75)
-"""Share of the reflected energy. Where it is less, the specular part needs the rays that it has."""
+LEAST_DIFFUSE = wp.constant(plan.LEAST_DIFFUSE)
 LARGEST_FACE = wp.constant(6.0)
 """Longest side [pixels]."""
 FLAT = wp.constant(0.95)
