@@ -22,6 +22,9 @@ from tests.web.browser import CHROMIUM_ARGUMENTS, ROOT, RunningServer, chromium_
 
 expect.set_options(timeout=1000 * PATIENCE_SECONDS)
 
+FEW_SAMPLES = "64"
+"""A pixel, as the page offers them: a quarter of what it asks for by itself."""
+
 
 @dataclass
 class Viewer:
@@ -209,7 +212,10 @@ def shown_page(server: RunningServer, browser: Browser, asset: str = "") -> Iter
     """A page of its own that opens the asset of this id, or none. Each object that a page opens costs about six seconds of a core: software GL lights it
     anew."""
     # Half a device pixel per CSS pixel: these tests are about the way there and back, not about the renderer's speed.
-    page = patient_page(browser, viewport={"width": 760, "height": 420}, device_scale_factor=0.5, color_scheme="dark")
+    # A camera that goes where it is sent at once: each picture on its way would be drawn. test_whole_path.py and test_screenshots.py have it glide.
+    page = patient_page(
+        browser, viewport={"width": 760, "height": 420}, device_scale_factor=0.5, color_scheme="dark", reduced_motion="reduce"
+    )
     shown = Viewer(page, server)
 
     def heard(message: ConsoleMessage) -> None:
@@ -222,6 +228,13 @@ def shown_page(server: RunningServer, browser: Browser, asset: str = "") -> Iter
     page.goto(f"{server.address}/#token={server.token}" + (f"&asset={asset}" if asset else ""))
     yield shown
     page.close()
+
+
+def ask_for_few_samples(viewer: Viewer) -> None:
+    """So that the server, whose cores are the browser's, does not refine what a test has seen enough of. Until the page is loaded anew."""
+    viewer.open_tab("View")
+    viewer.page.get_by_role("radio", name=FEW_SAMPLES, exact=True).check()
+    viewer.open_tab("Material")
 
 
 def frame_alone(viewer: Viewer) -> None:
@@ -244,5 +257,6 @@ def ball(server: RunningServer, browser: Browser, ball_asset: str) -> Iterator[V
     """The page with the ball open, its left panel away."""
     with shown_page(server, browser, ball_asset) as viewer:
         expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
+        ask_for_few_samples(viewer)
         frame_alone(viewer)
         yield viewer

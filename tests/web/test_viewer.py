@@ -13,7 +13,7 @@ from PIL import Image
 from playwright.sync_api import expect
 
 from tests.web.browser import RunningServer
-from tests.web.conftest import Viewer, wait_until
+from tests.web.conftest import FEW_SAMPLES, Viewer, ask_for_few_samples, wait_until
 
 TOO_SMALL_TO_SEE = 6.0
 """Euclidean difference of mean sRGB colours that noise between two pictures of the same thing stays below."""
@@ -30,6 +30,20 @@ DRAG = """async (slider, values) => {
 """What a pointer does to a range input."""
 
 
+DRAWN_WHILE_REFINED = """(samples) => new Promise((resolve) => {
+  const { dataset } = document.querySelector('.stage');
+  const count = () => ({ traced: Number(dataset.tracedFrames), local: Number(dataset.localFrames) });
+  const from = count();
+  const look = () => {
+    const now = count();
+    if (Number(dataset.samples) >= samples) resolve({ traced: now.traced - from.traced, local: now.local - from.local });
+    else setTimeout(look, 20);
+  };
+  look();
+})"""
+"""Pictures of both kinds until the traced one has all its samples."""
+
+
 def difference(a: tuple[float, ...], b: tuple[float, ...]) -> float:
     return math.dist(a, b)
 
@@ -40,6 +54,7 @@ def test_the_token_leaves_the_address_bar_and_a_chosen_mesh_opens(viewer: Viewer
     assert "token" not in viewer.page.url
     viewer.page.get_by_label("Capture or mesh").set_input_files(ball_file)
     expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
+    ask_for_few_samples(viewer)
     color = viewer.settled_color()
     assert color[0] > 1.5 * color[2], "the ball's red side faces the first camera"
     assert "asset=" in viewer.page.url
@@ -97,6 +112,8 @@ def test_orbiting_changes_the_picture_and_reset_brings_it_back(viewer: Viewer) -
     viewer.page.mouse.move(290, 150, steps=4)
     viewer.page.mouse.up()
     assert difference(viewer.settled_color(), before) > 5 * TOO_SMALL_TO_SEE
+    drawn = viewer.page.evaluate(DRAWN_WHILE_REFINED, int(FEW_SAMPLES))
+    assert drawn["traced"] > 1 and drawn["local"] == 0, "the local picture, which nobody sees, is not drawn with each traced one"
     viewer.page.keyboard.press("Shift+F")
     wait_until(lambda: difference(viewer.settled_color(), before) < TOO_SMALL_TO_SEE, "the first view")
 

@@ -32,7 +32,7 @@ import {
   WebGLRenderer,
   type BufferAttribute,
   type Texture,
-  type WebGLRenderTarget,
+  type WebGLCubeRenderTarget,
 } from 'three';
 import { EXRLoader } from 'three/examples/jsm/loaders/EXRLoader.js';
 import { HDRLoader } from 'three/examples/jsm/loaders/HDRLoader.js';
@@ -42,6 +42,7 @@ import type { RestMesh, VertexMaterials } from '../edit/mesh';
 import type { Settings } from '../session/protocol.gen';
 import type { Vec3 } from '../session/view';
 import { blurEnvironment, BLURRED_HEIGHT } from './blur_environment';
+import { drawsInSoftware, filterEnvironment } from './filter_environment';
 import { loadMesh, restGeometry } from './mesh_file';
 import { drawEnvironment, drawMaterials } from './thumbnails';
 import { makeVertexMaterial, type HighlightUniforms } from './vertex_material';
@@ -82,7 +83,8 @@ export class LocalPicture {
   private readonly material = makeVertexMaterial(this.uniforms);
   private readonly edgeMaterial = new MeshBasicMaterial({ color: EDGE_COLOUR, wireframe: true, transparent: true, opacity: 0.6, toneMapped: false });
   private readonly pmrem: PMREMGenerator;
-  private radiance: WebGLRenderTarget | null = null;
+  private readonly software: boolean;
+  private radiance: WebGLCubeRenderTarget | null = null;
   private sky: Texture | null = null;
   /** The sky out of focus; made when it is first asked for. */
   private softSky: Texture | null = null;
@@ -97,6 +99,7 @@ export class LocalPicture {
     this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true, powerPreference: 'low-power' });
     this.renderer.outputColorSpace = SRGBColorSpace;
     this.pmrem = new PMREMGenerator(this.renderer);
+    this.software = drawsInSoftware(this.renderer);
     this.root.matrixAutoUpdate = false;
     this.eye.matrixAutoUpdate = false;
     this.scene.add(this.root);
@@ -206,7 +209,7 @@ export class LocalPicture {
     sky.mapping = EquirectangularReflectionMapping;
     sky.minFilter = sky.magFilter = LinearFilter;
     sky.generateMipmaps = false;
-    const radiance = this.pmrem.fromEquirectangular(sky);
+    const radiance = filterEnvironment(this.pmrem, sky, this.software);
     this.radiance?.dispose();
     this.sky?.dispose();
     this.softSky?.dispose();

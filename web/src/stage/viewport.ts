@@ -213,8 +213,9 @@ export class Viewport {
 
   private updateLayers(): void {
     const picture = !this.local.standsIn ? 'traced' : this.fresh ? 'fresh' : 'stale';
-    if (this.stage.dataset.picture !== picture && (this.traced.exists || picture === 'stale')) this.stage.dataset.picture = picture;
-    this.local.redraw();
+    if (this.stage.dataset.picture === picture || !(this.traced.exists || picture === 'stale')) return;
+    this.stage.dataset.picture = picture;
+    if (picture === 'stale') this.local.redraw();
   }
 
   private followPicture(): void {
