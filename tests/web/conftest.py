@@ -22,6 +22,8 @@ from tests.web.browser import CHROMIUM_ARGUMENTS, ROOT, RunningServer, chromium_
 
 expect.set_options(timeout=1000 * PATIENCE_SECONDS)
 
+PLAIN_COMPOSITING = ("--disable-gpu-compositing", "--disable-gpu-rasterization")
+"""Panels and pictures are put together without software GL, which takes as much of a core for it as for what it draws on canvases."""
 FEW_SAMPLES = "64"
 """A pixel, as the page offers them: a quarter of what it asks for by itself."""
 
@@ -184,7 +186,7 @@ class _Browsing:
         if self._running is None or not self._running.is_connected():
             self.end()
             playwright = self._open.enter_context(sync_playwright())
-            self._running = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
+            self._running = playwright.chromium.launch(executable_path=chromium_path(), args=[*CHROMIUM_ARGUMENTS, *PLAIN_COMPOSITING])
             self._open.callback(self._running.close)
         return self._running
 
@@ -219,8 +221,8 @@ def shown_page(server: RunningServer, browser: Browser, asset: str = "") -> Iter
     shown = Viewer(page, server)
 
     def heard(message: ConsoleMessage) -> None:
-        # The one about reading a canvas often is these tests' own doing.
-        if message.type in ("error", "warning") and "willReadFrequently" not in message.text:
+        # Those about reading canvases often are these tests' own doing: they look at pictures, and have pages put together without a GPU.
+        if message.type in ("error", "warning") and not any(word in message.text for word in ("willReadFrequently", "ReadPixels")):
             shown.complaints.append(message.text)
 
     page.on("console", heard)
