@@ -22,7 +22,7 @@ from benchmarks.trials import access, captures, changes, connections, disk, faul
 from benchmarks.trials.load import MOST_BYTES
 from benchmarks.trials.shapes import ball, obj
 from benchmarks.trials.site import Site, Trial
-from benchmarks.trials.watch import HealthWatch, MemoryWatch, percentile_ms
+from benchmarks.trials.watch import PROBE_SECONDS, UNJUDGED_PROBE_SECONDS, HealthWatch, MemoryWatch, percentile_ms
 
 SOURCES = (changes, weights, streams, uploads, captures, connections, access, load, faults, disk)
 MOST_HEALTH_MS = 100.0
@@ -46,7 +46,8 @@ def main(arguments: list[str]) -> None:
         raise ValueError(f"there are no such trials; the groups are {', '.join(sorted({trial.group for trial in all_trials()}))}")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the server is ended, too
     with tempfile.TemporaryDirectory() as folder:
-        found = measure(chosen, Path(folder), given.asset, judge_health=not given.quick and not given.only)
+        probe_seconds = UNJUDGED_PROBE_SECONDS if given.quick else PROBE_SECONDS
+        found = measure(chosen, Path(folder), given.asset, judge_health=not given.quick and not given.only, probe_seconds=probe_seconds)
     print(json.dumps(found, indent=None if given.json else 1))
     if found["failed"]:
         raise SystemExit(1)
@@ -58,17 +59,20 @@ def all_trials() -> Iterator[Trial]:
         yield from source.trials()
 
 
-def measure(trials: list[Trial], folder: Path, asset: Path | None = None, judge_health: bool = False) -> dict:
+def measure(
+    trials: list[Trial], folder: Path, asset: Path | None = None, judge_health: bool = False, probe_seconds: float = PROBE_SECONDS
+) -> dict:
     """Run them one by one on one server.
 
     Args:
         asset: what most of them look at; a small ball where None.
+        probe_seconds: between two calls of /healthz.
     """
     site = Site(folder)
     started = time.monotonic()
     site.start()
     assert site.process is not None
-    memory, health = MemoryWatch(site.process.pid), HealthWatch(site.port)
+    memory, health = MemoryWatch(site.process.pid), HealthWatch(site.port, probe_seconds)
     failures: list[dict[str, str]] = []
     groups: dict[str, dict[str, int]] = {}
     peaks: dict[str, int] = {}

@@ -12,6 +12,8 @@ import psutil
 
 MEMORY_SECONDS = 0.2
 PROBE_SECONDS = 0.05
+UNJUDGED_PROBE_SECONDS = 0.5
+"""In the short form, which does not judge it: calls take the cores of what is tried."""
 LONGEST_PROBE_SECONDS = 30.0
 
 
@@ -65,13 +67,13 @@ class MemoryWatch:
 
 
 class HealthWatch:
-    """Final. Asks /healthz from a process of its own, whose answers no work of this one delays."""
+    """Final. Asks /healthz from a process of its own, whose answers no work of this one delays, with `pause_seconds` between two calls."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, pause_seconds: float = PROBE_SECONDS) -> None:
         context = multiprocessing.get_context("spawn")
         self._results: Queue = context.Queue()
         self._stop: Event = context.Event()
-        self._process = context.Process(target=_probe, args=(port, self._stop, self._results), daemon=True)
+        self._process = context.Process(target=_probe, args=(port, pause_seconds, self._stop, self._results), daemon=True)
         self._process.start()
 
     def stop(self) -> list[float]:
@@ -82,9 +84,9 @@ class HealthWatch:
         return found
 
 
-def _probe(port: int, stop: Event, results: Queue) -> None:
+def _probe(port: int, pause_seconds: float, stop: Event, results: Queue) -> None:
     seconds = []
-    while not stop.wait(PROBE_SECONDS):
+    while not stop.wait(pause_seconds):
         start = time.perf_counter()
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=LONGEST_PROBE_SECONDS)
         try:
