@@ -29,8 +29,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     metafunc.parametrize("device", [asked] if asked else ["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
 
 
-HALF_WAY = "tests/web/test_s"
-"""Tests of the browser before and behind this name take about equally long."""
+LONGEST_IN_BROWSER = "tests/web/test_whole_path.py"
+"""It waits for builds of a worker, which gives way to everything else on the machine: it begins first, and has a process for itself."""
+
+
+HALF_WAY = "tests/web/test_g"
+"""The other files of the browser before and behind this name take about equally long."""
 
 
 WAITING = ("tests/benchmarks/", "tests/worker/", "tests/server/", "tests/test_wheel.py", "tests/test_cli.py", "tests/test_site.py")
@@ -45,27 +49,44 @@ def is_in_browser(nodeid: str) -> bool:
     return nodeid.startswith("tests/web/")
 
 
+def browser_lot(nodeid: str) -> int:
+    """0, 1, 2: in this order they begin."""
+    return 0 if nodeid.startswith(LONGEST_IN_BROWSER) else 1 if nodeid < HALF_WAY else 2
+
+
+def order(nodeid: str) -> tuple[int, int]:
+    if is_in_browser(nodeid):
+        return 0, browser_lot(nodeid)
+    return 1 if nodeid.startswith(WAITING) else 2 if nodeid.startswith(LONG) else 3, 0
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """One thread of torch for each of the processes that share the tests, of which there are more than cores: two are far slower then."""
+    if hasattr(config, "workerinput"):
+        torch.set_num_threads(1)
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the browser's tests as slow; where processes share the tests, those that wait come first, and then the long ones."""
     for item in items:
         if is_in_browser(item.nodeid):
             item.add_marker(pytest.mark.slow)
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: (not is_in_browser(item.nodeid), not item.nodeid.startswith(WAITING), not item.nodeid.startswith(LONG)))
+        items.sort(key=lambda item: order(item.nodeid))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """How `./run test` shares the tests out among four processes: file by file, those that use the browser in two lots.
+    """How `./run test` shares the tests out among four processes: file by file, those that use the browser in three lots.
 
-    One server and one Chromium serve a lot. The lots wait more than they compute; the other two processes take what is left meanwhile, and
-    begin with what waits, too, so that at the end there are many small files that keep every core busy.
+    One server and one Chromium serve a lot. The lots wait more than they compute; the fourth process takes what is left meanwhile, and
+    begins with what waits, too, so that at the end there are many small files that keep every core busy.
     """
     from xdist.scheduler import LoadScopeScheduling
 
     class Shares(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return f"browser, second lot: {nodeid > HALF_WAY}" if is_in_browser(nodeid) else nodeid.split("::")[0]
+            return f"browser, lot {browser_lot(nodeid)}" if is_in_browser(nodeid) else nodeid.split("::")[0]
 
     return Shares(config, log)
 
