@@ -47,7 +47,9 @@ TINY = Preset(
     fit=FitSettings(iterations=20, densify=DensifySettings(every=5, budget=700)),
     mesh=MeshSettings(resolution=48, face_limit=2000),
     surface=PassSettings(
-        2, SurfaceSettings(rounds=1, steps_a_round=3, moves=MoveSettings(share_rays=4)), replace(PASS_MESH, resolution=32, face_limit=500)
+        2,
+        SurfaceSettings(rounds=1, steps_a_round=3, moves=MoveSettings(solves=1, share_rays=4)),
+        replace(PASS_MESH, resolution=32, face_limit=500),
     ),
     materials=MeshMaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
     detail=DetailSettings(most_faces=2000),
@@ -55,6 +57,8 @@ TINY = Preset(
     mesh_surfels=MeshFitSettings(iterations=6),
     surfel_materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
 )
+WITHOUT_HOLLOWS = replace(TINY, hollows=HollowSettings(RadianceGridSettings(levels=())))
+"""For tests of other files that ask nothing about hollows, as the preset `draft` does."""
 ON_SURFELS = replace(TINY, materials_on="surfels")
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
 

@@ -14,7 +14,7 @@ from drgs.reconstruct.capture import find_masks as find_masks_module
 from drgs.reconstruct.capture.build_box import BuildBox
 from drgs.scene.asset import Asset, load_asset, load_photographs
 from tests.reconstruct.capture.test_find_masks import before_surroundings
-from tests.reconstruct.test_build_asset import TINY
+from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
 
 X, Y, Z = SPHERE_CENTER.tolist()
@@ -24,7 +24,7 @@ SETTINGS = BuildSettings(preset="tiny", device="cpu", box=UPPER)
 
 @pytest.fixture(autouse=True)
 def _tiny_preset(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setitem(PRESETS, "tiny", WITHOUT_HOLLOWS)
 
 
 def check_upper_half(asset: Asset, volume_error: float) -> None:
@@ -62,7 +62,7 @@ def write_test_cameras(capture: Path) -> Path:
 
 @pytest.mark.slow
 def test_without_masks_the_surfels_in_the_box_are_the_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "tiny", replace(TINY, fit=replace(TINY.fit, iterations=80)))
+    monkeypatch.setitem(PRESETS, "tiny", replace(WITHOUT_HOLLOWS, fit=replace(WITHOUT_HOLLOWS.fit, iterations=80)))
     monkeypatch.setattr(find_masks_module, "ITERATIONS", 120)
     capture = write_nerf_synthetic(tmp_path / "capture", [before_surroundings(view) for view in sphere_views(24, square=True)])
     asked = iter(range(10**6))

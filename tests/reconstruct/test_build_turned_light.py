@@ -18,20 +18,20 @@ from drgs.scene.asset import Asset, light_from_world, load_asset, save_asset
 from drgs.scene.edits import EnvironmentEdit
 from drgs.scene.posed_scene import PosedScene
 from tests.reconstruct.capture.test_turning_light import write_turntable
-from tests.reconstruct.test_build_asset import TINY, asset_tensors
+from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS, asset_tensors
 
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
 LONGER = replace(
-    TINY,
-    fit=replace(TINY.fit, iterations=80),
-    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=40), TINY.surface.mesh),
-    materials=MeshMaterialSettings(iterations=40, points_a_step=256, samples=TINY.materials.samples),
+    WITHOUT_HOLLOWS,
+    fit=replace(WITHOUT_HOLLOWS.fit, iterations=80),
+    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=40), WITHOUT_HOLLOWS.surface.mesh),
+    materials=MeshMaterialSettings(iterations=40, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
 )
 
 
 @pytest.fixture(autouse=True)
 def _presets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setitem(PRESETS, "tiny", WITHOUT_HOLLOWS)
     monkeypatch.setitem(PRESETS, "longer", LONGER)
 
 
@@ -50,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def through(turntable: Path, folder: Path) -> Asset:
     """Built of the turntable without a word about its light, and never stopped."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", TINY)
+        patch.setitem(PRESETS, "tiny", WITHOUT_HOLLOWS)
         return build_asset(turntable, folder, SETTINGS)
 
 
