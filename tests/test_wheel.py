@@ -85,6 +85,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(wheel, python.parent, folder)
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_file_of_the_packages_the_viewer_and_what_is_bundled(installed: Installed):
     with zipfile.ZipFile(installed.wheel) as archive:
         held = set(archive.namelist())
@@ -178,6 +179,7 @@ def test_serve_shows_the_page_and_opens_it(installed: Installed, address: str):
     assert (installed.folder / "opened").read_text() == address
 
 
+@pytest.mark.slow
 def test_serve_brings_environments_and_a_worker_and_keeps_its_data_with_the_user(installed: Installed, address: str):
     names = {found["name"] for found in json.loads(ask(address, "/api/environments"))["environments"]}
     assert {path.name for path in (ROOT / "examples" / "environments").glob("*.exr")} <= names

@@ -188,6 +188,7 @@ def test_a_shrunk_mesh_keeps_shape_and_mean_colour():
     assert shrink_mesh(small, 5000) is small
 
 
+@pytest.mark.slow
 def test_what_makes_no_page_is_refused_with_a_sentence(program: Path, monkeypatch: pytest.MonkeyPatch):
     asset = ball_asset()
     nothing = replace(asset, mesh=replace(asset.mesh, faces=asset.mesh.faces[:0]))

@@ -38,6 +38,7 @@ def ball_asset() -> Asset:
     return Asset(gaussians, mesh, None, Environment(torch.rand(4, 8, 3, generator=random)), meters_per_unit=0.5)
 
 
+@pytest.mark.slow
 def test_an_exported_glb_comes_back_with_its_materials_upright_and_in_metres(tmp_path):
     asset = ball_asset()
     export_asset(asset, tmp_path / "a.glb", "glb")

@@ -22,6 +22,7 @@ def unit_directions(count: int) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(5)), dim=-1)
 
 
+@pytest.mark.slow
 def test_gaussians_come_back_from_a_glb_in_metres(tmp_path):
     asset = ball_asset()
     export_asset(asset, tmp_path / "a.glb", "glb")
@@ -37,6 +38,7 @@ def test_gaussians_come_back_from_a_glb_in_metres(tmp_path):
     assert len(found.mesh.vertices) == len(asset.mesh.vertices) and found.primary == "mesh"
 
 
+@pytest.mark.slow
 def test_colours_come_back_as_linear_radiance(tmp_path):
     """Sixteen harmonics hold neither curve exactly: what is compared is what is seen."""
     asset = ball_asset()
@@ -78,6 +80,7 @@ def test_a_turned_node_turns_places_axes_and_colours(tmp_path):
     assert torch.allclose(evaluate_sh(found.sh.double(), directions @ world_from_splats.T), colors, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_came_back_is_an_asset_whose_gaussians_follow_its_mesh(tmp_path):
     export_asset(ball_asset(), tmp_path / "a.glb", "glb")
     found = import_mesh(tmp_path / "a.glb")
@@ -89,6 +92,7 @@ def test_what_came_back_is_an_asset_whose_gaussians_follow_its_mesh(tmp_path):
     assert again is not None and torch.allclose(again.centers, found.gaussians.centers, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_mesh_alone_is_there_for_who_wants_a_small_file(tmp_path):
     asset = ball_asset()
     export_asset(asset, tmp_path / "both.glb", "glb")

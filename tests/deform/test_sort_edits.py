@@ -44,6 +44,7 @@ def digests(found: SortedEdits) -> tuple:
     return found.material.digest(found.material.count), found.shape.digest(found.shape.count), found.light
 
 
+@pytest.mark.slow
 def test_an_edit_more_takes_as_many_steps_behind_two_thousand_as_behind_a_hundred() -> None:
     taken = []
     for count in (100, 2000):

@@ -128,6 +128,7 @@ def test_a_path_that_no_disk_has_is_a_finding() -> None:
     assert not report["ok"] and "no such folder" in _sentences(report, "error")
 
 
+@pytest.mark.slow
 def test_what_a_capture_holds_beside_what_is_used_is_counted(tmp_path: Path) -> None:
     folder = tiny.write_nerf_synthetic(tmp_path)
     (folder / "masks").mkdir()

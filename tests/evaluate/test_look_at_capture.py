@@ -18,6 +18,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_nerf_synthetic(tmp_path_factory.mktemp("look") / "capture")
 
 
+@pytest.mark.slow
 def test_cameras_points_and_box_of_a_ball_are_where_they_are(capture: Path, tmp_path: Path) -> None:
     look = look_at_capture(capture, tmp_path / "sheet.jpg", "Ball")
     json.dumps(look, allow_nan=False)
@@ -59,6 +60,7 @@ def check_tiles(sheet: np.ndarray, layout: dict) -> None:
         assert tile.max() > 150 and gap.max() < 60, number
 
 
+@pytest.mark.slow
 def test_of_very_many_cameras_and_points_some_are_told(capture: Path, tmp_path: Path) -> None:
     with patch.multiple(looking, MOST_CAMERAS=7, MOST_POINTS=50):
         look = look_at_capture(capture, tmp_path / "sheet.jpg", "Ball")

@@ -99,6 +99,7 @@ def test_cells_that_are_near_in_the_picture_hold_faces_that_are_near_on_the_surf
         assert off.mean() < 0.1, "two edges' length; 0.9 where cells are in the order of the faces"
 
 
+@pytest.mark.slow
 def test_painting_takes_memory_in_proportion_to_the_picture():
     mesh = trimesh.creation.icosphere(6)  # 81 920 faces, in cells
     atlas = unwrap(np.asarray(mesh.vertices), np.asarray(mesh.faces))

@@ -67,6 +67,7 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_files_beside_a_layer_are_its_pictures_and_nothing_else_is_left(folder):
     assert {path.name for path in folder.iterdir()} == {"ar.usdz", "small.usdz", "scene.usdz", "scene.usda", "scene.usdc", "scene_textures"}
     assert {path.name for path in (folder / "scene_textures").iterdir()} == {BASE_COLOR, SURFACE, ENVIRONMENT}
@@ -255,6 +256,7 @@ def test_the_dome_shines_from_where_the_environment_does(folder, name):
             assert abs((found[0] - ours[0] + 0.5) % 1 - 0.5) < 1e-6
 
 
+@pytest.mark.slow
 def test_an_asset_without_gaussians_has_mesh_and_light(tmp_path):
 
     export_asset(replace(ball_asset(), gaussians=None), tmp_path / "a.usdc", "usd")

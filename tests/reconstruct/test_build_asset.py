@@ -103,6 +103,7 @@ def asset_tensors(asset: Asset) -> dict[str, torch.Tensor]:
     return {f"{part}.{f.name}": getattr(record, f.name) for part, record in parts.items() for f in fields(record)}
 
 
+@pytest.mark.slow
 def test_a_build_makes_an_asset_that_loads_with_the_same_numbers(build: Build):
     loaded = asset_tensors(load_asset(build.path))
     for name, value in asset_tensors(build.asset).items():
@@ -111,6 +112,7 @@ def test_a_build_makes_an_asset_that_loads_with_the_same_numbers(build: Build):
     assert len(load_asset(build.path).cameras) == FEW_VIEWS
 
 
+@pytest.mark.slow
 def test_the_photographs_of_the_capture_are_kept_with_the_asset(build: Build):
     photographs = load_photographs(build.path)
     assert photographs is not None
@@ -131,6 +133,7 @@ def test_a_capture_without_masks_keeps_whole_photographs():
         assert Image.open(io.BytesIO(picture)).getbands() == bands
 
 
+@pytest.mark.slow
 def test_the_mesh_is_the_sphere_and_its_vertices_carry_materials(build: Build):
     mesh = build.asset.mesh
     distance = (mesh.vertices - torch.tensor(SPHERE_CENTER, dtype=torch.float32)).norm(dim=-1) / SPHERE_RADIUS
@@ -144,6 +147,7 @@ def test_the_mesh_is_the_sphere_and_its_vertices_carry_materials(build: Build):
     assert float(build.asset.environment.radiance.min()) > 0
 
 
+@pytest.mark.slow
 def test_what_photographs_show_of_the_sphere_is_more_certain_than_what_they_do_not(build: Build):
     mesh, certainty = build.asset.mesh, build.asset.certainty
     assert certainty is not None
@@ -157,6 +161,7 @@ def test_what_photographs_show_of_the_sphere_is_more_certain_than_what_they_do_n
         assert not unseen.any() or float(values[unseen].max()) == 0, name
 
 
+@pytest.mark.slow
 def test_provenance_says_how_the_asset_came_about(build: Build, capture: Path):
     facts = load_asset(build.path).provenance
     assert (facts["preset"], facts["seed"], facts["device"], facts["source"], facts["dataset"]) == (
@@ -180,6 +185,7 @@ def test_provenance_keeps_each_lens_once_with_the_number_of_its_pictures():
     ]
 
 
+@pytest.mark.slow
 def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
     fractions = [p.fraction for p in build.progress]
     assert fractions == sorted(fractions) and fractions[0] == 0.0 and fractions[-1] == pytest.approx(1.0)

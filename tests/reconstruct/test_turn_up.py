@@ -56,6 +56,7 @@ def test_cameras_that_are_held_level_tell_which_way_is_up(tmp_path: Path) -> Non
     assert up_of_cameras(poses) == pytest.approx(rotation_to_up((0.0, 1.0, 0.0)) @ [0, 0, 1], abs=0.2)
 
 
+@pytest.mark.slow
 def test_the_hull_of_a_turned_capture_is_turned(tmp_path: Path) -> None:
     folder = write_nerf_synthetic(tmp_path / "capture")
     plain, turned = (open_capture(folder, None, 500, 0, up)[2].bounds_center for up in (UP, (1.0, 0.0, 0.0)))

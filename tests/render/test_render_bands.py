@@ -51,6 +51,7 @@ def assembled(made: list[Band], show) -> Tensor:
     return torch.cat([show(band.state)[band.within] for band in made])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("primary", ["mesh", "gaussians"])
 @pytest.mark.parametrize("denoise", ["none", "svgf"])
 @pytest.mark.parametrize("background", ["transparent", "environment"])

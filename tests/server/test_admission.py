@@ -207,6 +207,7 @@ async def ask(service: Service, path: str, leave_when: Callable[[], bool] | None
     return found["status"], {name.decode(): value.decode() for name, value in found["headers"]}
 
 
+@pytest.mark.slow
 def test_a_picture_is_given_up_when_its_caller_has_left(service: Service) -> None:
     url = f"/api/sessions/{service.open_session()}/frame.png?width=16&height=16&spp=65535"
     service.painter.pass_seconds = 0.01

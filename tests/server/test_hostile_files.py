@@ -222,6 +222,7 @@ def test_a_hostile_asset_or_mesh_is_refused(refuse: Callable[[str, str, bytes], 
     refuse("asset", name, MESHES[name])
 
 
+@pytest.mark.slow
 def test_a_bomb_of_an_asset_is_refused(refuse: Callable[[str, str, bytes], str]) -> None:
     # Made here and not above: packing it takes each process that collects these tests a second.
     refuse("asset", "a bomb.zip", zipped({"asset.json": manifest(), "mesh.glb": bytes(300_000_000)}))

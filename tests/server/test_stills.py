@@ -50,6 +50,7 @@ def with_certainty(asset: Asset) -> Asset:
     return replace(asset, certainty=Certainty(*known))
 
 
+@pytest.mark.slow
 def test_certainty_comes_over_rest_and_an_asset_without_it_says_so(tmp_path: Path) -> None:
     write_ball(tmp_path / "ball.ply")
     service = Service(tmp_path, DrgsRenderer("cpu"))  # type: ignore[arg-type]

@@ -75,6 +75,7 @@ def test_a_telephones_pictures_are_read_with_their_focal_length(tmp_path: Path) 
         assert exif_number(read_exif(image, EXIF_FOLDER), EXIF_FOCAL_35MM) == 26
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["heic", "dng"])
 def test_a_folder_of_such_pictures_is_one_of_photographs(tmp_path: Path, kind: str) -> None:
     pillow_heif = pytest.importorskip("pillow_heif") if kind == "heic" else pytest.importorskip("rawpy")

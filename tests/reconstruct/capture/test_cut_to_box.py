@@ -45,6 +45,7 @@ def test_a_box_holds_its_sides_and_moves_others_to_them() -> None:
     assert (box.center, box.longest_half, box.radius) == ((0.5, 1.0, 1.5), 1.5, pytest.approx(14**0.5 / 2))
 
 
+@pytest.mark.slow
 def test_a_hull_is_cut_flat(ball: Views) -> None:
     whole, half = visual_hull(ball), visual_hull(ball, box=ABOVE)
     assert whole is not None and half is not None
@@ -57,6 +58,7 @@ def test_a_hull_is_cut_flat(ball: Views) -> None:
     assert visual_hull(ball, box=BuildBox((3, 3, 3), (4, 4, 4))) is None
 
 
+@pytest.mark.slow
 def test_masks_show_what_is_seen_in_the_box(ball: Views) -> None:
     cut = cut_to_box(ball, ABOVE)
     assert 8 <= len(cut.cameras) < len(ball.cameras), "from below, the lower half hides the upper"
@@ -70,6 +72,7 @@ def test_masks_show_what_is_seen_in_the_box(ball: Views) -> None:
     assert wrong < 0.05 * shown
 
 
+@pytest.mark.slow
 def test_a_box_around_all_changes_nothing(ball: Views) -> None:
     cut = cut_to_box(ball, ALL)
     assert len(cut.cameras) == len(ball.cameras)
@@ -93,6 +96,7 @@ def test_views_in_which_the_rest_hides_the_content_are_left_out(ball: Views) -> 
         shown_views(ball, [CutMask(torch.zeros_like(mask.coverage), 0.0) for mask in cut], ALL)
 
 
+@pytest.mark.slow
 def test_the_box_is_that_of_the_turned_world(tmp_path: Path) -> None:
     folder = write_nerf_synthetic(tmp_path / "capture")
     up = (1.0, 0.0, 0.0)

@@ -41,6 +41,7 @@ def some_stops(count: int, seed: int = 0) -> np.ndarray:
     return stops - stops.mean()
 
 
+@pytest.mark.slow
 def test_exposures_are_found_by_points_and_even_pictures_are_left_alone(even: Views) -> None:
     points = initial_points(even, 1500, seed=0)
     assert with_gains_of_points(even, points) is even
@@ -58,6 +59,7 @@ def true_picture(even: Views, seen: ViewTarget) -> tuple[Tensor, Tensor]:
     return linear_from_srgb(target.saturation), target.mask
 
 
+@pytest.mark.slow
 def test_a_fit_tells_exposures_to_a_hundredth_of_a_stop(even: Views) -> None:
     stops = some_stops(len(even.cameras), seed=1)
     varied = exposed(even, stops)

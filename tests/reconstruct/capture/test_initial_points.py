@@ -98,6 +98,7 @@ def test_one_wrong_mask_is_outvoted(fill: int, sphere: Views) -> None:
     assert np.median(radii) < 1.06
 
 
+@pytest.mark.slow
 def test_pictures_of_several_sizes_carve_the_same_hull(sphere: Views) -> None:
     def at(share: float, camera: Camera, mask: torch.Tensor) -> tuple[Camera, torch.Tensor]:
         smaller = scaled_camera(camera, share)

@@ -67,6 +67,7 @@ def test_a_turntable_is_told_by_what_stays_and_what_changes(tmp_path: Path) -> N
     assert finding["level"] == "info" and "--light object" in finding["advice"]
 
 
+@pytest.mark.slow
 def test_masks_that_are_cut_outs_count_by_their_alpha(tmp_path: Path) -> None:
     for path in write_turntable(tmp_path, lamp_on_camera=True, same_around=True).glob("*_mask.png"):
         mask = np.asarray(Image.open(path))

@@ -42,6 +42,7 @@ def solved(mesh: TriangleMesh, wanted: torch.Tensor, settings: IntegrationSettin
     return mesh.vertices
 
 
+@pytest.mark.slow
 def test_a_sphere_that_is_too_small_and_bumpy_becomes_the_sphere_of_its_normals_and_masks():
     true = sphere_mesh(subdivisions=4)
     bumps = 0.02 * torch.sin(9 * true.vertices).prod(1, keepdim=True)
@@ -50,6 +51,7 @@ def test_a_sphere_that_is_too_small_and_bumpy_becomes_the_sphere_of_its_normals_
     assert abs(float(radii.mean()) - 1) < 2e-3 and float(radii.std()) < 0.2 * float((0.96 + bumps).std())
 
 
+@pytest.mark.slow
 def test_the_true_sphere_stays_where_it_is():
     true = sphere_mesh(subdivisions=4)
     assert float((solved(true, true.normals, IntegrationSettings()) - true.vertices).norm(dim=1).max()) < 4e-3

@@ -47,6 +47,7 @@ def parts(mesh: TriangleMesh) -> int:
     return mesh_report(mesh.vertices, mesh.faces).component_count
 
 
+@pytest.mark.slow
 def test_things_that_stand_apart_are_kept_and_what_floats_outside_the_hull_is_not(fused: dict[str, TriangleMesh]) -> None:
     mesh = fused["hull of two"]
     assert parts(mesh) == 2

@@ -160,6 +160,7 @@ def test_both_integrators_choose_the_same(sky: Environment, bounces: int) -> Non
         assert float(error.median()) < 1e-5, name
 
 
+@pytest.mark.slow
 @INTEGRATORS
 @pytest.mark.parametrize(
     ("counts", "bounces"), [(COUNTS, 0), (COUNTS, 3), (SampleCounts(0, 0, 16), 0)], ids=["direct", "bounces", "environment alone"]
@@ -239,6 +240,7 @@ def test_passes_together_are_those_one_by_one() -> None:
     torch.testing.assert_close(together.sums.specular, apart.sums.specular)
 
 
+@pytest.mark.slow
 def test_the_variance_falls_with_the_number_of_passes() -> None:
     """As with fresh samples: pools that came back would stop it. The median over pixels, since a pixel's variance has a long tail."""
 

@@ -75,6 +75,7 @@ def reflected_share(points: ShadingPoints) -> torch.Tensor:
     return torch.stack(shares)
 
 
+@pytest.mark.slow
 def test_furnace_returns_albedo_and_specular_share() -> None:
     points = points_seen_at([0.0, 45.0, 80.0], albedo=1.0, roughness=0.6)
     result = shade_points(points, constant_sky(), SampleCounts(2048, 1024, 1024))

@@ -52,6 +52,7 @@ def test_a_frame_at_rest_takes_no_more_rays() -> None:
     assert state.passes < 64 and again.passes == state.passes and torch.equal(again.sums.diffuse, state.sums.diffuse)
 
 
+@pytest.mark.slow
 def test_a_smaller_error_asked_for_later_goes_on_with_the_same_sums() -> None:
     scene = PosedScene(None, two_spheres(), sunny_sky(sun=50.0))
     loose = RenderSettings(bounces=0, target_error=0.2)

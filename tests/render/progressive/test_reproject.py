@@ -186,6 +186,7 @@ def test_nothing_of_the_old_light_or_material_is_left_one_frame_after_an_edit(ed
     torch.testing.assert_close(resolve_frame(after).radiance_linear, resolve_frame(fresh).radiance_linear, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_highlight_that_moves_with_the_camera_is_not_smeared() -> None:
     """A glossy ball under a sun: error of the frame after a move, near the highlight, against that of a frame alone."""
     glossy = PosedScene(None, sphere_mesh(4, roughness=0.25), sunny_sky(sun=200.0))

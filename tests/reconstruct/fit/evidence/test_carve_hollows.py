@@ -40,6 +40,7 @@ def carved(mesh: TriangleMesh, evidence: float, targets: list[ViewTarget]) -> tu
     return carved_depths(build_tracer(mesh), known, targets, mesh_edges(mesh.faces), SPHERE_RADIUS, SETTINGS)
 
 
+@pytest.mark.slow
 def test_a_bump_on_paint_goes_and_the_rest_stays(targets: list[ViewTarget]):
     mesh, share = bumped()
     inward, depth = carved(mesh, -1.0, targets)
@@ -74,6 +75,7 @@ def test_only_the_views_that_look_most_steeply_are_asked(targets: list[ViewTarge
     assert float(cosine[by_steep].mean()) > float(cosine[by_every].mean()) + 0.05
 
 
+@pytest.mark.slow
 def test_where_the_surface_is_right_nothing_moves(targets: list[ViewTarget]):
     sphere = dataclasses.replace(placed_sphere(subdivisions=4), roughness=torch.full((2562,), 0.6))
     _, depth = carved(sphere, -1.0, targets)

@@ -71,6 +71,7 @@ def test_a_grey_sphere_takes_on_the_colours_of_its_photographs(views: Views):
         assert float(torch.corrcoef(torch.stack([mesh.albedo[:, channel], normal[:, channel]]))[0, 1]) > 0.5
 
 
+@pytest.mark.slow
 def test_between_rounds_the_surface_follows_and_keeps_its_outline(views: Views):
     once, twice = (fitted(views, short(4, rounds=rounds, moves=MoveSettings(share_rays=4)))[0].parameters for rounds in (1, 2))
     assert torch.equal(once["vertices"], placed_sphere().vertices)

@@ -79,6 +79,7 @@ def test_no_place_may_be_loose_and_every_place_may(views: Views, loose: float):
     assert torch.isfinite(found.parameters["vertices"]).all() and (loose > 0 or not found.depth.any())
 
 
+@pytest.mark.slow
 def test_trials_that_are_told_to_stop_move_nothing(views: Views):
     mesh, _ = with_bump(0.12)
     told: list[int] = []

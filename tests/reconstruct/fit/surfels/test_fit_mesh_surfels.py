@@ -58,6 +58,7 @@ def fit(views):
     return fitted(views)
 
 
+@pytest.mark.slow
 def test_the_picture_gets_better_and_no_surfel_leaves_its_face(fit):
     state, reports = fit
     assert reports[-1].iteration == 6 and reports[-1].psnr > reports[0].psnr + 0.2
