@@ -114,6 +114,14 @@ DatasetPath = Annotated[
     Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP, Metashape or NeRO folder; pictures or a film.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
+StrokesPath = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Strokes (JSON) over some pictures that say what is the object and what is not: masks of all follow from them.",
+        show_default="the capture's own masks, else what is found",
+    ),
+]
 DataFolder = Annotated[
     Path | None,
     typer.Option(
@@ -196,6 +204,7 @@ def build(
             show_default="all of the object",
         ),
     ] = None,
+    strokes: StrokesPath = None,
     device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
     seed: Annotated[int, typer.Option()] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint that a stopped build left.")] = False,
@@ -206,6 +215,7 @@ def build(
     from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
     from drgs.reconstruct.capture.build_box import BuildBox
     from drgs.reconstruct.outline_agreement import complaint
+    from drgs.scene.strokes import read_strokes
 
     settings = BuildSettings(
         preset=preset.value,
@@ -216,6 +226,7 @@ def build(
         light=light.value,
         up=up,
         box=None if box is None else BuildBox(box[:3], box[3:]),
+        strokes=() if strokes is None else read_strokes(strokes),
     )
     with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
         try:
@@ -225,6 +236,7 @@ def build(
             chosen += "" if light == LightKind.auto else f" --light {light.value}"
             chosen += "" if up == (0.0, 0.0, 1.0) else f" --up {up[0]:g} {up[1]:g} {up[2]:g}"
             chosen += "" if box is None else f" --box {' '.join(f'{value:g}' for value in box)}"
+            chosen += "" if strokes is None else f" --strokes {strokes}"
             print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value}{chosen} --resume", file=sys.stderr)
             raise typer.Exit(130) from None
     if json_progress:
@@ -398,18 +410,29 @@ def doctor(
         Path | None,
         typer.Option(metavar="FILE", help="Draw all pictures small, with masks and what is wrong with them, into this PNG or JPEG."),
     ] = None,
+    strokes: StrokesPath = None,
     as_json: Json = False,
 ) -> None:
-    """Check a capture before time is spent on it."""
+    """Check a capture before time is spent on it; with strokes, see what masks they give."""
     from drgs.evaluate.contact_sheet import SHEET_FORMATS, contact_sheet
-    from drgs.evaluate.doctor import doctor as examine
+    from drgs.evaluate.doctor.doctor import examine
     from drgs.reconstruct.capture.load_views.checks import is_folder
+    from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
+    from drgs.scene.strokes import read_strokes
 
     if sheet is not None and sheet.suffix.lower() not in SHEET_FORMATS:
         raise UsageError(f"--sheet is {str(sheet)!r}; expected a file that ends with {' or '.join(SHEET_FORMATS)}")
-    report = examine(dataset)
+    if strokes is not None and sheet is None:
+        raise UsageError("--strokes shows its masks on a sheet; expected --sheet FILE, too")
+    drawn = None if strokes is None else read_strokes(strokes)
+    examined = examine(dataset)
+    report, masked = examined.report, None
+    if drawn is not None and report["ok"]:
+        if examined.views is None:
+            raise ValueError(f"{dataset}: has no cameras, which strokes need; expected a posed capture: drgs pose {dataset} OUT")
+        masked = masks_by_strokes(examined.views, drawn)
     if sheet is not None and (report["ok"] or is_folder(dataset)):
-        contact_sheet(dataset, report, sheet)
+        contact_sheet(dataset, report, sheet, masked)
     if as_json:
         print(json.dumps(report))
     elif report["ok"]:

@@ -8,7 +8,7 @@ import io
 import math
 import os
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from drgs.reconstruct.pose.backdrop_masks import backdrop_mask
 from drgs.reconstruct.pose.list_photos import list_photos
 from drgs.reconstruct.pose.posed_dataset import film_of
 from drgs.reconstruct.pose.prepare_photos import BACKDROP_SHARE
+from drgs.scene.views import Views
 
 SHEET_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 MOST_BYTES = 3_000_000
@@ -94,11 +95,12 @@ class SheetLayout:
     """A tile's width over its height [of its pixels]."""
 
 
-def contact_sheet(folder: Path, report: dict[str, Any], out: Path) -> SheetLayout:
+def contact_sheet(folder: Path, report: dict[str, Any], out: Path, masked: Views | None = None) -> SheetLayout:
     """Write the sheet, and say how its tiles lie.
 
     Args:
         report: the doctor's, on this folder. out: its suffix says whether it becomes a PNG or a JPEG.
+        masked: the capture as it is to be drawn, where its masks do not lie in the folder.
 
     Raises:
         ValueError: another suffix, or a folder without pictures.
@@ -114,7 +116,7 @@ def contact_sheet(folder: Path, report: dict[str, Any], out: Path) -> SheetLayou
     tiles = _chosen([Tile(file, tuple(report["marks"].get(file.name, ()))) for file in files])
     grid = grid_for(len(tiles))
     drawn = Image.new("RGB", (grid.columns * (grid.side + GAP) + GAP, grid.rows * grid.tile_height), BACKGROUND)
-    drawer = _TileDrawer(guesses=report.get("source") == "photographs")
+    drawer = _TileDrawer(report.get("source") == "photographs", {} if masked is None else _small_pictures(masked, grid.side))
     for number, tile in enumerate(tiles):
         row, column = divmod(number, grid.columns)
         drawer.draw(drawn, tile, (GAP + column * (grid.side + GAP), row * grid.tile_height), grid)
@@ -164,6 +166,17 @@ def _files_of(folder: Path) -> list[PictureFile]:
         return [PictureFile(path.stem, path) for path in found]
 
 
+def _small_pictures(views: Views, side: int) -> dict[str, SmallPicture]:
+    """By name, of at most `side` pixels."""
+    found = {}
+    for camera, image, mask in zip(views.cameras, views.images_srgb, views.coverage, strict=True):
+        scale = min(1.0, side / max(camera.width, camera.height))
+        size = (max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
+        color, small = (np.asarray(Image.fromarray(whole.numpy()).resize(size, Image.Resampling.BOX)) for whole in (image, mask))
+        found[camera.name] = SmallPicture(color, small)
+    return found
+
+
 def _chosen(tiles: list[Tile]) -> list[Tile]:
     """At most MOST_TILES, in their order."""
     if len(tiles) <= MOST_TILES:
@@ -177,7 +190,8 @@ def _chosen(tiles: list[Tile]) -> list[Tile]:
 class _TileDrawer:
     """Draws tiles one after the other and counts what masks they have. Final."""
 
-    def __init__(self, guesses: bool) -> None:
+    def __init__(self, guesses: bool, known: Mapping[str, SmallPicture]) -> None:
+        self._known = known
         self._guesses = guesses
         """Whether a plain backdrop is looked for where there is no mask, as a build of photographs without poses does."""
         self._shown = self._given = self._guessed = 0
@@ -187,7 +201,7 @@ class _TileDrawer:
         x, y = corner
         marks = list(tile.marks)
         try:
-            picture = small_picture(tile.file, grid.side)
+            picture = self._known.get(tile.file.name) or small_picture(tile.file, grid.side)
         except ValueError:
             marks = marks or ["cannot be read"]
             draw.line([(x, y), (x + grid.side, y + grid.side)], BAD, 2)

@@ -24,6 +24,7 @@ from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.find_masks import masked_by_surfels
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
+from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
 from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
@@ -82,6 +83,7 @@ from drgs.scene.certainty import Certainty
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
+from drgs.scene.strokes import Stroke, plain_strokes
 from drgs.scene.views import Views
 from drgs.warp_torch import device_from_name
 
@@ -104,6 +106,8 @@ class BuildSettings:
     """Direction of the capture's world that points up. The asset's world is the capture's, turned so that it is z (turn_up.rotation_to_up)."""
     box: BuildBox | None = None
     """Of the asset's world: what lies outside is not built. None: all of the object is."""
+    strokes: tuple[Stroke, ...] = ()
+    """What is the object in some pictures, and what is not: the masks of all follow from them, whatever masks the capture has. None: its own count."""
     materials: str | None = None
     """Preset of the stage `materials` alone: None is `preset`. It is how material and light are separated anew on kept geometry."""
 
@@ -224,11 +228,13 @@ def build_stages(
     with timed("read"):
         reporter.report("read", 0.0, "reading the capture")
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
-        found, views, points = open_capture(capture, preset.image_side, preset.points, settings.seed, settings.up, settings.box)
+        stop = should_stop or (lambda: False)
+        masked_by = _by_strokes(settings.strokes, reporter, stop) if settings.strokes else None
+        found, views, points = open_capture(capture, preset.image_side, preset.points, settings.seed, settings.up, settings.box, masked_by)
         photographs = views
         views = with_gains_of_points(views, points)
         identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views, settings.box)}
-        place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, should_stop or (lambda: False))
+        place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, stop)
         if not settings.resume:
             forget_checkpoints(place)
         fit_settings = replace(preset.fit, seed=settings.seed)
@@ -289,6 +295,21 @@ def _posed(
     found = pose_source(dataset, place, pose_settings, progress=report, should_stop=should_stop)
     reporter.begun["read"] = POSING_SHARE
     return place, {"poses": provenance_of(found)}
+
+
+def _by_strokes(strokes: tuple[Stroke, ...], reporter: BuildReporter, should_stop: Callable[[], bool]) -> Callable[[Views], Views]:
+    """masks_by_strokes, as open_capture takes it."""
+
+    def masked(views: Views) -> Views:
+        def report(share: float) -> None:
+            reporter.report("read", share, "finding masks by strokes")
+
+        found = masks_by_strokes(views, strokes, report=report, should_stop=should_stop)
+        if found is None:
+            raise BuildStopped
+        return found
+
+    return masked
 
 
 def _light(settings: BuildSettings, preset: Preset, capture: Capture, views: Views, points: InitialPoints) -> LightFound:
@@ -459,6 +480,7 @@ def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMes
         "seed": settings.seed,
         **({"up": list(settings.up)} if settings.up != UP else {}),
         **({"box": [list(settings.box.low), list(settings.box.high)]} if settings.box is not None else {}),
+        **({"strokes": plain_strokes(settings.strokes)} if settings.strokes else {}),
         "device": str(device),
         "torch": torch.__version__,
         "mesh": asdict(mesh_report(mesh.vertices, mesh.faces)),

@@ -173,10 +173,10 @@ def _bounding_sphere(points: Float[ndarray, "point 3"]) -> tuple[Float[ndarray, 
 
 def _sphere_without_masks(views: Views, box: BuildBox | None) -> tuple[Float[ndarray, "3"], float]:
     """Around the build's box, else what all cameras see."""
-    return _seen_by_all(views) if box is None else (np.array(box.center), box.radius)
+    return seen_by_all(views) if box is None else (np.array(box.center), box.radius)
 
 
-def _seen_by_all(views: Views) -> tuple[Float[ndarray, "3"], float]:
+def seen_by_all(views: Views) -> tuple[Float[ndarray, "3"], float]:
     """Sphere around the point where the optical axes meet, small enough to fit in every picture."""
     camera_from_world, intrinsics, centers = camera_geometry(views)
     axes = camera_from_world[:, 2, :3]

@@ -4,6 +4,7 @@ What a single file can tell is refused by the readers (load_views/checks.py); he
 and shares, so that neither the unit of the world nor the size of pictures matters. In: a folder. Out: its cameras, pictures and first points.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -39,13 +40,20 @@ INVERT = (
 
 
 def open_capture(
-    folder: Path, max_side: int | None, point_count: int, seed: int, up: Direction = UP, box: BuildBox | None = None
+    folder: Path,
+    max_side: int | None,
+    point_count: int,
+    seed: int,
+    up: Direction = UP,
+    box: BuildBox | None = None,
+    masked: Callable[[Views], Views] | None = None,
 ) -> tuple[Capture, Views, InitialPoints]:
     """The capture, its pictures of at most `max_side` pixels a side, and points to begin with.
 
     Args:
         up: the direction of the capture's own world that is to point up: all is given in the world that is turned so.
         box: of that turned world. Masks of the capture's own are cut to what it holds (cut_to_box); without masks it bounds the points alone.
+        masked: gives the views other masks than the capture's own, as strokes do.
 
     Raises:
         ValueError: one sentence why there is nothing to build from; a CaptureFault where what to do about it is known, too.
@@ -54,6 +62,8 @@ def open_capture(
     _check_cameras(capture, folder)
     views = read_pictures(capture, max_side)
     _check_pictures(views, folder)
+    if masked is not None:
+        views = masked(views)
     if box is not None and views.has_masks:
         views = _cut(views, box, folder)
     points = initial_points(views, point_count, seed, box=box)
