@@ -64,9 +64,14 @@ def look_at_capture(folder: Path, sheet: Path, name: str) -> dict[str, Any]:
     if views is None or points is None:
         return look
     count = len(views.cameras)
-    shown = views.cameras if count <= MOST_CAMERAS else [views.cameras[k * count // MOST_CAMERAS] for k in range(MOST_CAMERAS)]
+    shown = [views.cameras[number] for number in told_cameras(count)]
     up = up_of_cameras(np.stack([opengl_from_camera(camera).numpy() for camera in views.cameras])).round(DIGITS).tolist()
     return look | {"camera_count": count, "cameras": [_told_camera(camera) for camera in shown], "up": up} | _told_points(points)
+
+
+def told_cameras(count: int) -> list[int]:
+    """Numbers of the cameras that are told of a capture with so many."""
+    return list(range(count)) if count <= MOST_CAMERAS else [number * count // MOST_CAMERAS for number in range(MOST_CAMERAS)]
 
 
 def _by_name(report: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from drgs.exchange.export_formats import DownloadFormat
 from drgs.scene.edits import Edit, Triple
+from drgs.scene.strokes import Stroke, plain_strokes
 from drgs_server.api.rest_records import (
     AssetInfo,
     AssetList,
@@ -93,6 +94,7 @@ class Client:
         light: LightName = "auto",
         up: Triple = (0.0, 0.0, 1.0),
         box: tuple[Triple, Triple] | None = None,
+        strokes: Sequence[Stroke] = (),
     ) -> JobInfo:
         """Start a build.
 
@@ -103,6 +105,7 @@ class Client:
             light: what the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures.
             up: direction of the capture's world that points up; the asset's world is turned so that it is z.
             box: low and high corner in the asset's world: what lies outside is not built. None: all of the object is.
+            strokes: over some pictures, what is the object and what is not: the masks of all follow from them. None: the capture's own count.
             idempotency_key: the same key gives the same job, however often this is called.
         """
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
@@ -115,6 +118,7 @@ class Client:
             "light": light,
             "up": up,
             "box": None if box is None else {"low": box[0], "high": box[1]},
+            "strokes": plain_strokes(strokes) or None,
             "seed": seed,
             "name": name,
         }

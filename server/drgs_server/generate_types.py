@@ -64,6 +64,7 @@ _FRAME_CONSTANTS = (
 
 _REQUESTS: tuple[type[BaseModel], ...] = (
     rest_records.CaptureRequest,
+    rest_records.MasksRequest,
     rest_records.BuildRequest,
     rest_records.PoseRequest,
     rest_records.RedecoupleRequest,
@@ -80,6 +81,7 @@ _ANSWERS: tuple[type[BaseModel], ...] = (
     rest_records.CaptureInfo,
     rest_records.CaptureList,
     rest_records.CaptureLook,
+    rest_records.CaptureMasks,
     rest_records.JobInfo,
     rest_records.JobList,
     rest_records.JobFileList,

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from drgs.scene.edits import Edit, Triple
+from drgs.scene.strokes import StrokeList
 from drgs_server.live.messages import BrokenEdit, Row
 from drgs_worker.jobs.capture_report import CaptureFinding, CaptureReport
 from drgs_worker.jobs.requests import (
@@ -119,6 +120,19 @@ class CaptureLook(_Body):
     """Three numbers for each point on or about the object [world units]; 3000 points at most, none where nothing is known of them."""
     colors: list[float]
     """Three for each point, sRGB 0..1."""
+
+
+class MasksRequest(_Body):
+    strokes: StrokeList
+    """At least one over the object and one over what is not."""
+
+
+class CaptureMasks(_Body):
+    """Masks of all pictures by strokes, to be looked at; a build that is told the same strokes finds them again."""
+
+    version: str
+    """Names the sheet: GET .../masks/{version}.jpg."""
+    sheet: SheetLayout
 
 
 class JobInfo(_Body):

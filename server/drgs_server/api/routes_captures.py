@@ -1,5 +1,8 @@
 """REST: captures that were uploaded before anything is built of them. A build names one as `capture:ID`, and any number of builds may."""
 
+import hashlib
+import json
+import re
 import shutil
 import tempfile
 import uuid
@@ -8,6 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request
+from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -16,17 +20,22 @@ from starlette.concurrency import run_in_threadpool
 from drgs_server.api.context import ServerContext, caller_of, context_of
 from drgs_server.api.incoming import Incoming
 from drgs_server.api.problems import ProblemError
-from drgs_server.api.rest_records import CaptureInfo, CaptureList, CaptureLook, CaptureRequest
+from drgs_server.api.rest_records import CaptureInfo, CaptureList, CaptureLook, CaptureMasks, CaptureRequest, MasksRequest
 from drgs_server.api.while_connected import while_connected
 from drgs_server.api.zip_guard import single_folder, unpack_zip
 from drgs_server.live.admission import Caller
-from drgs_worker.jobs.file_tool import LOOK_NAME, SHEET_NAME, FileToolError, look_bytes, run_file_tool
+from drgs_worker.jobs.file_tool import LOOK_NAME, MASKS_NAME, SHEET_NAME, FileToolError, look_bytes, masks_bytes, run_file_tool
 from drgs_worker.store.artifacts import fetch_capture, share_artifact
 from drgs_worker.store.database import CaptureRow, now
 from drgs_worker.store.remove_unused import jobs_of_capture, remove_capture
 
 CAPTURE_PREFIX = "capture:"
 """Of a build's `dataset`."""
+PICTURES, MASKS = "pictures", "masks"
+"""Folders beside what is kept of a look."""
+KEPT_MASKS = 4
+"""Sheets of masks of one capture; the oldest go."""
+_VERSION = re.compile(r"[0-9a-f]{32}")
 
 router = APIRouter(prefix="/api/captures", tags=["captures"])
 
@@ -130,6 +139,72 @@ async def read_sheet(capture_id: str, request: Request, context: Context) -> Fil
     if not sheet.is_file():
         raise ProblemError(404, "This capture has no pictures to show: it is a film, or holds none.")
     return FileResponse(sheet, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=86400, immutable"})
+
+
+@router.get("/{capture_id}/pictures/{number}.jpg")
+async def read_picture(
+    capture_id: str, number: Annotated[int, PathParameter(ge=0, le=999)], request: Request, context: Context
+) -> FileResponse:
+    """A picture of a posed capture, without lens distortion, to draw strokes over. `number`: of the look's cameras. The first call takes seconds, in a process
+    of its own; then all are kept."""
+    look = await _look(context, request, capture_id)
+    async with context.incoming.alone(capture_id):
+        if not (look / PICTURES).is_dir():
+            await while_connected(request, _make_beside(context, caller_of(request), capture_id, look / PICTURES, None))
+    picture = look / PICTURES / f"{number}.jpg"
+    if not picture.is_file():
+        raise ProblemError(404, f"This capture has no picture number {number}.")
+    return FileResponse(picture, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=86400, immutable"})
+
+
+@router.post("/{capture_id}/masks")
+async def find_masks(capture_id: str, body: MasksRequest, request: Request, context: Context) -> CaptureMasks:
+    """What masks the strokes give, on a sheet of all pictures. Takes seconds to a minute, in a process of its own; nothing of the capture is changed."""
+    strokes = json.dumps({"strokes": [stroke.model_dump(mode="json") for stroke in body.strokes]})
+    version = hashlib.sha256(strokes.encode()).hexdigest()[:32]
+    look = await _look(context, request, capture_id)
+    async with context.incoming.alone(capture_id):
+        place = look / MASKS / version
+        if not place.is_dir():
+            await while_connected(request, _make_beside(context, caller_of(request), capture_id, place, strokes))
+            await run_in_threadpool(_forget_old_masks, place.parent)
+        told = await run_in_threadpool((place / MASKS_NAME).read_text)
+    return CaptureMasks.model_validate(json.loads(told) | {"version": version})
+
+
+@router.get("/{capture_id}/masks/{version}.jpg")
+def read_masks(capture_id: str, version: str, context: Context) -> FileResponse:
+    """The sheet of masks that were found by strokes."""
+    row = _read_row(context, capture_id)
+    sheet = context.directory.look(row.id) / MASKS / version / SHEET_NAME
+    if not _VERSION.fullmatch(version) or not sheet.is_file():
+        raise ProblemError(404, "These masks are not kept any more; ask for them again by their strokes.")
+    return FileResponse(sheet, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=86400, immutable"})
+
+
+async def _make_beside(context: ServerContext, caller: Caller, capture_id: str, place: Path, strokes: str | None) -> None:
+    """The pictures of a capture, or its masks by strokes, beside what is kept of its look."""
+    row = await run_in_threadpool(_read_row, context, capture_id)
+    capture = await run_in_threadpool(fetch_capture, context.directory, context.directory.uploads / row.folder)
+    with tempfile.TemporaryDirectory(prefix=".look-", dir=context.scratch.folder) as folder:
+        draft, written = Path(folder) / "made", Path(folder) / "strokes.json"
+        try:
+            if strokes is None:
+                async with context.admission.place("file", caller, await run_in_threadpool(look_bytes, capture)):
+                    await run_file_tool("pictures", str(capture), str(draft))
+            else:
+                written.write_text(strokes)
+                async with context.admission.place("file", caller, await run_in_threadpool(masks_bytes, capture)):
+                    await run_file_tool("masks", str(capture), str(written), str(draft))
+        except FileToolError as error:
+            raise ProblemError(422, str(error).replace(f"{capture}/", "").replace(str(capture), row.name)) from error
+        place.parent.mkdir(exist_ok=True)
+        draft.rename(place)
+
+
+def _forget_old_masks(folder: Path) -> None:
+    for old in sorted(folder.iterdir(), key=lambda place: place.stat().st_mtime)[:-KEPT_MASKS]:
+        shutil.rmtree(old, ignore_errors=True)
 
 
 async def _look(context: ServerContext, request: Request, capture_id: str) -> Path:

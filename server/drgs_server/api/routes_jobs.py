@@ -178,7 +178,7 @@ def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
         row.dataset, row.preset, row.seed = built.dataset, asked.preset, built.seed
         built_preset = built.parameters.get("built_preset", built.preset)
         kept = {"binding": built.parameters.get("binding", "particles"), "light": built.parameters.get("light", "auto")}
-        kept |= {name: built.parameters[name] for name in ("up", "box") if name in built.parameters}
+        kept |= {name: built.parameters[name] for name in ("up", "box", "strokes") if name in built.parameters}
         row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed} | kept
     elif isinstance(asked, SimulateRequest):
         from drgs.deform.simulation_scene import parse_simulation_scene

@@ -140,6 +140,11 @@ export interface BuildRequest {
    * bodies.
    */
   box?: BoxCorners | null;
+  /**
+   * Over some of the capture's pictures: what is the object, and what is not. The masks of all pictures follow from them, whatever masks the capture has.
+   * Not of multipart bodies.
+   */
+  strokes?: Stroke[] | null;
   seed?: number;
 }
 
@@ -239,6 +244,13 @@ export interface CaptureLook {
   points: number[];
   /** Three for each point, sRGB 0..1. */
   colors: number[];
+}
+
+/** Masks of all pictures by strokes, to be looked at; a build that is told the same strokes finds them again. */
+export interface CaptureMasks {
+  /** Names the sheet: GET .../masks/{version}.jpg. */
+  version: string;
+  sheet: SheetLayout;
 }
 
 /** Of `drgs doctor`. */
@@ -506,6 +518,11 @@ export interface LogChangeMessage {
 /** Send the whole edit log: this client has noticed that its own is not the one that a change was made to. Answered by `state`. */
 export interface LogMessage {
   type: "log";
+}
+
+export interface MasksRequest {
+  /** At least one over the object and one over what is not. */
+  strokes: Stroke[];
 }
 
 export interface MaterialEdit {
@@ -860,6 +877,17 @@ export interface StatusMessage {
 export interface StretchMap {
   type: "stretch";
   factor: number;
+}
+
+/** A way over a picture, as the build sees it: upright, and without lens distortion. */
+export interface Stroke {
+  /** Name of its file, without its ending. */
+  picture: string;
+  shows: "object" | "background";
+  /** Half its width, as a share of the picture's longer side. */
+  radius?: number;
+  /** x to the right and y down, as shares of the picture's width and height; joined by straight lines. */
+  points: [number, number][];
 }
 
 export interface TokenRequest {

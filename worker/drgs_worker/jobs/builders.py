@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 from drgs.reconstruct.progress import Progress
+from drgs.scene.strokes import Stroke
 from drgs_worker.jobs.capture_report import examine_capture
 from drgs_worker.jobs.progress import JobStopped, Tell
 from drgs_worker.jobs.requests import LightName
@@ -42,6 +43,8 @@ class BuildRequest:
     """Of the capture's world."""
     box: tuple[Corner, Corner] | None = None
     """Low and high corner in the asset's world; None: all of the object is built."""
+    strokes: tuple[Stroke, ...] = ()
+    """None: the capture's own masks count."""
 
 
 Builder = Callable[[BuildRequest, Tell, Callable[[], bool]], Iterator[str]]
@@ -75,6 +78,7 @@ def build_with_drgs(request: BuildRequest, tell: Tell, should_stop: Callable[[],
         light=request.light,
         up=request.up,
         box=None if request.box is None else BuildBox(*request.box),
+        strokes=request.strokes,
         materials=request.materials,
     )
 

@@ -5,6 +5,8 @@ Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full
     asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
     environment SOURCE OUT      EXR or Radiance HDR -> EXR
     look CAPTURE OUT NAME       folder of a capture, which sentences call NAME -> folder with look.json and, where it has pictures, sheet.jpg (drgs/evaluate/look_at_capture.py)
+    pictures CAPTURE OUT        folder of a posed capture -> folder with its pictures as 0.jpg, 1.jpg, ..., in the order of look.json's cameras, without lens distortion
+    masks CAPTURE STROKES OUT   the same and strokes (drgs/scene/strokes.py) -> folder with masks.json and sheet.jpg, on which the strokes' masks are outlined
     export ASSET OUT FORMAT FACES [EDITS ENVIRONMENTS N]    asset folder, with the edits put into it -> a format of drgs/exchange/export_formats.py, or zip
                                 (the asset itself); FACES: the most that a textured mesh has, 0 where nobody says
     version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
@@ -48,6 +50,13 @@ LOOK_BYTES = 320 << 20
 LOOK_PICTURE_BYTES = 512 << 10
 """Of each of its files: a picture shrunken to 400 pixels a side, or a mask."""
 LOOK_NAME, SHEET_NAME = "look.json", "sheet.jpg"
+MASKS_NAME = "masks.json"
+PICTURE_SIDE = 800
+"""Of pictures that strokes are drawn over, and"""
+MASKS_SIDE = 256
+"""of those that masks are then shown for [pixels]."""
+MASKS_BYTES = 2 << 20
+"""Of each picture while its mask is found."""
 MOST_ENVIRONMENT_SIDES = (8192, 4096)
 """Of an environment that a service takes: 1.2 GiB while it is read, and 400 MB in memory while something is lit by it."""
 MOST_CHANNEL_BYTES = 512 << 20
@@ -82,6 +91,11 @@ def _pixel_bytes(picture: Path) -> int:
 def look_bytes(capture: Path) -> int:
     """Memory that the tool takes to look at a capture, estimated: pictures are shrunken one by one."""
     return TOOL_BYTES + LOOK_BYTES + LOOK_PICTURE_BYTES * sum(1 for path in capture.rglob("*") if path.is_file())
+
+
+def masks_bytes(capture: Path) -> int:
+    """The same of finding masks by strokes."""
+    return look_bytes(capture) + MASKS_BYTES * sum(1 for path in capture.rglob("*") if path.is_file())
 
 
 async def run_file_tool(*arguments: str) -> None:
@@ -180,6 +194,41 @@ def make_look(capture: Path, out: Path, name: str) -> None:
     draft.rename(out)
 
 
+def make_pictures(capture: Path, out: Path) -> None:
+    """The folder `out` is there when all of it is."""
+    import simplejpeg
+
+    from drgs.evaluate.look_at_capture import told_cameras
+    from drgs.reconstruct.capture.load_views import load_views
+
+    views = load_views(capture, PICTURE_SIDE)
+    draft = out.with_name(f"{out.name}.part")
+    draft.mkdir()
+    for number, camera in enumerate(told_cameras(len(views.cameras))):
+        image = views.images_srgb[camera].contiguous().numpy()
+        (draft / f"{number}.jpg").write_bytes(simplejpeg.encode_jpeg(image, quality=85, colorspace="RGB"))
+    draft.rename(out)
+
+
+def make_masks(capture: Path, strokes: Path, out: Path) -> None:
+    """The folder `out` is there when all of it is."""
+    from dataclasses import asdict
+
+    from drgs.evaluate.contact_sheet import contact_sheet
+    from drgs.reconstruct.capture.load_views import load_views
+    from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
+    from drgs.scene.strokes import read_strokes
+
+    masked = masks_by_strokes(load_views(capture, MASKS_SIDE), read_strokes(strokes))
+    assert masked is not None  # nobody stopped it
+    draft = out.with_name(f"{out.name}.part")
+    draft.mkdir()
+    report = {"summary": f"{len(masked.cameras)} pictures, masked by strokes.", "findings": [], "marks": {}}
+    layout = contact_sheet(capture, report, draft / SHEET_NAME, masked)
+    (draft / MASKS_NAME).write_text(json.dumps({"sheet": asdict(layout)}, allow_nan=False))
+    draft.rename(out)
+
+
 def make_environment(source: Path, out: Path) -> None:
     from drgs.exchange.exr import PictureLimits, decode_environment, encode_environment
 
@@ -224,6 +273,10 @@ def main(arguments: list[str]) -> int:
                 make_environment(Path(source), Path(out))
             case ["look", capture, out, name]:
                 make_look(Path(capture), Path(out), name)
+            case ["pictures", capture, out]:
+                make_pictures(Path(capture), Path(out))
+            case ["masks", capture, strokes, out]:
+                make_masks(Path(capture), Path(strokes), Path(out))
             case ["export", asset, out, format, faces]:
                 export(Path(asset), Path(out), format, int(faces))
             case ["export", asset, out, format, faces, edits, environments, version]:
@@ -231,7 +284,9 @@ def main(arguments: list[str]) -> int:
             case ["version", asset, out, edits, environments, version]:
                 make_version(Path(asset), Path(out), Path(edits), Path(environments), int(version))
             case _:
-                raise ValueError(f"expected asset, environment, look, export or version with their arguments; found {arguments}")
+                raise ValueError(
+                    f"expected asset, environment, look, pictures, masks, export or version with their arguments; found {arguments}"
+                )
     except RecursionError:
         print("the file is nested deeper than is read here", file=sys.stderr)
         return 2

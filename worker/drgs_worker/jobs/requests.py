@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from drgs.exchange.export_formats import FEWEST_FACES, FILE_KINDS, MOST_FACES, DownloadFormat, refuse_faces
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.scene.edits import Coordinate, Edit, Triple
+from drgs.scene.strokes import StrokeList
 from drgs.scene.tone_curve import ToneCurve
 from drgs_worker.store.user_names import PlainText, UserName
 
@@ -105,6 +106,9 @@ class BuildRequest(_Job):
     box: BoxCorners | None = None
     """Of the asset's world, which is the capture's turned by `up`: what lies outside is not built. Absent: all of the object is. Not of multipart
     bodies."""
+    strokes: StrokeList | None = None
+    """Over some of the capture's pictures: what is the object, and what is not. The masks of all pictures follow from them, whatever masks the capture has.
+    Not of multipart bodies."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
 
     @model_validator(mode="after")

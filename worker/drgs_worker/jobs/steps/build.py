@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from drgs.reconstruct.progress import POSED, STAGE_SHARES
+from drgs.scene.strokes import Stroke, parse_strokes
 from drgs_worker.jobs.builders import BuildRequest, Corner
 from drgs_worker.jobs.requests import LightName
 from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
@@ -31,6 +32,7 @@ class BuildRun(AbstractJobRun):
         x, y, z = job.parameters.get("up", (0.0, 0.0, 1.0))
         self._up: tuple[float, float, float] = (x, y, z)
         self._box = _corners(job.parameters.get("box"))
+        self._strokes: tuple[Stroke, ...] = parse_strokes(job.parameters.get("strokes", []), "job")
         self.steps: tuple[str, ...] = (*STAGE_SHARES[self._binding], "register")
 
     def run(self, step: str) -> None:
@@ -65,6 +67,7 @@ class BuildRun(AbstractJobRun):
             light=self._light,
             up=self._up,
             box=self._box,
+            strokes=self._strokes,
         )
 
     def _register(self) -> None:
@@ -119,7 +122,9 @@ class RedecoupleRun(BuildRun):
         assert job.dataset is not None
         out = job.folder / "asset"
         preset, seed = given["built_preset"], given["built_seed"]
-        return BuildRequest(job.dataset, out, preset, seed, job.device, given["preset"], self._binding, self._light, self._up, self._box)
+        return BuildRequest(
+            job.dataset, out, preset, seed, job.device, given["preset"], self._binding, self._light, self._up, self._box, self._strokes
+        )
 
 
 def _corners(box: dict[str, list[float]] | None) -> tuple[Corner, Corner] | None:
