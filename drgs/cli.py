@@ -415,7 +415,8 @@ def doctor(
 ) -> None:
     """Check a capture before time is spent on it; with strokes, see what masks they give."""
     from drgs.evaluate.contact_sheet import SHEET_FORMATS, contact_sheet
-    from drgs.evaluate.doctor.doctor import examine
+    from drgs.evaluate.doctor.doctor import EXAMINED_SIDE, examine
+    from drgs.reconstruct.capture.load_views import load_unmasked_views
     from drgs.reconstruct.capture.load_views.checks import is_folder
     from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
     from drgs.scene.strokes import read_strokes
@@ -430,7 +431,7 @@ def doctor(
     if drawn is not None and report["ok"]:
         if examined.views is None:
             raise ValueError(f"{dataset}: has no cameras, which strokes need; expected a posed capture: drgs pose {dataset} OUT")
-        masked = masks_by_strokes(examined.views, drawn)
+        masked = masks_by_strokes(load_unmasked_views(dataset, EXAMINED_SIDE), drawn)
     if sheet is not None and (report["ok"] or is_folder(dataset)):
         contact_sheet(dataset, report, sheet, masked)
     if as_json:

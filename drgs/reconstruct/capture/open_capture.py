@@ -16,7 +16,7 @@ from drgs.reconstruct.capture.build_box import BuildBox
 from drgs.reconstruct.capture.cut_to_box import cut_to_box
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import read_capture
-from drgs.reconstruct.capture.load_views.capture import Capture
+from drgs.reconstruct.capture.load_views.capture import Capture, without_masks
 from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.mask_agreement import mask_agreement
@@ -53,13 +53,15 @@ def open_capture(
     Args:
         up: the direction of the capture's own world that is to point up: all is given in the world that is turned so.
         box: of that turned world. Masks of the capture's own are cut to what it holds (cut_to_box); without masks it bounds the points alone.
-        masked: gives the views other masks than the capture's own, as strokes do.
+        masked: gives the views other masks than the capture's own, which are not read then, as strokes do.
 
     Raises:
         ValueError: one sentence why there is nothing to build from; a CaptureFault where what to do about it is known, too.
     """
     capture = turn_up(read_capture(folder), up)
     _check_cameras(capture, folder)
+    if masked is not None:
+        capture = without_masks(capture)
     views = read_pictures(capture, max_side)
     _check_pictures(views, folder)
     if masked is not None:

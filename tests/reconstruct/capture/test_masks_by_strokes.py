@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,14 @@ from typer.testing import CliRunner
 from drgs.cli import app
 from drgs.evaluate.contact_sheet import GOOD
 from drgs.reconstruct.build_asset import PRESETS, BuildSettings, build_asset
-from drgs.reconstruct.capture.load_views import read_capture
+from drgs.reconstruct.capture.load_views import load_unmasked_views, load_views, read_capture
 from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
 from drgs.reconstruct.capture.masks_by_strokes.color_shares import CELLS, cells_of, color_shares, log_odds
 from drgs.reconstruct.capture.masks_by_strokes.cut_picture import cut_picture, edges_of, undecided
 from drgs.reconstruct.capture.masks_by_strokes.vote_volume import Region, silhouette, vote_volume
+from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.scene.strokes import Stroke, plain_strokes, read_strokes
 from drgs.scene.views import Views
 from tests.reconstruct.capture.test_find_masks import before_surroundings
@@ -106,6 +108,22 @@ def test_what_was_stroked_is_what_it_was_stroked_as(views: Views) -> None:
     found = masks_by_strokes(views, [*strokes_over(views), corner])
     assert found is not None
     assert int(found.coverage[3][HEIGHT // 2, round(0.06 * WIDTH)]) > 127
+
+
+def test_masks_of_the_capture_leave_the_pictures_for_strokes_whole(views: Views, folder: Path, tmp_path: Path) -> None:
+    """Shrunken with their masks, pictures lose what is outside."""
+    masked = tmp_path / "masked"
+    shutil.copytree(folder, masked)
+    (masked / "masks").mkdir()
+    for camera in views.cameras:
+        Image.fromarray(np.eye(HEIGHT, WIDTH, dtype=np.uint8) * 255).save(masked / "masks" / f"{camera.name}.png")
+    seen: list[Views] = []
+    _, opened, _ = open_capture(folder, 36, 100, 0, masked=lambda given: seen.append(given) or given)
+    open_capture(masked, 36, 100, 0, masked=lambda given: seen.append(given) or given)
+    seen.append(load_unmasked_views(masked, 36))
+    assert not opened.has_masks and not any(found.has_masks for found in seen)
+    assert all(torch.equal(seen[0].images_srgb[3], other.images_srgb[3]) for other in seen)
+    assert not load_views(masked, 36).images_srgb[3].equal(seen[0].images_srgb[3])
 
 
 def test_strokes_that_say_too_little_are_refused(views: Views) -> None:

@@ -199,9 +199,9 @@ def make_pictures(capture: Path, out: Path) -> None:
     import simplejpeg
 
     from drgs.evaluate.look_at_capture import told_cameras
-    from drgs.reconstruct.capture.load_views import load_views
+    from drgs.reconstruct.capture.load_views import load_unmasked_views
 
-    views = load_views(capture, PICTURE_SIDE)
+    views = load_unmasked_views(capture, PICTURE_SIDE)
     draft = out.with_name(f"{out.name}.part")
     draft.mkdir()
     for number, camera in enumerate(told_cameras(len(views.cameras))):
@@ -215,11 +215,11 @@ def make_masks(capture: Path, strokes: Path, out: Path) -> None:
     from dataclasses import asdict
 
     from drgs.evaluate.contact_sheet import contact_sheet
-    from drgs.reconstruct.capture.load_views import load_views
+    from drgs.reconstruct.capture.load_views import load_unmasked_views
     from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
     from drgs.scene.strokes import read_strokes
 
-    masked = masks_by_strokes(load_views(capture, MASKS_SIDE), read_strokes(strokes))
+    masked = masks_by_strokes(load_unmasked_views(capture, MASKS_SIDE), read_strokes(strokes))
     assert masked is not None  # nobody stopped it
     draft = out.with_name(f"{out.name}.part")
     draft.mkdir()

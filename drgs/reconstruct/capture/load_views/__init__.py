@@ -13,7 +13,7 @@ undistorted, so that cameras are always pinholes. Whatever makes a capture unusa
 from pathlib import Path
 from typing import Literal
 
-from drgs.reconstruct.capture.load_views.capture import Capture, Pinhole, camera_of
+from drgs.reconstruct.capture.load_views.capture import Capture, Pinhole, camera_of, without_masks
 from drgs.reconstruct.capture.load_views.checks import check_photographs, image_size, is_file, is_folder
 from drgs.reconstruct.capture.load_views.colmap import find_model, read_colmap
 from drgs.reconstruct.capture.load_views.metashape import find_cameras_file, read_metashape
@@ -30,7 +30,7 @@ from drgs.reconstruct.capture.load_views.transforms_json import (
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
-__all__ = ["has_cameras", "load_cameras", "load_views", "read_capture"]
+__all__ = ["has_cameras", "load_cameras", "load_unmasked_views", "load_views", "read_capture"]
 
 FALLBACK_SIZE = (400, 400)
 """Picture size when a camera file neither states one nor comes with its images."""
@@ -47,6 +47,11 @@ def load_views(folder: Path, max_side: int | None = None, split: Literal["train"
         ValueError: one sentence that names the file, what was found and what was expected.
     """
     return read_pictures(read_capture(Path(folder), split), max_side)
+
+
+def load_unmasked_views(folder: Path, max_side: int | None = None) -> Views:
+    """The same, whatever mask files there are: pictures keep their colours outside of them, which shrinking loses otherwise."""
+    return read_pictures(without_masks(read_capture(Path(folder))), max_side)
 
 
 def read_capture(folder: Path, split: Literal["train", "test"] = "train") -> Capture:

@@ -3,7 +3,7 @@
 Readers (nerf_synthetic, nerfstudio, colmap, metashape, nero) write these records; read_pictures turns them into Views.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +62,11 @@ class Capture:
     points_world: Float[ndarray, "point 3"] | None
     point_colors_srgb: Float[ndarray, "point 3"] | None
     """0..1."""
+
+
+def without_masks(capture: Capture) -> Capture:
+    """Whose mask files do not count, as for strokes. What is transparent in a picture stays so: nobody knows its colour."""
+    return replace(capture, photographs=tuple(replace(photograph, mask=None) for photograph in capture.photographs))
 
 
 def pinhole_from_angle(angle_x: float, angle_y: float | None, width: int, height: int) -> Pinhole:
