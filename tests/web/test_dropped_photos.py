@@ -126,6 +126,22 @@ def move_sides(viewer: Viewer, shown: Locator, folder: Path) -> tuple[list[float
     return numbers(shown, "Box from"), numbers(shown, "Box to")
 
 
+def open_strokes(viewer: Viewer, shown: Locator, folder: Path) -> list[str]:
+    """The brush on a telephone and on a laptop, and away again; faults of how it lies there."""
+    summary, brush = shown.get_by_text("Mark the object by strokes"), shown.locator(".brush img")
+    summary.click()
+    faults = []
+    for name, size in (("strokes-phone", PHONE), ("strokes-laptop", LAPTOP), ("strokes-phone", PHONE)):
+        viewer.page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+        wait_until(lambda: brush.evaluate(IS_LOADED), "the picture to draw on")
+        shown.get_by_role("button", name="Undo stroke").scroll_into_view_if_needed()
+        viewer.page.screenshot(path=folder / f"{name}.png")
+        faults += [f"{name}: {fault}" for fault in viewer.page.evaluate(FIND_FAULTS)]
+    summary.click()
+    expect(brush).to_have_count(0)
+    return faults
+
+
 def turn_up(viewer: Viewer, shown: Locator) -> None:
     """By mouse and by keys, and back to what was proposed."""
     proposed = numbers(shown, "Direction")
@@ -201,6 +217,7 @@ def test_a_dropped_folder_is_shown_with_its_cameras_and_its_pictures_before_a_bu
     tiles = shown.get_by_role("list", name="Pictures of Teal mug")
     expect(tiles).to_be_hidden()
     faults += look(viewer, shown, folder, "capture-phone", PHONE)
+    faults += open_strokes(viewer, shown, folder)
     assert faults == []
     expect(sheet).to_be_hidden()
     expect(tiles.get_by_role("listitem")).to_have_count(56)

@@ -1,5 +1,5 @@
 """The whole way of a newcomer: drop a capture, look at it, watch it built, change a part, the light and the shape, take all back, carry files away; then
-drop plain photographs, whose poses are found first, and build what of them lies in a box.
+drop plain photographs, whose poses are found first, say by strokes what of them is the object, and build what of that lies in a box.
 
 A real worker process builds the sample's photographs, fewer and smaller ones, in `short_builder`'s few iterations. The tests run in this
 order on one page; each looks at the pixels of the canvas and at what the server says.
@@ -285,7 +285,7 @@ def test_the_picture_is_exported_as_a_png(path: Viewer, first: np.ndarray) -> No
     assert path.edits() == [], "saving is no edit"
 
 
-def test_a_folder_of_plain_photographs_is_posed_seen_cut_and_built(path: Viewer, tmp_path: Path) -> None:
+def test_a_folder_of_plain_photographs_is_posed_seen_stroked_cut_and_built(path: Viewer, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     drop_folder(path, write_photographs(tmp_path / "Egg", orbit(EGG_VIEWS), masks=True))
     plain = path.page.get_by_role("dialog", name="Egg", exact=True)
@@ -304,6 +304,7 @@ def test_a_folder_of_plain_photographs_is_posed_seen_cut_and_built(path: Viewer,
     expect(posed.get_by_text(f"{EGG_VIEWS} of {EGG_VIEWS} pictures found their place")).to_be_visible()
     searches = [job["state"] for job in path.server.ask("/api/jobs")["jobs"] if job["kind"] == "pose"]
     assert searches == ["done", "cancelled"]
+    stroke_the_egg(path, posed, tmp_path)
     low, high = numbers(posed, "Box from"), numbers(posed, "Box to")
     cut = low[2] + (high[2] - low[2]) / 4
     posed.get_by_role("spinbutton", name="Box from z").fill(f"{cut:.3f}")
@@ -316,9 +317,56 @@ def test_a_folder_of_plain_photographs_is_posed_seen_cut_and_built(path: Viewer,
     expect(path.page.get_by_role("heading", name="Egg, posed", exact=True)).to_be_visible(timeout=BUILD_SECONDS * 1000)
     path.settle()
     path.page.screenshot(path=tmp_path / "egg.png")
+    asset = json.loads((path.server.data / "assets" / path.session()["asset"] / "asset.json").read_text())
+    strokes = asset["provenance"]["strokes"]
+    assert [stroke["shows"] for stroke in strokes] == ["object", "background"] * 2 and len({stroke["picture"] for stroke in strokes}) == 2
     heights = stored_mesh(path).vertices[:, 1]  # glTF's y is up
     assert heights.min() == pytest.approx(cut, abs=0.02) and heights.min() >= round(cut, 3) - 1e-4, "its bottom is cut off"
     assert heights.max() == pytest.approx(high[2], abs=0.1 * (high[2] - low[2]))
+
+
+def stroke_the_egg(viewer: Viewer, shown: Locator, folder: Path) -> None:
+    """By mouse in one picture and by keys in another; the sheet then shows the masks that they give."""
+    shown.get_by_text("Mark the object by strokes").click()
+    said, sheet = shown.locator(".strokes [role=status]"), shown.get_by_role("img", name="the masks that the strokes give")
+    expect(said).to_have_text("Draw over the object, and over what is around it.")
+    brush, picture = shown.locator(".brush canvas"), shown.get_by_label("Picture", exact=True)
+    wait_until(lambda: shown.locator(".brush img").evaluate("(image) => image.complete && image.naturalWidth > 0"), "the picture")
+    paint(viewer, brush, [(0.42, 0.42), (0.58, 0.58)])
+    expect(said).to_have_text("Draw over what is not the object, too.")
+    shown.get_by_role("radio", name="Not object").check()
+    paint(viewer, brush, [(0.5, 0.5), (0.6, 0.6)])
+    brush.press("Control+z")
+    expect(brush).to_have_attribute("data-strokes", "1")
+    paint(viewer, brush, [(0.03, 0.97), (0.03, 0.03), (0.97, 0.03)])
+    expect(said).to_contain_text("The sheet below shows the masks", timeout=BUILD_SECONDS * 1000)
+    first = sheet.get_attribute("src")
+    picture.select_option("4")
+    brush.press("x")
+    expect(shown.get_by_role("radio", name="Object", exact=True)).to_be_checked()
+    for key in ("ArrowLeft", "Space", "Shift+ArrowRight", "Shift+ArrowRight", "Space", "x"):
+        brush.press(key)
+    expect(brush).to_have_attribute("data-strokes", "1")
+    for key in (*["Shift+ArrowUp"] * 9, "Space", *["Shift+ArrowLeft"] * 6, "Space"):
+        brush.press(key)
+    expect(brush).to_have_attribute("data-strokes", "2")
+    wait_until(lambda: sheet.get_attribute("src") != first, "a sheet of the new strokes", BUILD_SECONDS)
+    viewer.page.screenshot(path=folder / "strokes.png")
+    wait_until(lambda: sheet.evaluate("(image) => image.complete && image.naturalWidth > 0"), "the sheet")
+    sheet.scroll_into_view_if_needed()
+    viewer.page.screenshot(path=folder / "strokes-masks.png")
+
+
+def paint(viewer: Viewer, brush: Locator, way: list[tuple[float, float]]) -> None:
+    """A stroke by mouse through places, as shares of the picture."""
+    brush.scroll_into_view_if_needed()
+    place = brush.bounding_box()
+    assert place is not None
+    for number, (x, y) in enumerate(way):
+        viewer.page.mouse.move(place["x"] + x * place["width"], place["y"] + y * place["height"], steps=4)
+        if number == 0:
+            viewer.page.mouse.down()
+    viewer.page.mouse.up()
 
 
 def test_the_page_logged_no_errors(path: Viewer) -> None:

@@ -1,7 +1,7 @@
 /** The REST calls of the viewer, each once. Every failure is an ApiError whose message is a sentence for the user. */
 
 import { STILL_BOUNCES, type DownloadFormat } from './constants.gen';
-import type { AssetInfo, AssetList, BuildRequest, CaptureInfo, CaptureList, CaptureLook, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, PoseRequest, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest, TrainingViewList, WeightsInfo } from './protocol.gen';
+import type { AssetInfo, AssetList, BuildRequest, CaptureInfo, CaptureList, CaptureLook, CaptureMasks, Edit, EnvironmentInfo, EnvironmentList, JobFileList, JobInfo, JobList, PoseRequest, Problem, RenderRequest, SessionInfo, SessionList, Settings, SimulateRequest, Stroke, TrainingViewList, WeightsInfo } from './protocol.gen';
 import type { View } from './view';
 
 export class ApiError extends Error {
@@ -31,16 +31,17 @@ function sentenceFor(status: number, body: string): string {
 /** Settles when the link's token has become a cookie; all other calls wait for it. */
 let signedIn: Promise<unknown> = Promise.resolve();
 
-async function call<T>(method: string, path: string, body?: unknown): Promise<T> {
+async function call<T>(method: string, path: string, body?: unknown, leaving?: AbortSignal): Promise<T> {
   await signedIn;
-  return ask(method, path, body);
+  return ask(method, path, body, leaving);
 }
 
-async function ask<T>(method: string, path: string, body?: unknown): Promise<T> {
+async function ask<T>(method: string, path: string, body?: unknown, leaving?: AbortSignal): Promise<T> {
   let response: Response;
   try {
     response = await fetch(path, {
       method,
+      signal: leaving,
       headers: body === undefined ? undefined : { 'Content-Type': 'application/json' },
       body: body === undefined ? undefined : JSON.stringify(body),
     });
@@ -110,6 +111,11 @@ export const readCapture = (id: string) => call<CaptureInfo>('GET', `/api/captur
 export const deleteCapture = (id: string) => call<void>('DELETE', `/api/captures/${part(id)}`);
 /** Takes seconds to minutes when it is asked for the first time. */
 export const lookAtCapture = (id: string) => call<CaptureLook>('GET', `/api/captures/${part(id)}/look`);
+/** Of the look's camera of that number, as a build sees it. */
+export const capturePicture = (id: string, number: number) => `/api/captures/${part(id)}/pictures/${number}.jpg`;
+/** Takes seconds to a minute; it ends when the page leaves. */
+export const findMasks = (id: string, strokes: Stroke[], leaving: AbortSignal) => call<CaptureMasks>('POST', `/api/captures/${part(id)}/masks`, { strokes }, leaving);
+export const masksSheet = (id: string, version: string) => `/api/captures/${part(id)}/masks/${version}.jpg`;
 export const captureSheet = (id: string) => `/api/captures/${part(id)}/sheet.jpg`;
 
 const TUS = { 'Tus-Resumable': '1.0.0' };

@@ -6,7 +6,7 @@ import { capture, openCapture, refreshCaptures } from './captures';
 import { refreshAssets, refreshEnvironments } from './library';
 import { attempt, notify } from './notices';
 import { preference } from './preferences';
-import type { BoxCorners, BuildRequest, CaptureInfo, JobInfo, RenderRequest, SimulateRequest } from './protocol.gen';
+import type { BoxCorners, BuildRequest, CaptureInfo, JobInfo, RenderRequest, SimulateRequest, Stroke } from './protocol.gen';
 import { openAsset, session } from './session';
 import type { Vec3 } from './view';
 
@@ -115,8 +115,9 @@ async function follow(started: Promise<JobInfo>): Promise<JobInfo | null> {
 export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding' | 'light'>>;
 
 export const buildSample = (choice: BuildChoice) => follow(api.startJob({ dataset: 'sample', ...choice }));
-/** `up`: direction of the capture's world that points up. `box`: of the world that is turned so; null: all of the object. */
-export const buildCapture = (capture: CaptureInfo, choice: BuildChoice, up: Vec3, box: BoxCorners | null) => follow(api.startJob({ dataset: `capture:${capture.id}`, ...choice, up, box }));
+/** `up`: direction of the capture's world that points up. `box`: of the world that is turned so; null: all of the object. `strokes`: null: the capture's own masks count. */
+export const buildCapture = (capture: CaptureInfo, choice: BuildChoice, up: Vec3, box: BoxCorners | null, strokes: Stroke[] | null) =>
+  follow(api.startJob({ dataset: `capture:${capture.id}`, ...choice, up, box, strokes }));
 /** Look for the poses of a capture's photographs; the capture then knows of the job. */
 export async function findPoses(photographs: CaptureInfo): Promise<void> {
   const job = await follow(api.startJob({ kind: 'pose', dataset: `capture:${photographs.id}` }));

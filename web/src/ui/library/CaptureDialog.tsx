@@ -3,11 +3,12 @@
 import { useEffect, useMemo, useRef, useState } from 'preact/hooks';
 import { foundBox, SIDES, stepOf, valueOf, withSide } from '../../capture/build_box';
 import { tileStyle } from '../../capture/sheet_tiles';
+import { areEnough, tileAt } from '../../capture/strokes';
 import * as api from '../../session/api';
 import { capture, captureLook, captureTrouble, closeCapture, refreshCaptures } from '../../session/captures';
 import { buildCapture, isActive, jobs } from '../../session/jobs';
 import { attempt } from '../../session/notices';
-import type { BoxCorners, CaptureInfo, CaptureLook, SheetLayout } from '../../session/protocol.gen';
+import type { BoxCorners, CaptureInfo, CaptureLook, CaptureMasks, SheetLayout, Stroke } from '../../session/protocol.gen';
 import type { Vec3 } from '../../session/view';
 import { Choice, PlaceField } from '../fields';
 import { Icon } from '../icons';
@@ -15,6 +16,7 @@ import { build, BuildChoices } from './BuildChoices';
 import { CaptureView } from './CaptureView';
 import { Findings } from './Findings';
 import { Poses, searchOf } from './Poses';
+import { Strokes } from './Strokes';
 
 const UPRIGHT: Vec3 = [0, 0, 1];
 /** Cosine of the lean beyond which a capture's z is probably not up: cameras that look steeply down lean by up to this. */
@@ -43,6 +45,10 @@ export function CaptureDialog() {
 function Look({ info, look, trouble }: { info: CaptureInfo; look: CaptureLook | null; trouble: string | null }) {
   const [chosenUp, setUp] = useState<Vec3 | null>(null);
   const [movedBox, setBox] = useState<BoxCorners | null>(null);
+  const [strokes, setStrokes] = useState<Stroke[]>([]);
+  const [masks, setMasks] = useState<CaptureMasks | null>(null);
+  const [isStroking, setStroking] = useState(false);
+  const [picture, setPicture] = useState(0);
   const up = chosenUp ?? likelyUp(look);
   const found = useMemo(() => look && foundBox(look, up), [look, ...up]);
   const box = movedBox ?? found;
@@ -67,31 +73,51 @@ function Look({ info, look, trouble }: { info: CaptureInfo; look: CaptureLook | 
         <div class="capture-side section">
           {poses && (poses.findings.length > 0 ? <Findings report={poses} said={null} open /> : <p class="facts">{poses.summary}</p>)}
           {look && <Findings report={look} said={null} open />}
-          <BuildForm info={info} ok={(look?.ok ?? trouble !== null) && !searching} shape={shape} />
+          <BuildForm info={info} ok={(look?.ok ?? trouble !== null) && !searching} shape={shape} strokes={areEnough(strokes) ? strokes : null} />
         </div>
       </div>
-      {look?.has_sheet && (
-        <>
-          <p class="hint sheet-head">
-            All pictures, with the outlines of their masks.{' '}
-            <a href={api.captureSheet(info.id)} target="_blank" rel="noopener">
-              Larger
-            </a>
-          </p>
-          <img class={look.sheet ? 'sheet tiled' : 'sheet'} src={api.captureSheet(info.id)} alt={`All pictures of ${info.name}, with the outlines of their masks`} />
-          {look.sheet && <Tiles layout={look.sheet} sheet={api.captureSheet(info.id)} name={info.name} />}
-        </>
+      {look && look.cameras.length > 0 && (
+        <details class="section" open={isStroking} onToggle={(event) => setStroking(event.currentTarget.open)}>
+          <summary>Mark the object by strokes</summary>
+          {isStroking && <Strokes info={info} look={look} number={picture} onNumber={setPicture} strokes={strokes} onStrokes={setStrokes} onMasks={setMasks} />}
+        </details>
       )}
+      {look?.has_sheet && <Sheet info={info} look={look} masks={masks} onPicture={isStroking ? setPicture : null} />}
+    </>
+  );
+}
+
+/** All pictures with their masks: the capture's own, or those that strokes give. `onPicture`: told the number of a picture that is clicked; null: nobody asks. */
+function Sheet({ info, look, masks, onPicture }: { info: CaptureInfo; look: CaptureLook; masks: CaptureMasks | null; onPicture: ((number: number) => void) | null }) {
+  const sheet = masks ? api.masksSheet(info.id, masks.version) : api.captureSheet(info.id);
+  const layout = masks?.sheet ?? look.sheet;
+  // Of many pictures the sheet shows others than the look does.
+  const choose = layout?.count === look.cameras.length ? onPicture : null;
+  const click = (event: MouseEvent) => {
+    const shown = (event.currentTarget as Element).getBoundingClientRect();
+    const number = layout && tileAt(layout, [(event.clientX - shown.left) / shown.width, (event.clientY - shown.top) / shown.height]);
+    if (number !== null && number !== undefined) choose?.(number);
+  };
+  return (
+    <>
+      <p class="hint sheet-head">
+        All pictures, with the outlines of {masks ? 'the masks that the strokes give' : 'their masks'}.{' '}
+        <a href={sheet} target="_blank" rel="noopener">
+          Larger
+        </a>
+      </p>
+      <img class={layout ? 'sheet tiled' : 'sheet'} src={sheet} alt={`All pictures of ${info.name}, with the outlines of ${masks ? 'the masks that the strokes give' : 'their masks'}`} onClick={click} />
+      {layout && <Tiles layout={layout} sheet={sheet} name={info.name} onPicture={choose} />}
     </>
   );
 }
 
 /** The sheet's pictures in as many columns as a narrow window has room for. */
-function Tiles({ layout, sheet, name }: { layout: SheetLayout; sheet: string; name: string }) {
+function Tiles({ layout, sheet, name, onPicture }: { layout: SheetLayout; sheet: string; name: string; onPicture: ((number: number) => void) | null }) {
   return (
     <ul class="tiles" aria-label={`Pictures of ${name}`}>
       {Array.from({ length: layout.count }, (_, number) => (
-        <li key={number} style={tileStyle(layout, sheet, number)} />
+        <li key={number} style={tileStyle(layout, sheet, number)} onClick={() => onPicture?.(number)} />
       ))}
     </ul>
   );
@@ -122,11 +148,11 @@ interface Shape {
 }
 
 /** The choices stand in a form of their own: those of the library are the same, and radio buttons are one group a form. */
-function BuildForm({ info, ok, shape }: { info: CaptureInfo; ok: boolean; shape: Shape | null }) {
+function BuildForm({ info, ok, shape, strokes }: { info: CaptureInfo; ok: boolean; shape: Shape | null; strokes: Stroke[] | null }) {
   const [busy, setBusy] = useState(false);
   const start = async () => {
     setBusy(true);
-    const job = await buildCapture(info, build.value, shape?.up ?? UPRIGHT, shape && !shape.isFound ? shape.box : null);
+    const job = await buildCapture(info, build.value, shape?.up ?? UPRIGHT, shape && !shape.isFound ? shape.box : null, strokes);
     setBusy(false);
     if (!job) return;
     closeCapture();
