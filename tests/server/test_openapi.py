@@ -100,7 +100,15 @@ def test_answers_are_of_the_kinds_and_shapes_that_the_document_names(service: Se
     weights = service.client.post("/api/weights", content=bytes(4)).json()["file"].rpartition("/")[2]
     capture = uploaded(service, zipped({"transforms.json": b"{}"}))
     service.client.post("/api/captures", json={"upload": capture})
-    known = {"session_id": session, "asset_id": asset, "job_id": job, "suffix": "png", "number": 0, "weights_name": weights}
+    known = {
+        "session_id": session,
+        "asset_id": asset,
+        "job_id": job,
+        "suffix": "png",
+        "number": 0,
+        "weights_name": weights,
+        "version": "0f" * 16,
+    }
     known |= {"capture_id": capture, "upload_id": capture}
     asked = 0
     for path, calls in document["paths"].items():
@@ -108,8 +116,10 @@ def test_answers_are_of_the_kinds_and_shapes_that_the_document_names(service: Se
         if "get" not in calls or path.endswith(("/export", "/files/{name}")):
             continue
         answer = service.client.get(address, params={"width": 16, "height": 16, "spp": 4} if "frame" in path else None)
-        if answer.status_code == 404:  # no preview yet, no pictures, no light of its own, no photographs
-            assert path.endswith(("preview.jpg", "sheet.jpg", "environment.exr", "photograph.webp")), path
+        if answer.status_code == 404:  # no preview yet, no pictures, no masks, no light of its own, no photographs
+            assert path.endswith(("preview.jpg", "sheet.jpg", "/{number}.jpg", "/{version}.jpg", "environment.exr", "photograph.webp")), (
+                path
+            )
             continue
         content = calls["get"]["responses"]["200"]["content"]
         media = answer.headers["content-type"].split(";")[0]

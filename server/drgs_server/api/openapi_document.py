@@ -77,6 +77,21 @@ _ENVIRONMENT = {"name": "studio.exr", "title": "Studio", "width": 1024, "height"
 _SESSION = {"id": SESSION, "asset": ASSET, "asset_name": "Mug", "created_at": "2026-11-20T10:10:00Z", "viewers": 1} | _LOG
 _SNAPSHOT = {"name": "chrome", "created_at": "2026-11-20T10:12:00Z", "revision": 3, "edits": [_MATERIAL, _LIGHT]}
 
+_SHEET: dict[str, Any] = {
+    "count": 64,
+    "columns": 10,
+    "left": 0.002,
+    "top": 0.05,
+    "across": 0.1,
+    "down": 0.13,
+    "width": 0.097,
+    "aspect": 0.88,
+}
+_STROKES = [
+    {"picture": "r_007", "shows": "object", "radius": 0.008, "points": [[0.4, 0.5], [0.6, 0.52]]},
+    {"picture": "r_007", "shows": "background", "radius": 0.02, "points": [[0.1, 0.7], [0.3, 0.9]]},
+]
+
 EXAMPLES: dict[str, dict[str, Any]] = {
     "AssetInfo": {
         "built": _ASSET,
@@ -91,16 +106,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
             "summary": _JOB["capture"]["summary"],
             "findings": _JOB["capture"]["findings"],
             "has_sheet": True,
-            "sheet": {
-                "count": 64,
-                "columns": 10,
-                "left": 0.002,
-                "top": 0.05,
-                "across": 0.1,
-                "down": 0.13,
-                "width": 0.097,
-                "aspect": 0.88,
-            },
+            "sheet": _SHEET,
             "camera_count": 64,
             "cameras": [_VIEW],
             "up": [0.0, 0.0, 1.0],
@@ -112,7 +118,9 @@ EXAMPLES: dict[str, dict[str, Any]] = {
             "colors": [0.8, 0.1, 0.1],
         }
     },
+    "CaptureMasks": {"sheet": {"version": "0f" * 16, "sheet": _SHEET}},
     "CaptureRequest": {"complete upload": {"upload": CAPTURE, "name": "Mug"}},
+    "MasksRequest": {"two strokes": {"strokes": _STROKES}},
     "EditLog": {"two edits": _LOG | {"digest": "9f86d081884c7d65"}},
     "EditRequest": {
         "material": {"edit": _MATERIAL},
@@ -165,6 +173,8 @@ EXAMPLES: dict[str, dict[str, Any]] = {
 _BINARY = {"type": "string", "format": "binary"}
 FILES: dict[str, tuple[str, ...]] = {
     "/api/captures/{capture_id}/sheet.jpg": ("image/jpeg",),
+    "/api/captures/{capture_id}/pictures/{number}.jpg": ("image/jpeg",),
+    "/api/captures/{capture_id}/masks/{version}.jpg": ("image/jpeg",),
     "/api/jobs/{job_id}/preview.jpg": ("image/jpeg",),
     "/api/jobs/{job_id}/files/{name}": ("application/octet-stream", "image/png", "video/mp4", "model/gltf-binary"),
     "/api/assets/{asset_id}/thumb.jpg": ("image/jpeg",),

@@ -145,7 +145,7 @@ async def read_sheet(capture_id: str, request: Request, context: Context) -> Fil
 async def read_picture(
     capture_id: str, number: Annotated[int, PathParameter(ge=0, le=999)], request: Request, context: Context
 ) -> FileResponse:
-    """A picture of a posed capture, without lens distortion, to draw strokes over. `number`: of the look's cameras. The first call takes seconds, in a process
+    """A picture of a posed capture, without lens distortion, to draw strokes over. `number`: of the look's cameras; 404 where it has none. The first call takes seconds, in a process
     of its own; then all are kept."""
     look = await _look(context, request, capture_id)
     async with context.incoming.alone(capture_id):
@@ -197,7 +197,8 @@ async def _make_beside(context: ServerContext, caller: Caller, capture_id: str, 
                 async with context.admission.place("file", caller, await run_in_threadpool(masks_bytes, capture)):
                     await run_file_tool("masks", str(capture), str(written), str(draft))
         except FileToolError as error:
-            raise ProblemError(422, str(error).replace(f"{capture}/", "").replace(str(capture), row.name)) from error
+            sentence = str(error).replace(f"{capture}/", "").replace(str(capture), row.name)
+            raise ProblemError(404 if strokes is None else 422, sentence) from error
         place.parent.mkdir(exist_ok=True)
         draft.rename(place)
 
