@@ -382,7 +382,7 @@ class RemoteSession:
         """One finished picture: the bytes of its file, which notebooks show.
 
         Args:
-            format: exr holds linear radiance.
+            format: exr holds linear radiance, or with `channel="all"` every channel as a layer of its own.
             world_from_camera: 4x4 OpenGL camera-to-world; the start view when absent.
             settings: exposure_stops, tone_curve, background, channel, bounces, denoise.
         """

@@ -17,6 +17,7 @@ from drgs_server.render.interface import (
     AbstractStill,
     Bounds,
     Explanation,
+    Layers,
     LinearPixels,
     Picked,
     Pixels,
@@ -102,6 +103,10 @@ class PaintedPose(AbstractPose):
         self.painter.stills += 1
         return PaintedStill(Painting(self, settings, width, height), linear)
 
+    def layers(self, camera: CameraMessage, settings: Settings, width: int, height: int) -> "PaintedLayers":
+        self.painter.stills += 1
+        return PaintedLayers(Painting(self, settings, width, height), True)
+
 
 class PaintedStill(AbstractStill):
     def __init__(self, painting: "Painting", linear: bool) -> None:
@@ -114,8 +119,14 @@ class PaintedStill(AbstractStill):
         self.painting.pose.painter.slices += 1
         return True
 
-    def picture(self) -> Pixels | LinearPixels:
+    def picture(self) -> Pixels | LinearPixels | Layers:
         return self.painting.linear() if self.linear else self.painting.resolve()
+
+
+class PaintedLayers(PaintedStill):
+    def picture(self) -> Layers:
+        pixels = self.painting.linear()
+        return {name: np.ascontiguousarray(pixels[..., k]) for k, name in enumerate("RGBA")}
 
 
 class Painting(AbstractPicture):

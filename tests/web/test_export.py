@@ -57,6 +57,25 @@ def test_an_exr_of_any_size_holds_light_and_alpha(ball: Viewer, tmp_path: Path) 
     page.get_by_role("radio", name="PNG", exact=True).check()
 
 
+def test_all_channels_are_layers_of_one_exr(ball: Viewer, tmp_path: Path) -> None:
+    page = ball.page
+    enter(page, "Width", "90")
+    enter(page, "Height", "60")
+    page.get_by_role("radio", name="32", exact=True).check()
+    page.get_by_role("radio", name="All channels", exact=True).check()
+    expect(page.get_by_role("switch", name="Transparent background")).to_have_count(0)
+    layers = decode_exr(downloaded(ball, "button", "Render all channels", tmp_path / "ball.exr").read_bytes())
+    assert {"R", "A", "albedo.G", "normal.Z", "depth.Z", "visibility.Y", "indirect.B", "variance.Y"} <= set(layers)
+    assert (
+        layers["A"][30, 45] == 1
+        and layers["albedo.R"][30, 45] == pytest.approx(0.8, abs=0.01)
+        and layers["roughness.Y"][30, 45] == pytest.approx(0.6, abs=0.01)
+    )
+    assert layers["A"][0, 0] == 0 and math.isinf(layers["depth.Z"][0, 0])
+    page.get_by_role("radio", name="PNG", exact=True).check()
+    page.get_by_role("radio", name="Window").check()
+
+
 def test_a_picture_that_the_server_would_refuse_is_not_asked_for(ball: Viewer) -> None:
     enter(ball.page, "Width", "9999")
     expect(ball.page.get_by_label("Width", exact=True)).to_have_value("4096")

@@ -9,6 +9,7 @@ from fastapi.responses import FileResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drgs.exchange.export_formats import DownloadFormat
+from drgs.exchange.exr import encode_exr
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.scene.edits import EnvironmentEdit
 from drgs.scene.tone_curve import ToneCurve
@@ -31,9 +32,19 @@ from drgs_server.api.while_connected import while_connected
 from drgs_server.live.admission import Caller
 from drgs_server.live.edit_log import ChangeRequest
 from drgs_server.live.live_session import LiveSession
-from drgs_server.live.messages import MAX_SIDE, MAX_STILL_PIXELS, MAX_STILL_SAMPLES, CameraMessage, Channel, EditLog, Settings, StartView
+from drgs_server.live.messages import (
+    MAX_LAYERED_PIXELS,
+    MAX_SIDE,
+    MAX_STILL_PIXELS,
+    MAX_STILL_SAMPLES,
+    CameraMessage,
+    Channel,
+    EditLog,
+    Settings,
+    StartView,
+)
 from drgs_server.render.encode import encode_exr_still, encode_jpeg, encode_png
-from drgs_server.render.interface import LINEAR_CHANNELS, LinearPixels, Pixels
+from drgs_server.render.interface import LINEAR_CHANNELS, AbstractStill, Layers, LinearPixels, Pixels
 from drgs_worker.store.user_names import UserName
 
 router = APIRouter(prefix="/api/sessions", tags=["sessions"])
@@ -165,7 +176,8 @@ class FrameQuery(BaseModel):
     exposure_stops: Annotated[float, Field(ge=-10, le=10)] = 0.0
     tone_curve: ToneCurve = "standard"
     background: Literal["environment", "blurred", "transparent"] = "environment"
-    channel: Channel = "final"
+    channel: Channel | Literal["all"] = "final"
+    """all: every channel that the asset has, as layers of one EXR."""
     denoise: bool = False
     captured: bool = False
     """Without what was done to material and shape; the light stays."""
@@ -178,8 +190,19 @@ class FrameQuery(BaseModel):
 async def read_frame(session_id: str, suffix: Suffix, context: Context, query: Annotated[FrameQuery, Query()], call: Request) -> Response:
     """One finished picture. PNG and JPEG show it as a screen does (sRGB). EXR holds the light itself: linear Rec.709 radiance as 32-bit
     floats, scaled by the exposure and nothing else; with a transparent background also A, which R, G and B are multiplied with. Of a
-    channel other than `final` it holds the values themselves (normals in the world, depth in world units), not multiplied, and A."""
-    if suffix == "exr" and query.channel not in LINEAR_CHANNELS:
+    channel other than `final` it holds the values themselves (normals in the world, depth in world units), not multiplied, and A.
+
+    With `channel=all` an EXR holds the object alone, in layers: those of `drgs render --aov` (R, G, B, not multiplied and without exposure, A,
+    albedo.R .G .B, normal.X .Y .Z, depth.Z, roughness.Y, metallic.Y, visibility.Y), indirect.R .G .B, variance.Y, and certainty.R .G .B and
+    surfels.R .G .B .A where the asset has them."""
+    if query.channel == "all":
+        if suffix != "exr":
+            raise ProblemError(422, f"All channels fit into an EXR only; ask for frame.exr instead of frame.{suffix}.")
+        if query.width * query.height > MAX_LAYERED_PIXELS:
+            raise ProblemError(
+                422, f"A picture with all channels has at most {MAX_LAYERED_PIXELS} pixels; found {query.width}x{query.height}."
+            )
+    elif suffix == "exr" and query.channel not in LINEAR_CHANNELS:
         raise ProblemError(422, f"An EXR holds one of {', '.join(LINEAR_CHANNELS)}; ask for a PNG of {query.channel}.")
     if query.width * query.height > MAX_STILL_PIXELS:
         raise ProblemError(422, f"A picture has at most {MAX_STILL_PIXELS} pixels, as 4096x2160 has; found {query.width}x{query.height}.")
@@ -203,8 +226,14 @@ async def _make_picture(
         if query.captured:
             light = [edit for edit in session.log.applied if isinstance(edit, EnvironmentEdit)]
             pose = await asyncio.wrap_future(work(lambda: loaded.pose(light, posed.pose)))
+
+        def begin() -> AbstractStill:
+            if query.channel == "all":
+                return pose.layers(camera, settings, query.width, query.height)
+            return pose.still(camera, settings, query.width, query.height, suffix == "exr")
+
         try:
-            still = await asyncio.wrap_future(work(lambda: pose.still(camera, settings, query.width, query.height, suffix == "exr")))
+            still = await asyncio.wrap_future(work(begin))
         except ValueError as error:
             raise ProblemError(422, str(error)) from error
         # One call a slice: viewers get their turns in between, and who leaves stops the next one.
@@ -213,15 +242,17 @@ async def _make_picture(
         return await asyncio.to_thread(_encode, still.picture(), suffix, query), posed.revision
 
 
-def _encode(pixels: Pixels | LinearPixels, suffix: Suffix, query: FrameQuery) -> bytes:
+def _encode(pixels: Pixels | LinearPixels | Layers, suffix: Suffix, query: FrameQuery) -> bytes:
+    if isinstance(pixels, dict):
+        return encode_exr(pixels)
     if suffix == "exr":
         return encode_exr_still(pixels, query.exposure_stops if query.channel == "final" else 0.0)
     return encode_png(pixels) if suffix == "png" else encode_jpeg(pixels, moving=False)
 
 
-def still_bytes(pixels: int, suffix: Suffix, channel: Channel) -> int:
+def still_bytes(pixels: int, suffix: Suffix, channel: Channel | Literal["all"]) -> int:
     """Memory that making a picture takes, estimated: a band in the making, the whole picture, and what encoding it needs (float32 for EXR)."""
-    a_pixel = 64 if suffix == "exr" else 24 if channel == "depth" else 16
+    a_pixel = 256 if channel == "all" else 64 if suffix == "exr" else 24 if channel == "depth" else 16
     return STILL_BYTES + a_pixel * pixels
 
 
@@ -248,7 +279,7 @@ def _settings_of(query: FrameQuery) -> Settings:
         background=query.background,
         spp_target=query.spp,
         bounces=query.bounces,
-        channel=query.channel,
+        channel="final" if query.channel == "all" else query.channel,
         denoise=query.denoise,
     )
 

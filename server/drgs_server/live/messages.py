@@ -29,6 +29,8 @@ MAX_SIDE = 4096
 MAX_PIXELS = 4_194_304
 MAX_STILL_PIXELS = 4096 * 2160
 """Of one picture over REST, which is rendered once: what its sums fill of the memory is the limit."""
+MAX_LAYERED_PIXELS = MAX_STILL_PIXELS // 4
+"""Of one with all channels, whose pixels take four times the memory."""
 MAX_STILL_SAMPLES = MAX_PICTURE_SAMPLES
 MAX_SPP_TARGET = 65535
 """The header holds 16 bits."""

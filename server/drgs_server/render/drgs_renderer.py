@@ -7,7 +7,7 @@ Imported only on the render thread, and torch only inside functions: the API pro
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 
 from drgs.maths.color_numpy import linear_from_srgb
 from drgs.scene.edits import Edit
-from drgs_server.live.messages import NO_CERTAINTY, CameraMessage, Settings
+from drgs_server.live.messages import NO_CERTAINTY, CameraMessage, Channel, Settings
 from drgs_server.render.channels import channel_pixels, linear_channel
 from drgs_server.render.environment_memory import EnvironmentMemory
 from drgs_server.render.interface import (
@@ -33,6 +33,7 @@ from drgs_server.render.interface import (
     Pixels,
     view_of_bounds,
 )
+from drgs_server.render.layers import LayeredStill, certainty_layers, light_layers, visibility_layers
 from drgs_server.render.still import SLICE_SECONDS, Still, SurfelStill
 from drgs_server.render.surfel_picture import SurfelPicture
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from drgs.render.intersect.tracer import AbstractTracer
     from drgs.render.progressive.frame_state import FrameState
     from drgs.render.records import GBuffer
+    from drgs.render.render_bands import Band
     from drgs.scene.asset import Asset
     from drgs.scene.environment import Environment
     from drgs.scene.posed_scene import PosedScene
@@ -184,6 +186,23 @@ class Pose(AbstractPose):
         rendered = replace(_render_settings(settings), samples_per_pixel=_samples_wanted(settings, self.scene.primary))
         bands = render_bands(scene, seen, rendered, tracer, SLICE_SECONDS)
         return Still(bands, height, width, settings, linear)
+
+    def layers(self, camera: CameraMessage, settings: Settings, width: int, height: int) -> AbstractStill:
+        from drgs.render.render_bands import render_bands
+
+        seen = _camera(camera, width, height)
+
+        def bands(channel: Channel) -> "Iterator[Band | None]":
+            shown = settings.model_copy(update={"channel": channel, "background": "transparent"})
+            scene, tracer = self._shown(shown)
+            samples = _samples_wanted(shown, self.scene.primary)
+            rendered = replace(_render_settings(shown), samples_per_pixel=samples, split_indirect=channel == "final")
+            return render_bands(scene, seen, rendered, tracer, SLICE_SECONDS)
+
+        parts = [(bands("final"), light_layers), (bands("visibility"), visibility_layers)]
+        if self.certainty is not None:
+            parts.append((bands("certainty"), certainty_layers))
+        return LayeredStill(parts, None if self.scene.surfels is None else SurfelStill(self.scene, seen))
 
     def _shown(self, settings: Settings) -> tuple["PosedScene", "AbstractTracer"]:
         """What a picture of this channel is made of."""

@@ -19,6 +19,8 @@ Pixels: TypeAlias = np.ndarray
 """(height, width, 4) uint8, sRGB, straight alpha."""
 LinearPixels: TypeAlias = np.ndarray
 """(height, width, 4) float32: linear values and coverage."""
+Layers: TypeAlias = dict[str, np.ndarray]
+"""Name in the EXR -> (height, width) float32."""
 LINEAR_CHANNELS = ("final", "albedo", "roughness", "metallic", "normal", "depth", "certainty")
 """Of which there are values to work with, not only a picture to look at."""
 
@@ -97,7 +99,7 @@ class AbstractStill(ABC):
         """A slice of the work, some hundredths of a second; False once there is nothing left."""
 
     @abstractmethod
-    def picture(self) -> Pixels | LinearPixels:
+    def picture(self) -> Pixels | LinearPixels | Layers:
         """What was asked for, once the work is done."""
 
 
@@ -120,6 +122,11 @@ class AbstractPose(ABC):
         Raises:
             ValueError: a sentence, when the asset does not hold what the channel shows.
         """
+
+    @abstractmethod
+    def layers(self, camera: CameraMessage, settings: Settings, width: int, height: int) -> AbstractStill:
+        """The values behind every channel that the asset has, as Layers: R G B A albedo.{R,G,B} normal.{X,Y,Z} depth.Z roughness.Y metallic.Y
+        visibility.Y indirect.{R,G,B} variance.Y, and certainty.{R,G,B} and surfels.{R,G,B,A} where it has them."""
 
 
 class AbstractLoadedAsset(ABC):

@@ -188,10 +188,13 @@ export const saveVersion = (session: string) => call<AssetInfo>('POST', `/api/se
 export const appendEdit = (session: string, edit: Edit) => call<unknown>('POST', `/api/sessions/${part(session)}/edits`, { edit });
 
 /** Of pictures that are waited for: moving ones have one, which is left to them; another choice is the user's own. */
-export const stillBounces = (settings: Settings) => (settings.bounces === 1 ? STILL_BOUNCES : settings.bounces);
+export const stillBounces = (settings: Pick<Settings, 'bounces'>) => (settings.bounces === 1 ? STILL_BOUNCES : settings.bounces);
+
+/** `all`: every channel as a layer of one EXR. */
+export type StillSettings = Omit<Settings, 'channel'> & { channel?: Settings['channel'] | 'all' };
 
 /** Query of `frame.png` and its like for a camera. A background colour can only be streamed. */
-export function frameQuery(view: View, { width, height }: { width: number; height: number }, settings: Settings, transparent: boolean): string {
+export function frameQuery(view: View, { width, height }: { width: number; height: number }, settings: StillSettings, transparent: boolean): string {
   const query = new URLSearchParams({
     width: String(width),
     height: String(height),

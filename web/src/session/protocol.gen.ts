@@ -6,6 +6,7 @@ export const CLOSE_VERSION_MISMATCH = 1002;
 export const MAX_SIDE = 4096;
 export const MAX_PIXELS = 4194304;
 export const MAX_STILL_PIXELS = 8847360;
+export const MAX_LAYERED_PIXELS = 2211840;
 export const MAX_STILL_SAMPLES = 1073741824;
 export const LEAST_SHOWN_ERROR = 0.001;
 export const NO_CERTAINTY = "this asset does not say what is certain: it was imported, or built by an older version or with materials on surfels";

@@ -1,5 +1,5 @@
 import { expect, it } from 'vitest';
-import { MAX_SIDE, MAX_STILL_PIXELS, MAX_STILL_SAMPLES } from '../../../src/session/protocol.gen';
+import { MAX_LAYERED_PIXELS, MAX_SIDE, MAX_STILL_PIXELS, MAX_STILL_SAMPLES } from '../../../src/session/protocol.gen';
 import { sizeLimit, sizeTrouble } from '../../../src/ui/export/still_size';
 
 it('sizes that the server takes are taken, and others are refused with what to do', () => {
@@ -22,4 +22,7 @@ it('trouble begins exactly where the server refuses', () => {
 it('the limit is said in megapixels', () => {
   expect(sizeLimit(32)).toBe('Up to 4096 pixels a side and 8.8 megapixels with 32 samples a pixel.');
   expect(sizeLimit(512)).toContain('2 megapixels with 512');
+  expect(sizeLimit(32, MAX_LAYERED_PIXELS)).toContain('2.2 megapixels');
+  expect(sizeTrouble({ width: 1920, height: 1080 }, 32, MAX_LAYERED_PIXELS)).toBe(null);
+  expect(sizeTrouble({ width: 3840, height: 2160 }, 32, MAX_LAYERED_PIXELS)).toMatch(/2\.2 megapixels is the limit/);
 });
