@@ -21,6 +21,7 @@ from drgs_server.render.interface import (
     LinearPixels,
     Picked,
     Pixels,
+    Positions,
     view_of_bounds,
 )
 
@@ -102,6 +103,9 @@ class PaintedPose(AbstractPose):
     def still(self, camera: CameraMessage, settings: Settings, width: int, height: int, linear: bool) -> "PaintedStill":
         self.painter.stills += 1
         return PaintedStill(Painting(self, settings, width, height), linear)
+
+    def vertices(self) -> Positions:
+        return np.full((4, 3), self.edit_count, "<f4")
 
     def layers(self, camera: CameraMessage, settings: Settings, width: int, height: int) -> "PaintedLayers":
         self.painter.stills += 1

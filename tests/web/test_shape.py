@@ -74,7 +74,15 @@ def test_a_handle_dragged_on_the_picture_pulls_the_object_and_is_one_step_of_und
     for step in range(1, 9):
         page.mouse.move(middle, top + reach - 5 * step)
         page.wait_for_timeout(30)
-    # The picture follows while the button is held.
+    # The local picture follows while the button is held, and the traced one behind it.
+    frames = int(ball.stage()["localFrames"])
+    for step in range(1, 200):
+        page.mouse.move(middle + step % 2, top + reach - 40)
+        page.wait_for_timeout(20)
+        if ball.stage()["picture"] == "stale" and int(ball.stage()["localFrames"]) > frames + 2:
+            break
+    drawn = screen(ball).min(-1) < 200
+    assert ball.stage()["picture"] == "stale" and 2 * np.nonzero(drawn[:, round(middle / 2)])[0].min() < top - 15, "drawn here, pulled up"
     held = wait_until(lambda: (now := outline(ball))[1] < top - 15 and now, "a picture pulled up")
     assert held[3] - held[1] > bottom - top + 4, "drawn out, since the lower handle holds its part"
     page.mouse.up()

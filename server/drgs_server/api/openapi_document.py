@@ -185,6 +185,7 @@ FILES: dict[str, tuple[str, ...]] = {
     "/api/environments/{name}": ("image/x-exr",),
     "/api/environments/{name}/thumb.jpg": ("image/jpeg",),
     "/api/sessions/{session_id}/frame.{suffix}": ("image/jpeg", "image/png", "image/x-exr"),
+    "/api/sessions/{session_id}/vertices": ("application/octet-stream",),
     "/api/sessions/{session_id}/export": ("application/octet-stream",),
     "/api/weights/{weights_name}": ("application/octet-stream",),
 }

@@ -164,6 +164,15 @@ async def export_session(
     return await while_connected(call, write())
 
 
+@router.get("/{session_id}/vertices")
+async def read_vertices(session_id: str, context: Context, call: Request) -> Response:
+    """Where the edits in force put the vertices of the asset's mesh, in its order: three float32 (little-endian) each [world units]."""
+    session = await context.sessions.get(session_id)
+    posed = await while_connected(call, context.sessions.load(session, caller_of(call, session_id)))
+    data = await asyncio.to_thread(lambda: posed.pose.vertices().tobytes())
+    return Response(data, media_type="application/octet-stream", headers={"x-drgs-revision": str(posed.revision)})
+
+
 class FrameQuery(BaseModel):
     """Of one picture."""
 

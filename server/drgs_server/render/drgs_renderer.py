@@ -31,6 +31,7 @@ from drgs_server.render.interface import (
     LinearPixels,
     Picked,
     Pixels,
+    Positions,
     view_of_bounds,
 )
 from drgs_server.render.layers import LayeredStill, certainty_layers, light_layers, visibility_layers
@@ -186,6 +187,9 @@ class Pose(AbstractPose):
         rendered = replace(_render_settings(settings), samples_per_pixel=_samples_wanted(settings, self.scene.primary))
         bands = render_bands(scene, seen, rendered, tracer, SLICE_SECONDS)
         return Still(bands, height, width, settings, linear)
+
+    def vertices(self) -> Positions:
+        return self.scene.mesh.vertices.detach().cpu().numpy().astype("<f4")
 
     def layers(self, camera: CameraMessage, settings: Settings, width: int, height: int) -> AbstractStill:
         from drgs.render.render_bands import render_bands

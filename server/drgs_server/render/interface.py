@@ -21,6 +21,8 @@ LinearPixels: TypeAlias = np.ndarray
 """(height, width, 4) float32: linear values and coverage."""
 Layers: TypeAlias = dict[str, np.ndarray]
 """Name in the EXR -> (height, width) float32."""
+Positions: TypeAlias = np.ndarray
+"""(vertex, 3) little-endian float32 [world units]."""
 LINEAR_CHANNELS = ("final", "albedo", "roughness", "metallic", "normal", "depth", "certainty")
 """Of which there are values to work with, not only a picture to look at."""
 
@@ -122,6 +124,10 @@ class AbstractPose(ABC):
         Raises:
             ValueError: a sentence, when the asset does not hold what the channel shows.
         """
+
+    @abstractmethod
+    def vertices(self) -> Positions:
+        """Of the posed mesh. For any thread."""
 
     @abstractmethod
     def layers(self, camera: CameraMessage, settings: Settings, width: int, height: int) -> AbstractStill:

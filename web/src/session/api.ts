@@ -211,6 +211,9 @@ export function frameQuery(view: View, { width, height }: { width: number; heigh
   return query.toString();
 }
 
+/** Where the session's edits put the vertices of the asset's mesh, three numbers each [world units]. */
+export const sessionVertices = async (session: string) => new Float32Array(await (await file(`/api/sessions/${part(session)}/vertices`)).arrayBuffer());
+
 /** A picture of the object with material and shape as captured, under the present light. */
 export const capturedPicture = async (session: string, query: string) => (await file(`/api/sessions/${part(session)}/frame.jpg?${query}&captured=true`)).blob();
 

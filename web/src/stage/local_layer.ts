@@ -11,14 +11,13 @@ import { materialThumbnails, namedMaterials } from '../edit/material/presets';
 import { flash, selectionWeights } from '../edit/material/selection';
 import { materials } from '../edit/material/values';
 import { mesh } from '../edit/mesh';
-import { deformPoints, isAnalytic } from '../edit/shape/deform_maps';
 import { pinWeights } from '../edit/shape/pins';
 import { shapeTool } from '../edit/shape/shape_tools';
-import { edits } from '../session/edit_log';
 import { notify } from '../session/notices';
 import { openedAsset, session, settings } from '../session/session';
 import { DynamicResolution, screenPixelRatio } from './dynamic_resolution';
 import { LocalPicture } from './local_picture';
+import { shapeIsKnown, shapeNow } from './shape_now';
 import { before, localPicture, wireframe } from './switches';
 import * as api from '../session/api';
 
@@ -60,7 +59,7 @@ export class LocalLayer {
 
   /** Whether it may stand in for the traced picture: only for the final picture, of a shape that the browser knows. */
   get standsIn(): boolean {
-    return localPicture.value && this.picture !== null && this.picture.hasMesh && this.lit && settings.value.channel === 'final' && session.value !== null && isAnalytic(edits.value);
+    return localPicture.value && this.picture !== null && this.picture.hasMesh && this.lit && settings.value.channel === 'final' && session.value !== null && shapeIsKnown.value;
   }
 
   /** Left of this share of the width the object stands as captured; a photograph that stands there needs no picture of ours. */
@@ -70,7 +69,7 @@ export class LocalLayer {
 
   /** What a simulation holds is marked for as long as its brush is chosen. */
   private get marksPins(): boolean {
-    return shapeTool.value === 'pins' && isAnalytic(edits.value);
+    return shapeTool.value === 'pins' && shapeIsKnown.value;
   }
 
   redraw(): void {
@@ -95,13 +94,13 @@ export class LocalLayer {
     if (Number.isNaN(this.flashedAt)) this.flashedAt = now;
     const since = now - this.flashedAt;
     const flashing = since < FLASH_MS;
-    const analytic = isAnalytic(edits.value);
+    const known = shapeIsKnown.value;
     const marks = this.marksPins;
-    const edges = wireframe.value && analytic && !before.value;
+    const edges = wireframe.value && known && !before.value;
     const shows = this.standsIn && !covered;
     const { splitAt } = this;
     // Over a traced picture only the selection and the edges are drawn, on nothing.
-    const overlay = ((flashing && analytic) || marks || edges) && !shows && !before.value && splitAt === null;
+    const overlay = ((flashing && known) || marks || edges) && !shows && !before.value && splitAt === null;
     if (flashing || this.stage.dataset.overlay !== String(overlay)) this.dirty = true;
     this.stage.dataset.overlay = String(overlay);
     if (!this.standsIn && !overlay && !before.value && splitAt === null) return;
@@ -139,9 +138,8 @@ export class LocalLayer {
     let shape: Float32Array | null = null;
     effect(() => {
       const rest = mesh.value?.positions;
-      if (!rest) return;
-      const next = before.value ? rest : deformPoints(rest, edits.value);
-      if (next === shape) return;
+      const next = before.value ? rest : shapeNow.value;
+      if (!rest || !next || next === shape) return;
       shape = next;
       this.picture?.setShape(next);
       this.dirty = true;

@@ -7,15 +7,14 @@ import { viewNumber } from '../capture/photographs';
 import { nearestVertex } from '../edit/material/select_vertices';
 import { paint, selectAt } from '../edit/material/selection';
 import { mesh } from '../edit/mesh';
-import { isAnalytic } from '../edit/shape/deform_maps';
 import { paintPins } from '../edit/shape/pins';
 import { choose, putHandle, shapeTool } from '../edit/shape/shape_tools';
-import { edits } from '../session/edit_log';
 import { notify } from '../session/notices';
 import { pick } from '../session/session';
 import type { Gizmo } from './gizmo';
 import type { LocalPicture } from './local_picture';
 import type { PointerActions } from './pointers';
+import { shapeIsKnown } from './shape_now';
 import { flying } from './switches';
 
 /** A point of the object at rest, and the nearest vertex. */
@@ -46,8 +45,8 @@ export class PointerTools implements PointerActions {
   }
 
   paint(event: PointerEvent): boolean {
-    if (!isAnalytic(edits.value)) {
-      notify('The brush paints on the shape at rest: take the simulation or the handles away first.', 'info');
+    if (!shapeIsKnown.value) {
+      notify('The brush needs the shape in this browser: pause what plays, and leave the instant local picture on.', 'info');
       return false;
     }
     const hit = this.pickLocally(event);
@@ -71,7 +70,7 @@ export class PointerTools implements PointerActions {
 
   private pickLocally(event: MouseEvent): SurfacePoint | null {
     const [x, y] = this.shareAt(event);
-    return isAnalytic(edits.value) ? (this.local?.pick(this.camera, 2 * x - 1, 1 - 2 * y) ?? null) : null;
+    return shapeIsKnown.value ? (this.local?.pick(this.camera, 2 * x - 1, 1 - 2 * y) ?? null) : null;
   }
 
   /** The server knows where surfaces are at rest that the browser cannot follow. */

@@ -5,7 +5,7 @@ import type { Vec3 } from '../../session/view';
 
 export type AnalyticMap = TwistMap | BendMap | StretchMap | LatticeMap;
 
-/** Whether the browser knows the shape: what simulations, clips, files of vertices and dragged handles do is known to the server only. */
+/** Whether the browser can compute the shape: what simulations, clips, files of vertices and dragged handles do is asked of the server. */
 export function isAnalytic(edits: Edit[]): boolean {
   return edits.every((edit) => edit.op === 'material' || edit.op === 'environment' || (edit.op === 'deform' && (edit.map != null || (edit.handles != null && !edit.handles.drag?.length))));
 }

@@ -1,12 +1,11 @@
 /** What the picture shows, and how well. */
 
 import { STILL_BOUNCES } from '../../session/constants.gen';
-import { isAnalytic } from '../../edit/shape/deform_maps';
-import { edits } from '../../session/edit_log';
 import { assets } from '../../session/library';
 import { NO_CERTAINTY } from '../../session/protocol.gen';
 import { changeSettings, session, settings, status } from '../../session/session';
 import { CHANNELS, entryOf } from '../../stage/channels';
+import { shapeIsKnown } from '../../stage/shape_now';
 import { flying, localPicture, resolution, wireframe } from '../../stage/switches';
 import { CompareSection } from '../Compare';
 import { Choice, Section, Switch } from '../fields';
@@ -54,7 +53,7 @@ export function ViewPanel() {
         />
         <Legend />
         <Switch label="Edges of the mesh" title={titleFor('wireframe', 'Drawn over the picture by the browser')} value={wireframe.value} onChange={(value) => (wireframe.value = value)} />
-        {wireframe.value && !isAnalytic(edits.value) && <p class="hint">The browser does not know the shape of a simulation or a clip: its edges are not shown.</p>}
+        {wireframe.value && !shapeIsKnown.value && <p class="hint">The browser does not know the shape while it plays, or without the local picture: its edges are not shown.</p>}
       </Section>
       <Section title="Quality">
         <Choice

@@ -1,10 +1,9 @@
 /** What a simulation holds in place: painted on the object, or one end of it. */
 
 import { size } from '../../edit/material/selection';
-import { isAnalytic } from '../../edit/shape/deform_maps';
 import { forgetPins, holdEnd, pinnedShare, pins } from '../../edit/shape/pins';
 import { chooseShapeTool, shapeTool } from '../../edit/shape/shape_tools';
-import { edits } from '../../session/edit_log';
+import { shapeIsKnown } from '../../stage/shape_now';
 import { Slider, Switch } from '../fields';
 
 export function Pins() {
@@ -16,7 +15,7 @@ export function Pins() {
       <Switch label="Paint what stays" title="Drag over the object; Shift takes away" value={on} onChange={(next) => chooseShapeTool(next ? 'pins' : 'none')} />
       {(on || pins.value.length > 0) && (
         <p class="hint" role="status">
-          {on && !isAnalytic(edits.value) ? 'Painting goes on the shape at rest: remove the simulation or the handles first.' : held}
+          {on && !shapeIsKnown.value ? 'Painting needs the shape in this browser: pause what plays, and leave the instant local picture on.' : held}
         </p>
       )}
       {on && <Slider label="Brush" value={size.value} min={0.02} max={1} step={0.01} onChange={(value) => (size.value = value)} />}
