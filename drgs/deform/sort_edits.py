@@ -20,6 +20,7 @@ from drgs.scene.edits import (
     Edit,
     EnvironmentEdit,
     MaterialEdit,
+    MatterEdit,
     PoseEdit,
     SimulateEdit,
     UnreadableEdit,
@@ -144,6 +145,9 @@ class _SortedList:
             if edit.file is not None:
                 named = (*(name for name in named if name != edit.file), edit.file)
             self.sums.append(last._replace(light=Light(edit.rotation, edit.intensity, named)))
+        elif isinstance(edit, MatterEdit):
+            parse_simulation_scene(edit.scene)  # refused here, not when somebody simulates
+            self.sums.append(last)
         else:
             word = _word(edit, files)
             if _may_change(edit):

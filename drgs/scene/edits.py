@@ -244,6 +244,14 @@ class SimulateEdit(_Plain):
     time: Seconds
 
 
+class MatterEdit(_Plain):
+    """What simulations of the object begin with, for the viewers of a session. It moves nothing by itself."""
+
+    op: Literal["matter"]
+    scene: dict
+    """As of a simulate edit."""
+
+
 class UnreadableEdit(_Plain):
     """Stands where an edit was kept that this version does not read, so that those around it keep their places. It never applies."""
 
@@ -252,7 +260,9 @@ class UnreadableEdit(_Plain):
     """What was kept, as JSON."""
 
 
-Edit = Annotated[MaterialEdit | EnvironmentEdit | DeformEdit | PoseEdit | SimulateEdit | UnreadableEdit, Field(discriminator="op")]
+Edit = Annotated[
+    MaterialEdit | EnvironmentEdit | DeformEdit | PoseEdit | SimulateEdit | MatterEdit | UnreadableEdit, Field(discriminator="op")
+]
 _edits = TypeAdapter(list[Edit])
 
 

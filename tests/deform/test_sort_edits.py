@@ -44,6 +44,17 @@ def digests(found: SortedEdits) -> tuple:
     return found.material.digest(found.material.count), found.shape.digest(found.shape.count), found.light
 
 
+def test_matter_moves_nothing_and_is_refused_where_a_simulation_would_be() -> None:
+    asset = plate_asset()
+    around = parse_edits([twist(0.1), material({"all": True}, roughness=0.3)])
+    matter = parse_edits([{"op": "matter", "scene": {"matter": {"preset": "clay"}, "pins": [1, 2]}}])
+    before, after = pose_scene(asset, around), pose_scene(asset, [around[0], *matter, around[1]])
+    assert after.mesh.vertices is before.mesh.vertices and after.mesh.roughness is before.mesh.roughness
+    with pytest.raises(ValueError, match=r"simulation scene: matter\.preset"):
+        pose_scene(asset, [*around, *parse_edits([{"op": "matter", "scene": {"matter": {"preset": "porridge"}}}])])
+    assert pose_scene(asset, around).mesh.vertices is before.mesh.vertices
+
+
 @pytest.mark.slow
 def test_an_edit_more_takes_as_many_steps_behind_two_thousand_as_behind_a_hundred() -> None:
     taken = []

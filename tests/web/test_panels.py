@@ -104,12 +104,14 @@ def test_matter_falls_and_its_time_can_be_set(ball: Viewer) -> None:
     type_number(ball, "Length", "0.25")
     before = ball.settled_picture()
     ball.page.get_by_role("button", name="Let it go").click()
-    wait_until(lambda: any(edit["time"] > 0 for edit in ball.edits()), "a simulation that plays", 60)
+    wait_until(lambda: any(edit.get("time", 0) > 0 for edit in ball.edits()), "a simulation that plays", 60)
     ball.page.get_by_role("button", name="Pause").click()
     type_number(ball, "Time", "0.2")
-    wait_until(lambda: [edit["time"] for edit in ball.edits()][-1:] == [0.2], "the moment that was typed", 60)
+    wait_until(lambda: [edit.get("time") for edit in ball.edits()][-1:] == [0.2], "the moment that was typed", 60)
     wait_for_change(ball, before, "the ball lower down")
     ball.page.get_by_role("button", name="Remove").click()
+    assert [edit["scene"]["duration"] for edit in ball.wait_for_edits(1)] == [0.25]
+    ball.page.get_by_role("button", name="As captured").click()
     ball.wait_for_edits(0)
 
 

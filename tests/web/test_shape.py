@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
-from tests.web.conftest import Viewer, wait_until
+from tests.web.conftest import Viewer, patient_page, wait_until
 
 
 @pytest.fixture(autouse=True)
@@ -175,7 +175,7 @@ def test_a_corner_of_the_lattice_is_dragged_and_the_local_picture_follows(ball: 
     ball.wait_for_edits(0)
 
 
-def test_what_is_painted_stays_while_the_rest_falls(ball: Viewer) -> None:
+def test_what_is_painted_stays_while_the_rest_falls(ball: Viewer, browser: Browser, ball_asset: str) -> None:
     page = ball.page
     left, top, right, bottom = outline(ball)
     before = screen(ball)
@@ -197,7 +197,7 @@ def test_what_is_painted_stays_while_the_rest_falls(ball: Viewer) -> None:
         field.fill(value)
         field.press("Enter")
     page.get_by_role("button", name="Let it go").click()
-    (edit,) = wait_until(lambda: [edit for edit in ball.edits() if edit["time"] > 0], "a simulation that plays", 60)
+    (edit,) = wait_until(lambda: [edit for edit in ball.edits() if edit.get("time", 0) > 0], "a simulation that plays", 60)
     page.get_by_role("button", name="Pause").click()
     assert len(edit["scene"]["pins"]) > 10
     assert edit["scene"]["matter"] == {"preset": "jelly", "density": 2000, "poisson_ratio": 0.4}
@@ -207,8 +207,25 @@ def test_what_is_painted_stays_while_the_rest_falls(ball: Viewer) -> None:
     wait_until(lambda: ball.edits()[-1]["time"] == 0.25, "the last moment", 60)
     assert abs(outline(ball)[1] - top) < 6, "the top hangs where it was; without pins it would have fallen by a third of the ball"
     page.get_by_role("button", name="Remove", exact=True).click()
+    # What it was made of and held by is the session's: another viewer sees it, and it is undone.
+    (kept,) = ball.wait_for_edits(1)
+    assert kept == {"op": "matter", "scene": edit["scene"]}
+    other = Viewer(patient_page(browser, viewport={"width": 760, "height": 420}, device_scale_factor=0.5), ball.server)
+    session = ball.session_path().rpartition("/")[2]
+    other.page.add_init_script(f"localStorage.setItem('drgs.session.{ball_asset}', '{session}')")
+    other.page.goto(f"{ball.server.address}/#token={ball.server.token}&asset={ball_asset}")
+    other.open_tab("Shape")
+    expect(other.page.get_by_label("Density, exact value")).to_have_value("2")
+    expect(other.hint("% of the surface is held.")).to_be_visible()
+    other.page.close()
     page.get_by_role("button", name="Hold nothing").click()
+    wait_until(lambda: ball.edits()[0]["scene"]["pins"] == [], "nothing held")
+    expect(page.get_by_role("button", name="Hold nothing")).to_have_count(0)
+    ball.undo()
+    expect(page.get_by_role("button", name="Hold nothing")).to_be_visible()
+    page.get_by_role("button", name="As captured").click()
     ball.wait_for_edits(0)
+    expect(page.get_by_label("Poisson, exact value")).to_have_value(re.compile(r"^0\.30?$"))
 
 
 def test_the_page_logged_no_errors(ball: Viewer) -> None:

@@ -29,6 +29,10 @@ export function describeEdit(edit: Edit): string {
       return `Pose: ${edit.clip} at ${rounded(edit.time)} s`;
     case 'simulate':
       return `Simulation at ${rounded(edit.time)} s`;
+    case 'matter': {
+      const { matter, pins } = edit.scene as { matter?: { preset?: string }; pins?: number[] };
+      return `Matter: ${matter?.preset ?? 'of its own'}${pins?.length ? ', held' : ''}`;
+    }
     case 'unreadable':
       return 'Of another version';
   }

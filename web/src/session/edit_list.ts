@@ -17,8 +17,11 @@ const plain = ({ all, sphere, box, region, similar, vertex_weights, weights_file
 
 /** Whether two lists of edits mean the same. What only one side spells out agrees: the server fills in defaults. */
 export const sameEdits = (a: Edit[], b: Edit[]) => a.length === b.length && a.every((edit, i) => agree(comparable(edit), comparable(b[i]!)));
-const comparable = (edit: Edit) =>
-  edit.op === 'material' ? { op: edit.op, select: JSON.stringify(plain(edit.select)), set: JSON.stringify(valuesSet(edit.set)), mode: edit.mode ?? 'absolute' } : edit;
+function comparable(edit: Edit): object {
+  if (edit.op === 'material') return { op: edit.op, select: JSON.stringify(plain(edit.select)), set: JSON.stringify(valuesSet(edit.set)), mode: edit.mode ?? 'absolute' };
+  // The server keeps scenes as they came: what one of two leaves out is a difference.
+  return 'scene' in edit ? { ...edit, scene: JSON.stringify(edit.scene) } : edit;
+}
 
 /** The values without nulls, in the schema's order. */
 export const valuesSet = ({ albedo, roughness, metallic }: MaterialValues) => ({ albedo: albedo ?? undefined, roughness: roughness ?? undefined, metallic: metallic ?? undefined });

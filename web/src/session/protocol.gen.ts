@@ -540,6 +540,12 @@ export interface MaterialValues {
   metallic?: number | null;
 }
 
+/** What simulations of the object begin with, for the viewers of a session. It moves nothing by itself. */
+export interface MatterEdit {
+  op: "matter";
+  scene: Record<string, unknown>;
+}
+
 /** What lies under a pixel of the newest frame. */
 export interface PickMessage {
   type: "pick";
@@ -990,4 +996,5 @@ export type Edit =
   | DeformEdit
   | PoseEdit
   | SimulateEdit
+  | MatterEdit
   | UnreadableEdit;

@@ -7,7 +7,7 @@ import { viewNumber } from '../capture/photographs';
 import { nearestVertex } from '../edit/material/select_vertices';
 import { paint, selectAt } from '../edit/material/selection';
 import { mesh } from '../edit/mesh';
-import { paintPins } from '../edit/shape/pins';
+import { endStroke, paintPins } from '../edit/shape/pins';
 import { choose, putHandle, shapeTool } from '../edit/shape/shape_tools';
 import { notify } from '../session/notices';
 import { pick } from '../session/session';
@@ -53,6 +53,8 @@ export class PointerTools implements PointerActions {
     if (hit) (shapeTool.value === 'pins' ? paintPins : paint)(hit.rest, event.shiftKey);
     return hit !== null;
   }
+
+  painted = () => endStroke();
 
   /** Put the focal point on the surface under the pointer; the server knows surfaces that the local mesh does not. */
   focus(event: MouseEvent): void {

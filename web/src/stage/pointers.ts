@@ -20,6 +20,8 @@ export interface PointerActions {
   select(event: PointerEvent): void;
   /** False where the brush met nothing: the drag then is the camera's. */
   paint(event: PointerEvent): boolean;
+  /** The brush is lifted. */
+  painted(): void;
   /** True where the gizmo took hold of something: the drag then is its own. */
   grab(event: PointerEvent): boolean;
   drag(event: PointerEvent): void;
@@ -63,6 +65,7 @@ export function listenToPointers(stage: HTMLElement, controls: CameraControls, o
   });
   const release = (event: PointerEvent) => {
     if (event.pointerId === grabbing) on.release(event);
+    if (event.pointerId === painting) on.painted();
     lightDrag = painting = grabbing = pressed = null;
     controls.enabled = true;
   };

@@ -5,28 +5,44 @@ import { openedAsset } from '../../session/session';
 import type { Vec3 } from '../../session/view';
 import { withDab } from '../material/selection';
 import { bounds, mesh } from '../mesh';
+import { pins, setPins } from './matter';
 
 /** Share of the object's height that `Top` and `Foot` hold. */
 const SLICE = 0.12;
 
-/** 0 or 1 for each vertex; null: nothing is held. */
-const painted = signal<number[] | null>(null);
+/** 0 or 1 for each vertex, while a stroke is being painted; it is one change of the session. */
+const stroke = signal<number[] | null>(null);
+const vertexCount = () => (mesh.value?.positions.length ?? 0) / 3;
+/** 0 or 1 for each vertex. */
+const held = computed(() => {
+  if (stroke.value) return stroke.value;
+  const weights = new Array<number>(vertexCount()).fill(0);
+  for (const vertex of pins.value) if (vertex < weights.length) weights[vertex] = 1;
+  return weights;
+});
 /** For the highlight on the object. */
-export const pinWeights = computed(() => (mesh.value ? Float32Array.from(painted.value ?? new Array<number>(mesh.value.positions.length / 3).fill(0)) : null));
-/** Numbers of the vertices that are held. */
-export const pins = computed(() => (painted.value ?? []).flatMap((weight, vertex) => (weight > 0 ? [vertex] : [])));
-export const pinnedShare = computed(() => (painted.value ? pins.value.length / Math.max(1, painted.value.length) : 0));
+export const pinWeights = computed(() => (mesh.value ? Float32Array.from(held.value) : null));
+export const pinnedShare = computed(() => held.value.reduce((sum, weight) => sum + weight, 0) / Math.max(1, held.value.length));
 
-export const forgetPins = () => void (painted.value = null);
+const hold = (weights: number[]) => setPins(weights.flatMap((weight, vertex) => (weight > 0 ? [vertex] : [])));
+export const holdNothing = () => setPins([]);
 
 effect(() => {
   openedAsset.value;
-  forgetPins();
+  stroke.value = null;
 });
 
 export function paintPins(point: Vec3, erase: boolean): void {
   const positions = mesh.value?.positions;
-  if (positions) painted.value = withDab(painted.value ?? new Array<number>(positions.length / 3).fill(0), positions, point, erase, 0);
+  if (positions) stroke.value = withDab(held.value, positions, point, erase, 0);
+}
+
+/** The brush is lifted. */
+export function endStroke(): void {
+  const painted = stroke.value;
+  if (!painted) return;
+  hold(painted);
+  stroke.value = null;
 }
 
 export function holdEnd(end: 'top' | 'foot'): void {
@@ -34,6 +50,6 @@ export function holdEnd(end: 'top' | 'foot'): void {
   if (!positions) return;
   const { minimum, maximum } = bounds.value;
   const limit = SLICE * (maximum[2] - minimum[2]);
-  const held = (z: number) => (end === 'top' ? z >= maximum[2] - limit : z <= minimum[2] + limit);
-  painted.value = Array.from({ length: positions.length / 3 }, (_, i) => (held(positions[3 * i + 2]!) ? 1 : (painted.value?.[i] ?? 0)));
+  const within = (z: number) => (end === 'top' ? z >= maximum[2] - limit : z <= minimum[2] + limit);
+  hold(held.value.map((weight, vertex) => (within(positions[3 * vertex + 2]!) ? 1 : weight)));
 }

@@ -1,17 +1,17 @@
 /** The object as matter: what it is made of, how it falls, and a timeline to play it. Moments are computed as they are first shown. */
 
-import { type Signal } from '@preact/signals';
 import { keyOfGesture } from '../../edit/gestures';
-import { bake, clips, density, dropHeight, fine, hasFloor, loop, matter, MATTERS, matterValues, moment, playClip, playing, poisson, removeMotion, seconds, secondsOf, seek, simulate, speed, stiffness } from '../../edit/shape/simulation';
+import { density, dropHeight, fine, hasFloor, matter, MATTERS, matterValues, poisson, seconds, setDensity, setDropHeight, setFine, setFloor, setMatter, setPoisson, setSeconds, setStiffness, stiffness } from '../../edit/shape/matter';
+import { bake, clips, loop, moment, playClip, playing, removeMotion, secondsOf, seek, simulate, speed } from '../../edit/shape/simulation';
 import { Choice, Section, Slider, Switch } from '../fields';
 import { Baking } from './Baking';
 import { Pins } from './Pins';
 
 /** Of a slider whose value is the matter's until it is moved. */
-const unlessSet = (value: Signal<number | null>) => ({
-  unset: value.value === null,
-  onChange: (next: number) => void (value.value = next),
-  onReset: value.value === null ? undefined : () => void (value.value = null),
+const unlessSet = (value: number | null, set: (next: number | null) => void) => ({
+  unset: value === null,
+  onChange: (next: number) => set(next),
+  onReset: value === null ? undefined : () => set(null),
 });
 
 export function Simulation() {
@@ -19,15 +19,15 @@ export function Simulation() {
   const own = matterValues.value;
   return (
     <Section title="Simulation">
-      <Choice bare label="Matter" value={matter.value} options={MATTERS.map((name) => ({ value: name, text: name[0]!.toUpperCase() + name.slice(1) }))} onChange={(next) => (matter.value = next)} />
-      {own.poisson !== null && <Slider label="Stiffness" title={stiffness.value === null ? 'Young’s modulus: it follows the object’s size until you set it' : 'Young’s modulus'} unit="kPa" logarithmic value={stiffness.value ?? 2} min={0} max={4} step={0.1} {...unlessSet(stiffness)} />}
-      <Slider label="Density" title="Of the matter; water has 1 t/m³" unit="t/m³" logarithmic value={density.value ?? Math.log10(own.density)} min={-2} max={1.3} step={0.05} {...unlessSet(density)} />
-      {own.poisson !== null && <Slider label="Poisson" title="Poisson’s ratio: how much it gets thinner when it is drawn out; near 0.5 it keeps its volume" value={poisson.value ?? own.poisson} min={0} max={0.45} step={0.01} {...unlessSet(poisson)} />}
+      <Choice bare label="Matter" value={matter.value} options={MATTERS.map((name) => ({ value: name, text: name[0]!.toUpperCase() + name.slice(1) }))} onChange={setMatter} />
+      {own.poisson !== null && <Slider label="Stiffness" title={stiffness.value === null ? 'Young’s modulus: it follows the object’s size until you set it' : 'Young’s modulus'} unit="kPa" logarithmic value={stiffness.value ?? 2} min={0} max={4} step={0.1} {...unlessSet(stiffness.value, setStiffness)} />}
+      <Slider label="Density" title="Of the matter; water has 1 t/m³" unit="t/m³" logarithmic value={density.value ?? Math.log10(own.density)} min={-2} max={1.3} step={0.05} {...unlessSet(density.value, setDensity)} />
+      {own.poisson !== null && <Slider label="Poisson" title="Poisson’s ratio: how much it gets thinner when it is drawn out; near 0.5 it keeps its volume" value={poisson.value ?? own.poisson} min={0} max={0.45} step={0.01} {...unlessSet(poisson.value, setPoisson)} />}
       <Pins />
-      <Switch label="Ground" value={hasFloor.value} onChange={(value) => (hasFloor.value = value)} />
-      {hasFloor.value && <Slider label="Drop from" unit="×" value={dropHeight.value} min={0} max={2} step={0.05} onChange={(value) => (dropHeight.value = value)} />}
-      <Slider label="Length" unit="s" value={seconds.value} min={0.25} max={5} step={0.25} onChange={(value) => (seconds.value = value)} />
-      <Switch label="Fine (slow)" value={fine.value} onChange={(value) => (fine.value = value)} />
+      <Switch label="Ground" value={hasFloor.value} onChange={setFloor} />
+      {hasFloor.value && <Slider label="Drop from" unit="×" value={dropHeight.value} min={0} max={2} step={0.05} onChange={setDropHeight} />}
+      <Slider label="Length" unit="s" value={seconds.value} min={0.25} max={5} step={0.25} onChange={setSeconds} />
+      <Switch label="Fine (slow)" value={fine.value} onChange={setFine} />
       <div class="buttons">
         <button class="primary" onClick={simulate}>
           {edit ? 'Start again' : 'Let it go'}
