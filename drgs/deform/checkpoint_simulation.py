@@ -1,7 +1,7 @@
 """How far a simulation has come, on disk after every frame: whoever starts it again goes on with the next frame, to the same bits.
 
 frame_00007.safetensors holds what frame 7 shows; state.safetensors the matter behind the newest frame, and is written last, so that a process
-that dies in between computes one frame again. A checkpoint that is damaged, or of another asset or scene, is left aside: it would only
+that dies in between computes one frame again. The frames with clip.json are a clip that grows: it plays while it is made. A checkpoint that is damaged, or of another asset or scene, is left aside: it would only
 have saved time.
 """
 
@@ -14,14 +14,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from drgs.deform.clip import ClipFrame
+from drgs.deform.clip import ClipFrame, write_manifest
 from drgs.deform.mpm import State
 from drgs.deform.simulation_progress import SimulationProgress
 
 STATE = "state.safetensors"
 
 
-def save_progress(folder: Path, progress: SimulationProgress, of: str) -> None:
+def save_progress(folder: Path, progress: SimulationProgress, of: str, fps: float) -> None:
     """Write the newest frame, then the state behind it.
 
     Args:
@@ -29,11 +29,13 @@ def save_progress(folder: Path, progress: SimulationProgress, of: str) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     newest = len(progress.frames) - 1
-    _write(folder / _name(newest), {name: value for name, value in vars(progress.frames[newest]).items() if value is not None}, {})
+    for index in (0, newest) if newest == 1 else (newest,):  # the first, at rest, was there before any was computed
+        _write(folder / _name(index), {name: value for name, value in vars(progress.frames[index]).items() if value is not None}, {})
     tensors = {name: value for name, value in vars(progress.state).items() if isinstance(value, Tensor)}
     # JSON keeps every bit of a float64.
     facts = {"of": of, "frames": newest + 1, "time": progress.state.time, "still": progress.still, "totals": progress.totals}
     _write(folder / STATE, tensors, {"facts": json.dumps(facts)})
+    write_manifest(folder, progress.frames[0], newest + 1, fps, {})
 
 
 def read_progress(folder: Path, start: SimulationProgress, of: str) -> SimulationProgress:

@@ -20,6 +20,9 @@ from torch import Tensor
 
 FORMAT, VERSION = "drgs clip", 1
 MOST_FRAMES = 100_000
+MANIFEST = "clip.json"
+MAKING = ".making"
+"""Ends the name of a folder where a clip grows frame by frame, beside its place: it can be read at any time, up to the newest frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,7 @@ def save_clip(folder: Path, frames: list[ClipFrame], fps: float, details: dict) 
         ValueError: the path is taken by something that is no clip.
     """
     folder = Path(folder)
-    if folder.exists() and not (folder / "clip.json").is_file() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and not (folder / MANIFEST).is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder}: exists, and is no clip")
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -80,10 +83,7 @@ def save_clip(folder: Path, frames: list[ClipFrame], fps: float, details: dict) 
             arrays = {name: value.detach().cpu().contiguous() for name, value in vars(frame).items() if value is not None}
             # Two tensors of one frame never share memory, which the format would refuse.
             safetensors.torch.save_file(arrays, partial / _name(index))
-        first = frames[0]
-        counts = {"vertices": len(first.vertices), "surfels": 0 if first.centers is None else len(first.centers)}
-        manifest = {"format": FORMAT, "version": VERSION, "fps": fps, "frames": len(frames), "counts": counts} | details
-        (partial / "clip.json").write_text(json.dumps(manifest, indent=1))
+        write_manifest(partial, frames[0], len(frames), fps, details)
         os.chmod(partial, 0o755)
         if folder.exists():
             shutil.rmtree(folder)
@@ -93,6 +93,25 @@ def save_clip(folder: Path, frames: list[ClipFrame], fps: float, details: dict) 
         raise
 
 
+def write_manifest(folder: Path, first: ClipFrame, frames: int, fps: float, details: dict) -> None:
+    """Say what lies in a folder of frames; whoever reads it meanwhile finds the old words or the new ones.
+
+    Args:
+        first: frame 0.
+        frames: how many there are.
+    """
+    counts = {"vertices": len(first.vertices), "surfels": 0 if first.centers is None else len(first.centers)}
+    manifest = {"format": FORMAT, "version": VERSION, "fps": fps, "frames": frames, "counts": counts} | details
+    draft = folder / f"{MANIFEST}.part"
+    draft.write_text(json.dumps(manifest, indent=1))
+    os.replace(draft, folder / MANIFEST)
+
+
+def growing_clip(folder: Path) -> Path:
+    """Where the clip of a folder is while it is being made."""
+    return folder.with_name(folder.name + MAKING)
+
+
 def open_clip(folder: Path) -> Clip:
     """Read a clip's manifest.
 
@@ -100,7 +119,7 @@ def open_clip(folder: Path) -> Clip:
         ValueError: one sentence: no clip, or a damaged or newer one.
     """
     try:
-        manifest = json.loads((Path(folder) / "clip.json").read_text())
+        manifest = json.loads((Path(folder) / MANIFEST).read_text())
         if manifest["format"] != FORMAT:
             raise ValueError(f"its format is {manifest['format']!r}")
         if manifest["version"] > VERSION:

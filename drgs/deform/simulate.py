@@ -245,7 +245,7 @@ def simulate(
     Args:
         progress: told of each finished frame and of how many there will be.
         find: the files that the scene names.
-        checkpoint: folder that keeps every finished frame, and from which an interrupted run goes on, to the same clip; removed in the end.
+        checkpoint: folder that keeps every finished frame, and from which an interrupted run goes on, to the same clip; a clip that can be played meanwhile; removed in the end.
         warn: told of what will not look right before the first frame is computed; the report has it too.
 
     Raises:
@@ -261,7 +261,7 @@ def simulate(
     for index in range(simulation.frame_count):
         kept.append(simulation.frame(index))
         if checkpoint is not None and index >= found:
-            save_progress(checkpoint, simulation.progress, scene.model_dump_json())
+            save_progress(checkpoint, simulation.progress, scene.model_dump_json(), scene.fps)
         if progress is not None and index >= found - 1:  # those that a killed run had told are not news
             progress(index + 1, simulation.frame_count)
     if out is not None:

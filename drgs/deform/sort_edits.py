@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Generic, NamedTuple, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary
 
+from drgs.deform.clip import MANIFEST, growing_clip
 from drgs.deform.simulation_scene import mesh_files, parse_simulation_scene
 from drgs.scene.asset import Asset
 from drgs.scene.edits import (
@@ -42,7 +43,7 @@ AnyEdit = TypeVar("AnyEdit", bound=MaterialEdit | DeformEdit | PoseEdit | Simula
 
 @dataclass(frozen=True)
 class EditFiles:
-    """Turns the names in edits into paths."""
+    """Turns the names in edits into paths. A clip that is not there is looked for where it is being made."""
 
     base_directory: Path | None
     confine: bool
@@ -55,6 +56,9 @@ class EditFiles:
         """
         base = Path.cwd() if self.base_directory is None else Path(self.base_directory)
         path = (base / name).resolve()
+        growing = growing_clip(path.parent) / MANIFEST
+        if path.name == MANIFEST and not path.exists() and growing.is_file():
+            path = growing
         if self.confine and not path.is_relative_to(base.resolve()):
             raise ValueError(f"the file {name!r} lies outside the folder that edits may read")
         if not path.is_file() and not (or_folder and path.is_dir()):

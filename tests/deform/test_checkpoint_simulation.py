@@ -7,12 +7,16 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import trimesh
 
 from drgs.convert.import_mesh import import_mesh
+from drgs.deform.clip import growing_clip, open_clip, read_frame
+from drgs.deform.pose_scene import pose_scene
 from drgs.deform.simulate import simulate
 from drgs.deform.simulation_scene import parse_simulation_scene
 from drgs.scene.asset import Asset, load_asset, save_asset
+from drgs.scene.edits import parse_edits
 from tests.patience import PATIENCE_SECONDS
 
 SCENE = parse_simulation_scene({"particles": 300, "duration": 0.4, "fps": 20, "spin": [0, 3.0, 0], "matter": {"preset": "jelly"}})
@@ -97,6 +101,20 @@ def test_the_checkpoint_of_another_scene_is_left_aside(asset: Asset, tmp_path: P
     other = SCENE.model_copy(update={"duration": 0.1})
     simulate(asset, other, None, lambda done, total: told.append(done), checkpoint=tmp_path / "frames")
     assert told == [1, 2, 3]
+
+
+@pytest.mark.slow
+def test_a_clip_in_the_making_plays_up_to_its_newest_frame(folder: Path, asset: Asset, tmp_path: Path) -> None:
+    (edit,) = parse_edits([{"op": "pose", "clip": "fall", "time": 0.15}])
+    stop_at(asset, 3, growing_clip(tmp_path / "fall"))
+    growing, whole = open_clip(growing_clip(tmp_path / "fall")), open_clip(folder / "undisturbed")
+    assert (growing.frame_count, growing.fps) == (3, whole.fps)
+    for index in range(3):
+        assert torch.equal(read_frame(growing, index).vertices, read_frame(whole, index).vertices)
+    newest = pose_scene(asset, [edit], tmp_path, confine=True).mesh
+    assert torch.equal(newest.vertices, read_frame(whole, 2).vertices), "later moments show the newest frame"
+    frames_reported(asset, tmp_path / "fall", growing_clip(tmp_path / "fall"))
+    assert torch.equal(pose_scene(asset, [edit], tmp_path, confine=True).mesh.vertices, read_frame(whole, 3).vertices)
 
 
 @pytest.mark.slow

@@ -138,13 +138,13 @@ def test_a_simulation_that_was_stopped_goes_on_with_the_next_frame(job: Callable
     context = job(request, told.append, lambda: len(told) >= 2)
     with pytest.raises(JobStopped):
         run(SimulateRun(context))
-    assert (context.folder / "frames" / "state.safetensors").is_file() and not context.directory.clip(JOB).exists()
+    assert (context.directory.growing_clip(JOB) / "state.safetensors").is_file() and not context.directory.clip(JOB).exists()
     again: list[Progress] = []
     run(SimulateRun(job(request, again.append)))
     assert [made.iteration for made in again] == [2, 3]
     assert told[0].eta_seconds is None and told[1].eta_seconds > 0, "one frame of three is left"
     assert [made.eta_seconds for made in again] == [None, 0]
-    assert open_clip(context.directory.clip(JOB)).frame_count == 3 and not (context.folder / "frames").exists()
+    assert open_clip(context.directory.clip(JOB)).frame_count == 3 and not context.directory.growing_clip(JOB).exists()
 
 
 def test_a_film_passes_its_views_and_is_as_bright_as_asked(job: Callable[..., JobContext]) -> None:

@@ -345,7 +345,7 @@ def delete_job(job_id: str, context: Context) -> None:
     with Session(context.engine) as session, session.begin():
         session.execute(delete(JobRow).where(JobRow.id == row.id))
     capture = () if made_capture else (context.directory.uploads / row.id,)
-    for folder in (context.directory.job(row.id), context.directory.clip(row.id), *capture):
+    for folder in (context.directory.job(row.id), context.directory.clip(row.id), context.directory.growing_clip(row.id), *capture):
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -37,7 +37,10 @@ class EditReferences:
         if isinstance(edit, MaterialEdit) and edit.select.weights_file is not None and not self._has_weights(edit.select.weights_file):
             raise ProblemError(422, f"There are no weights {edit.select.weights_file[:100]!r}; POST them to /api/weights first.")
         if isinstance(edit, PoseEdit) and not self._has_clip(edit.clip):
-            raise ProblemError(422, f"There is no clip {edit.clip[:100]!r}; a simulate job that is done names its clip.")
+            raise ProblemError(
+                422,
+                f"There is no clip {edit.clip[:100]!r}; a simulate job that is done names its clip, and one that runs on this machine has `clips/ID` by its own id.",
+            )
 
     def missing(self, edit: Edit) -> str | None:
         """Why what an edit refers to is not there, if so.
@@ -65,6 +68,6 @@ class EditReferences:
 
     def _has_clip(self, clip: str) -> bool:
         try:
-            return _CLIP.fullmatch(clip) is not None and has_clip(self._directory, clip)
+            return _CLIP.fullmatch(clip) is not None and has_clip(self._directory, clip, or_growing=True)
         except ArtifactError as error:
             raise artifact_problem(error) from error

@@ -56,12 +56,17 @@ def fetch_clip(directory: DataDirectory, clip: str) -> Path:
     return _fetch_missing(directory, "clips", job_id, directory.clip(job_id))
 
 
-def has_clip(directory: DataDirectory, clip: str) -> bool:
+def has_clip(directory: DataDirectory, clip: str, or_growing: bool = False) -> bool:
     """Whether there is such a clip; it is on this machine then.
+
+    Args:
+        or_growing: or the beginning of one that a worker of this machine is making.
 
     Raises:
         StoreAway, ArtifactDamaged: a sentence.
     """
+    if or_growing and (directory.growing_clip(clip.rpartition("/")[2]) / "clip.json").is_file():
+        return True
     try:
         return (fetch_clip(directory, clip) / "clip.json").is_file()
     except ArtifactMissing:
@@ -220,7 +225,12 @@ def remove_deleted_elsewhere(directory: DataDirectory, engine: Engine) -> int:
         ("clips", clips, jobs),
     ):
         for path in folder.iterdir() if folder.is_dir() else ():
-            if path.name.startswith(".") or path.name in known or path.stat().st_mtime > old or directory.store.has(kind, path.name):
+            if (
+                path.name.startswith(".")
+                or path.name.removesuffix(".making") in known
+                or path.stat().st_mtime > old
+                or directory.store.has(kind, path.name)
+            ):
                 continue
             shutil.rmtree(path, ignore_errors=True)
             removed += 1

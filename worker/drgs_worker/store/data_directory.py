@@ -107,6 +107,10 @@ class DataDirectory:
         """What a `pose` edit calls `clips/ID`."""
         return self.environments / "clips" / job_id
 
+    def growing_clip(self, job_id: str) -> Path:
+        """Where it is while it is being made (drgs.deform.clip.growing_clip, which loads torch)."""
+        return self.environments / "clips" / f"{job_id}.making"
+
     def told(self, sentence: str) -> str:
         """A sentence as callers may read it: files of this folder by their place in it, and no more than MOST_TOLD characters."""
         short = sentence.replace(f"{self.root}/", "").replace(str(self.root), "the data folder")

@@ -5,7 +5,7 @@ import { withReplaced } from '../../session/edit_list';
 import { draft, edits, pending, replaceEdits, reviseEdits } from '../../session/edit_log';
 import { isActive, jobName, jobs, startJob } from '../../session/jobs';
 import { preference } from '../../session/preferences';
-import type { Edit, PoseEdit, SimulateEdit } from '../../session/protocol.gen';
+import type { Edit, JobInfo, PoseEdit, SimulateEdit } from '../../session/protocol.gen';
 import { session } from '../../session/session';
 import { newKey } from '../gestures';
 import { FPS, matter, scene, seconds } from './matter';
@@ -34,6 +34,16 @@ export const clips = computed(() => jobs.value.filter((job) => job.kind === 'sim
 export const baking = computed(() => jobs.value.filter((job) => job.kind === 'simulate' && job.source_asset === session.value?.asset && isActive(job)));
 
 export const secondsOf = (edit: Moment) => (edit.op === 'simulate' ? Number(edit.scene.duration ?? 2) : (clipSeconds.value[jobOfClip(edit.clip)] ?? LONGEST_CLIP));
+
+/** How much of a film there is to play [s]: of a clip that is being made, what is made; its first frame is at rest. */
+function secondsMade(edit: Moment): number {
+  const job = edit.op === 'pose' ? baking.value.find(({ id }) => id === jobOfClip(edit.clip)) : undefined;
+  if (!job) return secondsOf(edit);
+  return Math.max(0, (job.fraction * (secondsOf(edit) * FPS + 1) - 1) / FPS);
+}
+
+/** What a job makes, under the name that it will have. */
+export const clipOf = (job: JobInfo) => `clips/${job.id}`;
 
 /** One for each film: however slowly it plays, undo takes it away in one step. */
 let filmKey = newKey();
@@ -76,7 +86,9 @@ effect(() => {
     const now = performance.now();
     const step = Math.min((now - before) / 1000, 2 / FPS) * Number(speed.value);
     before = now;
-    const length = secondsOf(edit);
+    const length = secondsMade(edit);
+    // What is not made yet is waited for.
+    if (edit.time + step > length && length < secondsOf(edit)) return;
     if (edit.time + step > length && !loop.value) playing.value = false;
     seek(edit, playing.value ? (edit.time + step) % length : length, filmKey);
   }, 1000 / FPS);

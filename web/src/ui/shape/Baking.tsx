@@ -1,6 +1,6 @@
 /** Simulations of the open asset that a worker computes now. */
 
-import { baking } from '../../edit/shape/simulation';
+import { baking, clipOf, playClip } from '../../edit/shape/simulation';
 import { cancel } from '../../session/jobs';
 import { Bar } from '../fields';
 import { duration } from '../library/Jobs';
@@ -15,6 +15,11 @@ export function Baking() {
           <li key={job.id} class="baking">
             <Bar label={`Progress of ${job.name}`} share={job.fraction} />
             <span class="facts">{job.state === 'running' ? `${job.name}: ${job.message || 'begins'}${left}` : `${job.name}: waits for a worker`}</span>
+            {job.state === 'running' && job.fraction > 0 && (
+              <button title="What is made so far; the film goes on as more is" onClick={() => playClip(clipOf(job))}>
+                Play
+              </button>
+            )}
             <button class="ghost" aria-label={`Cancel ${job.name}`} onClick={() => void cancel(job)}>
               Cancel
             </button>

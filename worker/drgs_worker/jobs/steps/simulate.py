@@ -1,5 +1,5 @@
-"""Simulations: an asset's matter moves, and the clip is kept where `pose` edits find it. Every finished frame is on disk: a worker that dies
-costs one frame."""
+"""Simulations: an asset's matter moves, and the clip is kept where `pose` edits find it. Every finished frame is on disk, beside the
+clip's place: a worker that dies costs one frame, and `pose` edits of this machine find what is made so far."""
 
 import time
 from pathlib import Path
@@ -48,4 +48,4 @@ class SimulateRun(AbstractJobRun):
                 raise JobStopped
 
         out.parent.mkdir(mode=0o700, exist_ok=True)
-        simulate(asset, parse_simulation_scene(self._asked.scene), out, report, checkpoint=job.folder / "frames")
+        simulate(asset, parse_simulation_scene(self._asked.scene), out, report, checkpoint=job.directory.growing_clip(job.job_id))
