@@ -1,5 +1,6 @@
 """Light, shape, camera, export: each panel and gesture shows in pixels or in the server's log. And all of it can be used without a mouse."""
 
+import io
 import json
 from pathlib import Path
 
@@ -112,6 +113,30 @@ def test_matter_falls_and_its_time_can_be_set(ball: Viewer) -> None:
     ball.page.get_by_role("button", name="Remove").click()
     assert [edit["scene"]["duration"] for edit in ball.wait_for_edits(1)] == [0.25]
     ball.page.get_by_role("button", name="As captured").click()
+    ball.wait_for_edits(0)
+
+
+def test_four_lights_are_compared_and_one_is_put_in_force(ball: Viewer) -> None:
+    page = ball.page
+    ball.open_tab("Light")
+    page.get_by_role("button", name="Compare lights").click()
+    dialog = page.get_by_role("dialog", name="Lights compared")
+    expect(dialog.get_by_role("img")).to_have_count(4)
+    names = dialog.get_by_role("combobox").evaluate_all("(all) => all.map((one) => one.value)")
+    assert names[0] == "captured" and len(set(names)) == 4
+    means = [
+        np.asarray(Image.open(io.BytesIO(picture.screenshot())).convert("RGB"), float).mean((0, 1))
+        for picture in dialog.get_by_role("img").all()
+    ]
+    assert all(np.abs(a - b).max() > 4 for k, a in enumerate(means) for b in means[:k]), f"four lights, four pictures; found means {means}"
+    assert ball.edits() == []
+    dialog.get_by_label("Light 2").select_option(names[3])
+    expect(dialog.get_by_role("img")).to_have_count(4)
+    dialog.get_by_role("button", name="Use").nth(1).click()
+    (edit,) = ball.wait_for_edits(1)
+    assert edit["file"] == names[3]
+    expect(dialog).not_to_be_visible()
+    ball.undo()
     ball.wait_for_edits(0)
 
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from drgs.exchange.export_formats import DownloadFormat
 from drgs.exchange.exr import encode_exr
 from drgs.maths.constants import STILL_BOUNCES
-from drgs.scene.edits import EnvironmentEdit
+from drgs.scene.edits import Edit, EnvironmentEdit
 from drgs.scene.tone_curve import ToneCurve
 from drgs_server.api.answers import session_info, snapshot_info
 from drgs_server.api.context import ServerContext, caller_of, context_of
@@ -55,6 +55,7 @@ ClientKeyHeader = Annotated[str | None, Header(alias="Idempotency-Key", min_leng
 SnapshotName = Annotated[UserName, PathParameter()]
 
 Suffix = Literal["jpg", "png", "exr"]
+CAPTURED_LIGHT = "captured"
 STILL_BYTES = 256 << 20
 """Of a picture of no size."""
 _MEDIA_TYPES = {"jpg": "image/jpeg", "png": "image/png", "exr": "image/x-exr"}
@@ -188,6 +189,8 @@ class FrameQuery(BaseModel):
     channel: Channel | Literal["all"] = "final"
     """all: every channel that the asset has, as layers of one EXR."""
     denoise: bool = False
+    environment: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    """Name of a stored environment, or `captured` for the asset's own, in the place of the light in force: turned and as bright as that is."""
     captured: bool = False
     """Without what was done to material and shape; the light stays."""
     world_from_camera: Annotated[str, Field(max_length=1000)] | None = None
@@ -232,9 +235,11 @@ async def _make_picture(
         assert loaded is not None
         camera, settings = _camera_of(query, loaded.start_view), _settings_of(query)
         work = context.render_thread.call_in_turn
-        if query.captured:
-            light = [edit for edit in session.log.applied if isinstance(edit, EnvironmentEdit)]
-            pose = await asyncio.wrap_future(work(lambda: loaded.pose(light, posed.pose)))
+        if query.captured or query.environment is not None:
+            shown = _edits_shown(session.log.applied, query)
+            if query.environment is not None:
+                await asyncio.to_thread(context.sessions.references.check, shown[-1])
+            pose = await asyncio.wrap_future(work(lambda: loaded.pose(shown, posed.pose)))
 
         def begin() -> AbstractStill:
             if query.channel == "all":
@@ -249,6 +254,17 @@ async def _make_picture(
         while await asyncio.wrap_future(work(still.work)):
             pass
         return await asyncio.to_thread(_encode, still.picture(), suffix, query), posed.revision
+
+
+def _edits_shown(applied: list[Edit], query: FrameQuery) -> list[Edit]:
+    """Those behind a picture that does not show all of them as they are, or another light: that comes last."""
+    light = [edit for edit in applied if isinstance(edit, EnvironmentEdit)]
+    edits: list[Edit] = [*light] if query.captured else applied
+    if query.environment is None:
+        return edits
+    now = light[-1] if light else EnvironmentEdit(op="environment")
+    other = now.model_copy(update={"file": None if query.environment == CAPTURED_LIGHT else query.environment})
+    return [*(edit for edit in edits if not isinstance(edit, EnvironmentEdit)), other]
 
 
 def _encode(pixels: Pixels | LinearPixels | Layers, suffix: Suffix, query: FrameQuery) -> bytes:

@@ -218,6 +218,8 @@ export const sessionVertices = async (session: string) => new Float32Array(await
 export const capturedPicture = async (session: string, query: string) => (await file(`/api/sessions/${part(session)}/frame.jpg?${query}&captured=true`)).blob();
 
 export type StillFormat = 'png' | 'exr';
+/** What `environment` of a picture calls the asset's own light. */
+export const CAPTURED_LIGHT = 'captured';
 
 export const stillPicture = async (session: string, query: string, format: StillFormat, leaving: AbortSignal) => (await file(`/api/sessions/${part(session)}/frame.${format}?${query}`, leaving)).blob();
 

@@ -22,6 +22,7 @@ import { Inspector } from './inspector/Inspector';
 import { helpOpen, inspectorOpen, libraryOpen, theme } from './layout';
 import { CaptureDialog } from './library/CaptureDialog';
 import { Library, takeFiles } from './library/Library';
+import { LightsDialog } from './LightsDialog';
 import { listenForKeys, titleFor, type Actions } from './shortcuts';
 
 export function App() {
@@ -100,6 +101,7 @@ export function App() {
       <Notices />
       <DropZone />
       <Help />
+      <LightsDialog />
       <CaptureDialog />
     </>
   );

@@ -8,6 +8,7 @@ export const theme = preference<'dark' | 'light'>('theme', matchMedia('(prefers-
 export const libraryOpen = preference<boolean>('libraryOpen', true);
 export const inspectorOpen = preference<boolean>('inspectorOpen', true);
 export const helpOpen = signal(false);
+export const lightsOpen = signal(false);
 
 export type Tab = 'material' | 'light' | 'shape' | 'view' | 'out';
 export const tab = preference<Tab>('tab', 'material');

@@ -10,6 +10,7 @@ import { environments } from '../../session/library';
 import { changeSettings, settings } from '../../session/session';
 import { Choice, Section, Slider } from '../fields';
 import { Icon } from '../icons';
+import { lightsOpen } from '../layout';
 
 export function LightPanel() {
   return (
@@ -72,6 +73,11 @@ function Environment() {
       <Slider label="Rotation" unit="°" value={rotation} min={0} max={360} step={1} onChange={(value) => editLight({ rotation: value })} onReset={rotation ? () => editLight({ rotation: 0 }) : undefined} />
       <Slider label="Intensity" unit="×" value={intensity} min={0} max={4} step={0.01} onChange={(value) => editLight({ intensity: value })} onReset={intensity !== 1 ? () => editLight({ intensity: 1 }) : undefined} />
       <p class="hint">{elevation !== null && 'Elevation is how high the sun stands. '}Alt+drag on the picture turns the light.</p>
+      <div class="buttons">
+        <button title="Four of them beside each other" onClick={() => (lightsOpen.value = true)}>
+          Compare lights
+        </button>
+      </div>
     </Section>
   );
 }

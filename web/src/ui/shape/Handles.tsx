@@ -39,7 +39,7 @@ function Tool({ count }: { count: number }) {
             ? 'Click on the object to put a handle. It stays where it is until you move it.'
             : count === 1
               ? 'Put another one: what is to move, and what is to stay. One alone takes the whole object along.'
-              : 'Drag one: the traced picture follows the hand. White ones stay, orange ones were moved.'
+              : 'Drag one: the picture follows the hand. White ones stay, orange ones were moved.'
         }
       />
       <Slider
