@@ -334,6 +334,9 @@ def export(
         int | None,
         typer.Option(help="The most that a textured mesh (glb, mesh, usdz, usd) has.", show_default=str(DEFAULT_FACES), min=FEWEST_FACES),
     ] = None,
+    variants: Annotated[
+        Path | None, typer.Option(help="Other materials of a GLB: JSON, lists of material edits by name (docs/formats.md).")
+    ] = None,
 ) -> None:
     """Write an asset as a file that other programs read."""
     try:
@@ -342,14 +345,17 @@ def export(
         raise UsageError(str(error)) from error
 
     from drgs.convert.export_asset import export_asset
+    from drgs.convert.material_variants import load_variants
     from drgs.convert.transform_splats import transform_splats
     from drgs.scene.asset import load_asset
 
     if chosen == "sog" or chosen == "compressed":
         refuse_faces(faces, (chosen,))
+        if variants is not None:
+            raise UsageError(f"format {chosen!r} holds no material variants; expected glb or mesh")
         left_out = transform_splats(load_asset(asset), out, chosen)
     else:
-        left_out = export_asset(load_asset(asset), out, chosen, faces)
+        left_out = export_asset(load_asset(asset), out, chosen, faces, None if variants is None else load_variants(variants))
     print(f"Wrote {out}: {out.stat().st_size / 1e6:.1f} MB{', ' if left_out else ''}{left_out}", file=sys.stderr)
 
 

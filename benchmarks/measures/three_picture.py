@@ -38,6 +38,8 @@ class SeenByThree:
     stands: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """How far the file moves the object from where the asset has it [m], y up."""
     without: tuple[Map, ...] = ()
+    variant: str | None = None
+    """Name of the material variant that is shown; None: what the file opens with."""
 
 
 def three_version() -> str:

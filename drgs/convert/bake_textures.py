@@ -10,6 +10,7 @@ Source: glTF 2.0 for what channels mean and for the frame of normals: x along u,
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import igl
@@ -60,25 +61,42 @@ class TexturedMesh:
     """Of unit vectors n in the frame of `tangents` 255 (n + 1) / 2; None where the vertices' normals are all there is."""
     tangents: Float[ndarray, "corner 4"] | None
     """Of the atlas's vertices: unit, along u, and the sign of cross(normal, tangent) against the rows. None with `normal`."""
+    variants: tuple[tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "height width 3"]], ...] = ()
+    """`base_color` and `surface` of each variant."""
 
 
-def bake_textures(mesh: TriangleMesh, most_faces: int = DEFAULT_FACES) -> TexturedMesh:
-    """Textures of a mesh on the CPU, which is shrunk where it has more faces."""
+def bake_textures(mesh: TriangleMesh, most_faces: int = DEFAULT_FACES, variants: Sequence[TriangleMesh] = ()) -> TexturedMesh:
+    """Textures of a mesh on the CPU, which is shrunk where it has more faces.
+
+    Args:
+        variants: the same mesh in other materials.
+    """
     small = shrink_mesh(mesh, most_faces)
     if small is mesh:
         atlas = unwrap(_array(mesh.vertices), _array(mesh.faces))
-        fine_atlas, fine = _finely_divided(atlas, mesh)
-        values = torch.cat([_materials(fine), _openness(fine)[:, None]], -1)
-        picture = paint(fine_atlas, _array(values), _surface_texels)
-        return TexturedMesh(mesh, atlas, picture[..., :3], picture[..., 3:], None, None)
+
+        def picture_at_corners(of: TriangleMesh) -> UInt8[ndarray, "height width 6"]:
+            fine_atlas, fine = _finely_divided(atlas, of)
+            values = torch.cat([_materials(fine), _openness(fine)[:, None]], -1)
+            return paint(fine_atlas, _array(values), _surface_texels)
+
+        picture, *others = (picture_at_corners(of) for of in (mesh, *variants))
+        return TexturedMesh(mesh, atlas, picture[..., :3], picture[..., 3:], None, None, _parts(others))
     texels = max(TEXELS_PER_FACE, TEXELS_PER_VERTEX * len(mesh.vertices) // len(small.faces))
     atlas = unwrap(_array(small.vertices), _array(small.faces), texels)
     tangents = atlas_tangents(atlas, small)
     corners = torch.from_numpy(atlas.vertex_of)
     values = torch.cat([small.vertices[corners], small.normals[corners], torch.from_numpy(tangents)], -1)
-    look = _LargeSurface(mesh)
-    picture = paint(replace(atlas, vertex_of=np.arange(len(atlas.uv))), _array(values), look.texels)
-    return TexturedMesh(small, atlas, picture[..., :3], picture[..., 3:6], picture[..., 6:], tangents)
+    of_corners = replace(atlas, vertex_of=np.arange(len(atlas.uv)))
+    picture, *others = (paint(of_corners, _array(values), _LargeSurface(of).texels) for of in (mesh, *variants))
+    return TexturedMesh(small, atlas, picture[..., :3], picture[..., 3:6], picture[..., 6:], tangents, _parts(others))
+
+
+def _parts(
+    pictures: Sequence[UInt8[ndarray, "height width _"]],
+) -> tuple[tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "height width 3"]], ...]:
+    """Base colour and surface of each."""
+    return tuple((picture[..., :3], picture[..., 3:6]) for picture in pictures)
 
 
 def atlas_tangents(atlas: Atlas, mesh: TriangleMesh) -> Float[ndarray, "corner 4"]:

@@ -15,6 +15,7 @@ Viewers of Gaussians show colours as they stand in the file, so there the linear
 
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,11 +26,12 @@ from torch import Tensor
 
 from drgs.convert.bake_textures import TexturedMesh, bake_textures
 from drgs.convert.gltf_reflectance import BASE_COLOR_MARK, gltf_base_color
+from drgs.convert.material_variants import AS_CAPTURED, Variants, refuse_variants, variant_meshes
 from drgs.convert.page.encode_page import encode_page
 from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, TEXTURED_FORMATS, ExportFormat, refuse_faces
 from drgs.exchange.exr import encode_environment
 from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
-from drgs.exchange.glb import GlbMesh, GlbPoints, encode_glb
+from drgs.exchange.glb import GlbMesh, GlbPoints, GlbVariant, encode_glb
 from drgs.exchange.gltf_splats import GltfSplats, points_from_splats
 from drgs.exchange.pictures import encode_png
 from drgs.exchange.spz import SMALLEST_SCALE, encode_spz
@@ -45,18 +47,19 @@ _UPRIGHT_FROM_WORLD = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=t
 """z up to y up."""
 
 
-def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int | None = None) -> str:
+def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int | None = None, variants: Variants | None = None) -> str:
     """Write one file; an existing one is replaced at once.
 
     Args:
         faces: the most that a textured mesh has; the detail of those left out goes into its textures. None: DEFAULT_FACES.
+        variants: other materials of a GLB's mesh, by KHR_materials_variants; textures are baked for each.
 
     Returns:
         What the file leaves out or shows otherwise, in words; empty where it has all that its format can hold.
 
     Raises:
         ValueError: unknown format, Gaussians asked of an asset that has none, usd-core is missing, no page can be made of it,
-            or a number of faces that is too small or that the format has no use for.
+            a number of faces that is too small or that the format has no use for, or variants that the format cannot hold.
         OSError: the file cannot be written.
     """
     out = Path(out)
@@ -67,6 +70,10 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int
     if format in ("ply", "ply3", "spz") and asset.gaussians is None:
         raise ValueError(f"format {format!r} needs Gaussians, and this asset has only a mesh; export it as glb")
     refuse_faces(faces, (format,))
+    if variants is not None:
+        if format not in ("glb", "mesh"):
+            raise ValueError(f"format {format!r} holds no material variants; expected glb or mesh")
+        refuse_variants(variants)
     if format in ("usd", "usdz"):
         refuse_unwritable(out, for_ar=format == "usdz")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +84,8 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int
     try:
         if format in TEXTURED_FORMATS:
             mesh = on_cpu(asset.mesh)
-            textured = bake_textures(_with_gltf_colors(mesh) if format in ("glb", "mesh") else mesh, faces or DEFAULT_FACES)
+            others = [_with_gltf_colors(on_cpu(one)) for one in variant_meshes(asset, variants or {})]
+            textured = bake_textures(_with_gltf_colors(mesh) if format in ("glb", "mesh") else mesh, faces or DEFAULT_FACES, others)
             kept, all_faces = len(textured.mesh.faces), len(asset.mesh.faces)
             left_out = "" if kept == all_faces else f"{kept} of the mesh's {all_faces} faces, the detail of the others in its textures"
             if format == "usd":
@@ -85,7 +93,7 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int
             elif format == "usdz":
                 write_ar_usdz(temporary, _usd_scene(asset, textured))
             else:
-                temporary.write_bytes(_textured_glb(asset, textured, with_splats=format == "glb"))
+                temporary.write_bytes(_textured_glb(asset, textured, list(variants or ()), with_splats=format == "glb"))
         elif format == "spz":
             splats = _upright_splats(asset)
             wide = int((splats["scales"][:, :2].min(1) < SMALLEST_SCALE).sum())
@@ -116,23 +124,34 @@ def _file_bytes(asset: Asset, format: str) -> bytes:
     return encode_gaussian_ply(arrays, normals, third_scale=format == "ply3", comments=(note,))
 
 
-def _textured_glb(asset: Asset, textured: TexturedMesh, with_splats: bool) -> bytes:
+def _textured_glb(asset: Asset, textured: TexturedMesh, names: Sequence[str], with_splats: bool) -> bytes:
     """
     Args:
+        names: of the variants.
         with_splats: the Gaussians too, where there are some: 260 bytes each.
     """
     mesh, atlas = textured.mesh, textured.atlas
     normals = torch.nn.functional.normalize(mesh.normals, dim=-1)
     attributes = {"POSITION": _array(mesh.vertices)[atlas.vertex_of], "NORMAL": _array(normals)[atlas.vertex_of], "TEXCOORD_0": atlas.uv}
     images = [encode_png(textured.base_color), encode_png(textured.surface)]
-    textures = {"occlusionTexture": {"index": 1}}
+    textures: dict[str, dict] = {}
     if textured.normal is not None and textured.tangents is not None:
         attributes["TANGENT"] = textured.tangents
         textures["normalTexture"] = {"index": len(images)}
         images.append(encode_png(textured.normal))
-    material = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}, "extras": BASE_COLOR_MARK}
+
+    def material(base_color: int, surface: int) -> tuple[dict, dict]:
+        """By the numbers of its images; occlusion depends on the light that a material throws onto itself, normals do not."""
+        factors = {"baseColorTexture": {"index": base_color}, "metallicRoughnessTexture": {"index": surface}, "extras": BASE_COLOR_MARK}
+        return factors, {"occlusionTexture": {"index": surface}, **textures}
+
+    others = []
+    for name, (base_color, surface) in zip(names, textured.variants, strict=True):
+        others.append(GlbVariant(name, *material(len(images), len(images) + 1)))
+        images += [encode_png(base_color), encode_png(surface)]
     points = _splat_points(asset.gaussians) if with_splats and asset.gaussians is not None and len(asset.gaussians.centers) else None
-    return encode_glb(GlbMesh(attributes, atlas.faces, material, textures, tuple(images)), asset.meters_per_unit, points)
+    glb = GlbMesh(attributes, atlas.faces, *material(0, 1), tuple(images), AS_CAPTURED if others else "object", tuple(others))
+    return encode_glb(glb, asset.meters_per_unit, points)
 
 
 def _with_gltf_colors(mesh: TriangleMesh) -> TriangleMesh:

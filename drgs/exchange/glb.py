@@ -21,6 +21,7 @@ _POINTS = 0
 """Mode of a primitive."""
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 MAX_VERTICES = 20_000_000
+VARIANTS = "KHR_materials_variants"
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,20 @@ class GlbMesh:
     """What else the material reads: glTF `occlusionTexture`, `normalTexture`."""
     images: tuple[bytes, ...] = ()
     """PNG files."""
+    name: str = "object"
+    """Of the material; with variants, of the one that a file opens with."""
+    variants: tuple["GlbVariant", ...] = ()
+    """Other materials of the same mesh, by KHR_materials_variants."""
+
+
+@dataclass(frozen=True)
+class GlbVariant:
+    """Another material."""
+
+    name: str
+    material: dict
+    """As GlbMesh has it."""
+    textures: dict
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,18 +102,24 @@ def encode_glb(mesh: GlbMesh, meters_per_unit: float = 1.0, points: GlbPoints | 
     s = meters_per_unit
     # Columns of (x, y, z) -> s (x, z, -y): z up to y up, world units to metres.
     matrix = [s, 0, 0, 0, 0, 0, -s, 0, 0, s, 0, 0, 0, 0, 0, 1]
+    worn = (GlbVariant(mesh.name, mesh.material, mesh.textures), *mesh.variants)
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "drgs"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "object", "mesh": 0, "matrix": matrix}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": len(accessors) - 1, "material": 0}]}],
-        "materials": [{"name": "object", "pbrMetallicRoughness": mesh.material, **mesh.textures, "doubleSided": False}],
+        "materials": [{"name": one.name, "pbrMetallicRoughness": one.material, **one.textures, "doubleSided": False} for one in worn],
         "accessors": accessors,
     }
+    if mesh.variants:
+        names = [{"name": one.name} for one in worn]
+        document |= {"extensionsUsed": [VARIANTS], "extensions": {VARIANTS: {"variants": names}}}
+        mappings = [{"material": k, "variants": [k]} for k in range(len(names))]
+        document["meshes"][0]["primitives"][0]["extensions"] = {VARIANTS: {"mappings": mappings}}
     if points is not None:
         named = {key: add_attribute(key, values) for key, values in points.attributes.items()}
-        document["extensionsUsed"] = sorted(points.extensions)
+        document["extensionsUsed"] = sorted({*document.get("extensionsUsed", ()), *points.extensions})
         document["scenes"] = [{"name": "mesh", "nodes": [0]}, {"name": points.name, "nodes": [1]}]
         document["nodes"].append({"name": points.name, "mesh": 1, "matrix": matrix})
         primitive = {"mode": _POINTS, "attributes": named, "extensions": points.extensions}
@@ -116,7 +137,7 @@ def encode_glb(mesh: GlbMesh, meters_per_unit: float = 1.0, points: GlbPoints | 
 
 
 def decode_glb(data: bytes, name: str = "GLB") -> GlbMesh:
-    """The mesh of a file that `encode_glb` wrote (neither images nor points are read back).
+    """The mesh of a file that `encode_glb` wrote (neither images, points nor variants are read back).
 
     Raises:
         ValueError: not such a file, or damaged.

@@ -20,12 +20,13 @@ from drgs.convert.export_asset import display_sh, export_asset
 from drgs.convert.import_splats import import_splats
 from drgs.exchange import texture_atlas
 from drgs.exchange.gaussian_ply import decode_gaussian_ply
-from drgs.exchange.glb import GlbMesh, encode_glb
+from drgs.exchange.glb import VARIANTS, GlbMesh, encode_glb
 from drgs.exchange.gltf_splats import EXTENSION
 from drgs.exchange.ply import encode_ply, parse_ply
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.scene.asset import Asset, save_asset
+from drgs.scene.edits import parse_edits
 from tests.convert.test_export_asset import ball_asset
 from tests.exchange.write_splats import flat_splats, glb_with_splats, splats_of, with_document
 from tests.patience import PATIENCE_SECONDS
@@ -85,6 +86,19 @@ def test_the_gltf_validator_finds_no_fault_in_an_exported_glb(run_node, tmp_path
     assert len(refused) == 19 and all(name.startswith(f"{EXTENSION}:") for name in refused), (
         "names with a prefix, which it does not know yet"
     )
+
+
+def test_the_gltf_validator_knows_variants_and_finds_no_fault_in_them(run_node, tmp_path):
+    gold = parse_edits([{"op": "material", "select": {"all": True}, "set": {"metallic": 1.0}}])
+    export_asset(ball_asset(), tmp_path / "whole.glb", "mesh", faces=300, variants={"Gold": gold, "Plain": []})
+    whole = (tmp_path / "whole.glb").read_bytes()
+
+    def points_nowhere(document: dict) -> None:
+        document["meshes"][0]["primitives"][0]["extensions"][VARIANTS]["mappings"][1]["material"] = 9
+
+    said = findings(run_node, tmp_path, whole=whole, points_nowhere=with_document(whole, points_nowhere))
+    assert said["whole"] == []
+    assert "UNRESOLVED_REFERENCE" in {message["code"] for message in said["points_nowhere"]}
 
 
 def name_splats_as_ours(document: dict) -> None:

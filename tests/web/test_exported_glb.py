@@ -12,7 +12,9 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from benchmarks.measures.three_picture import SeenByThree, three_picture
+from drgs.convert.bake_edits import bake_edits
 from drgs.convert.export_asset import export_asset
+from drgs.convert.material_variants import AS_CAPTURED
 from drgs.deform.pose_scene import pose_scene
 from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
@@ -75,6 +77,28 @@ def test_waves_that_faces_were_too_few_for_are_seen_in_three(browser: Browser, t
     difference = np.abs(a - b)[inside][:, :3].mean()
     print(f"waves: mean difference {difference:.2f} of 255")
     assert difference < WAVES_DIFFERENCE
+
+
+@pytest.mark.slow
+def test_three_shows_each_variant_as_an_asset_that_wears_it(browser: Browser, tmp_path: Path) -> None:
+    asset, path = wavy_ball(), tmp_path / "ball.glb"
+    gold = parse_edits(
+        [{"op": "material", "select": {"all": True}, "set": {"albedo": [1.0, 0.77, 0.34], "metallic": 1.0, "roughness": 0.3}}]
+    )
+    export_asset(asset, path, "mesh", faces=1000, variants={"Gold": gold})
+    export_asset(bake_edits(asset, gold, tmp_path, 2), tmp_path / "gold.glb", "mesh", faces=1000)
+    view = start_view((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).tolist()
+    light = (ROOT / "examples" / "environments" / "studio.exr").read_bytes()
+
+    def seen(file: Path, variant: str | None) -> np.ndarray:
+        told = SeenByThree(view, FOV_Y_DEGREES, SIDE, SIDE, variant=variant)
+        return three_picture(browser, file.read_bytes(), ".glb", light, told).astype(float)
+
+    opened, captured, worn = seen(path, None), seen(path, AS_CAPTURED), seen(path, "Gold")
+    np.testing.assert_array_equal(opened, captured)
+    np.testing.assert_array_equal(worn, seen(tmp_path / "gold.glb", None))
+    inside = opened[..., 3] > 254
+    assert np.abs(worn - opened)[inside][:, :3].mean() > 20
 
 
 def wavy_ball() -> Asset:
