@@ -3,11 +3,13 @@
     python -m benchmarks page ASSET [--turn-seconds 6] [--size 800x600] [--out FOLDER] [--json]
 
 bytes, faces, export_s: of the file. fps: pictures a second while the object turns by itself in Chromium with software GL; sharpness: pixels that
-it draws then for each of the screen's, one way (1: all of them); detail: the mesh that it draws then, 0 the fine one, 1 the coarse. difference: mean over pixels and channels [of 255] where the object covers
+it draws then for each of the screen's, one way (1: all of them); detail: the mesh that it draws then, 0 the fine one, 1 the coarse. orbit_fps: likewise while a hand drags the view round; relit: mean change of the picture [of 255] when
+the light is turned by a third with its slider; requests: what the page asked for beside itself, opened from a file without a network. difference: mean over pixels and channels [of 255] where the object covers
 pixels wholly, between the page and `drgs render` (256 rays a pixel, four bounces) under the recovered light, from the page's first camera.
 """
 
 import argparse
+import io
 import json
 import tempfile
 import time
@@ -62,20 +64,25 @@ def measure(asset: Asset, out: Path, width: int, height: int, turn_seconds: floa
     seconds = time.perf_counter() - start
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium_path(), args=list(CHROMIUM_ARGUMENTS))
-        page = browser.new_page(viewport={"width": width, "height": height})
+        context = browser.new_context(offline=True, viewport={"width": width, "height": height})
+        page, asked = context.new_page(), []
+        page.on("request", lambda request: asked.append(request.url))
         page.goto((out / "page.html").as_uri())
         page.get_by_role("switch", name="Show the light").uncheck()
         page.get_by_role("button", name="Light and material").click()
         page.wait_for_timeout(SETTLING_MS)
         page.screenshot(path=out / "page.png")
         camera = camera_of(page, width, height)
-        rate = turning_rate(page, turn_seconds)
+        relit = light_change(page)
+        rate = turning_rate(page, turn_seconds) | {"orbit_fps": orbiting_rate(page, width, height, turn_seconds)}
         browser.close()
     return {
         "bytes": len(made.html),
         "faces": made.faces,
         "export_s": round(seconds, 1),
         **rate,
+        "relit": round(relit, 1),
+        "requests": len([url for url in asked if not url.startswith(("file:", "data:", "blob:"))]),
         "difference": round(difference(asset, camera, out), 2),
     }
 
@@ -101,6 +108,34 @@ def turning_rate(page: Page, seconds: float) -> dict[str, float]:
         "sharpness": float(stage.get_attribute("data-sharpness") or 0),
         "detail": int(stage.get_attribute("data-detail") or 0),
     }
+
+
+def orbiting_rate(page: Page, width: int, height: int, seconds: float) -> float:
+    """Pictures a second while the view is dragged to and fro; the object stands still by itself then."""
+    stage = page.locator(".stage")
+    page.get_by_role("button", name="Turn by itself").click()
+    page.mouse.move(width / 3, height / 2)
+    page.mouse.down()
+    first, start, step = int(stage.get_attribute("data-pictures") or 0), time.perf_counter(), 0
+    while (elapsed := time.perf_counter() - start) < seconds:
+        step += 1
+        page.mouse.move(width / 3 + (step % 100 if step % 200 < 100 else 100 - step % 100), height / 2)
+    count = int(stage.get_attribute("data-pictures") or 0) - first
+    page.mouse.up()
+    return round(count / elapsed, 1)
+
+
+def light_change(page: Page) -> float:
+    """Mean difference [of 255] between the picture and that under the light turned by a third; the light is as before afterwards."""
+    panel, slider = page.get_by_role("button", name="Light and material"), page.locator("#slider-turn")
+    pictures = []
+    for degrees in ("0", "120", "0"):
+        panel.click()
+        slider.fill(degrees)
+        panel.click()
+        page.wait_for_timeout(SETTLING_MS)
+        pictures.append(np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float))
+    return float(np.abs(pictures[1] - pictures[0]).mean())
 
 
 def difference(asset: Asset, camera: Camera, out: Path) -> float:
