@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drgs.convert.bake_textures import TexturedMesh, bake_textures
-from drgs.convert.gltf_reflectance import BASE_COLOR_MARK, gltf_base_color
+from drgs.convert.gltf_reflectance import BASE_COLOR_MARK, gltf_base_color, usd_base_color
 from drgs.convert.material_variants import AS_CAPTURED, Variants, refuse_variants, variant_meshes
 from drgs.convert.page.encode_page import encode_page
 from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, TEXTURED_FORMATS, ExportFormat, refuse_faces
@@ -84,8 +84,9 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int
     try:
         if format in TEXTURED_FORMATS:
             mesh = on_cpu(asset.mesh)
-            others = [_with_gltf_colors(on_cpu(one)) for one in variant_meshes(asset, variants or {})]
-            textured = bake_textures(_with_gltf_colors(mesh) if format in ("glb", "mesh") else mesh, faces or DEFAULT_FACES, others)
+            colored = _with_gltf_colors if format in ("glb", "mesh") else _with_usd_colors
+            others = [colored(on_cpu(one)) for one in variant_meshes(asset, variants or {})]
+            textured = bake_textures(colored(mesh), faces or DEFAULT_FACES, others)
             kept, all_faces = len(textured.mesh.faces), len(asset.mesh.faces)
             left_out = "" if kept == all_faces else f"{kept} of the mesh's {all_faces} faces, the detail of the others in its textures"
             if format == "usd":
@@ -156,6 +157,10 @@ def _textured_glb(asset: Asset, textured: TexturedMesh, names: Sequence[str], wi
 
 def _with_gltf_colors(mesh: TriangleMesh) -> TriangleMesh:
     return replace(mesh, albedo=gltf_base_color(mesh.albedo, mesh.roughness, mesh.metallic))
+
+
+def _with_usd_colors(mesh: TriangleMesh) -> TriangleMesh:
+    return replace(mesh, albedo=usd_base_color(mesh.albedo, mesh.metallic))
 
 
 def _usd_scene(asset: Asset, textured: TexturedMesh) -> UsdScene:

@@ -1,8 +1,10 @@
-"""Base colours for glTF's BRDF: a file shall send back as much light as the object does.
+"""Base colours for the BRDFs of glTF and USD: a file shall send back as much light as the object does.
 
 Of one albedo, glTF's BRDF makes less than ours (drgs/maths/brdf.py): light gets into a dielectric only where its surface did not reflect it. And of
 a rough metal more: three.js, Filament and Blender add the light that meets the surface twice. So a file gets the base colour that sends back as
 much of an even light as our albedo does, in the mean over views; one that we wrote is marked, and read back the other way round.
+UsdPreviewSurface names no formula. That of OpenUSD's own renderer (Storm, previewSurface.glslfx) takes from a dielectric's inside what its surface reflects,
+as glTF does, and adds nothing twice; so dielectrics are made lighter for it, and metals keep their albedo.
 Source: glTF 2.0, appendix B; Fdez-Aguera 2019 (docs/sources.md: fdezaguera2019), as three.js' standard material has it.
 """
 
@@ -19,6 +21,8 @@ BASE_COLOR_MARK = {"drgs": {"base_color_for": "gltf"}}
 """`extras` of the `pbrMetallicRoughness` whose base colour was made here."""
 MEAN_FRESNEL = 1 / 21
 """Mean of (1 - cosine)^5 over cosine-weighted directions: what F0 lacks to its mean over directions, of what it lacks to 1."""
+MEAN_HALF_FRESNEL = 0.00369
+"""The same of (1 - cosine)^5 between a view and the half vector, over views and lights."""
 HALVINGS = 20
 """Of the interval that a colour is looked for in: to a millionth."""
 
@@ -29,6 +33,12 @@ def gltf_base_color(
     """Linear; 1 where no base colour sends back as much as the albedo."""
     factors, metal = mean_factors(roughness), metallic[:, None]
     return _solved(our_share(albedo, factors, metal), lambda base: gltf_share(base, factors, metal))
+
+
+def usd_base_color(albedo: Float[Tensor, "point 3"], metallic: Float[Tensor, "point"]) -> Float[Tensor, "point 3"]:
+    """Linear; 1 where no base colour sends back as much as the albedo."""
+    inside = (1 - F0) * (1 - MEAN_HALF_FRESNEL)
+    return (albedo / (inside + (1 - inside) * metallic[:, None])).clamp(max=1)
 
 
 def albedo_from_gltf(

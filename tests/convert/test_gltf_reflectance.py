@@ -12,6 +12,7 @@ from drgs.convert.gltf_reflectance import (
     gltf_even_share,
     mean_factors,
     scattered,
+    usd_base_color,
 )
 from drgs.maths.brdf import evaluate_brdf
 from drgs.maths.constants import F0
@@ -52,6 +53,34 @@ def test_the_base_color_sends_back_as_much_of_an_even_light_as_our_brdf(albedo, 
     once, _ = scattered(F0 * (1 - metallic) + base * metallic, factors)
     found = once + gltf_even_share(base, factors, given[2][:, None])
     assert abs(float(found[0, 0]) - total) < 0.01 * total
+
+
+@pytest.mark.parametrize(("albedo", "roughness"), [(0.5, 0.6), (0.2, 0.3), (0.9, 0.9)])
+def test_the_base_color_of_usd_sends_back_what_our_albedo_does_by_the_formula_of_its_own_renderer(albedo, roughness):
+    """By quadrature over lights and views, with our distribution and shadowing of facets for both."""
+    light = sphere_lattice(20_000).double()
+    light = light[light[:, 2] > 0]
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(light)
+    cosines = (torch.arange(24, dtype=torch.float64) + 0.5) / 24
+    base = float(usd_base_color(torch.full((1, 3), albedo), torch.zeros(1))[0, 0])
+    ours = theirs = 0.0
+    for cosine in cosines.tolist():
+        view = torch.tensor([math.sqrt(1 - cosine * cosine), 0.0, cosine], dtype=torch.float64).expand_as(light)
+        met = (1 - (view * torch.nn.functional.normalize(view + light, dim=-1)).sum(-1)) ** 5
+        rough = torch.full_like(light[:, 0], roughness)
+        diffuse, specular = evaluate_brdf(light, view, up, torch.full_like(light, albedo), rough, torch.zeros_like(rough))
+        inside = base * (1 - (F0 + (1 - F0) * met)) / math.pi
+        share = 2 * math.pi / len(light) * cosine / float(cosines.sum())
+        ours += float(((diffuse + specular)[:, 0] * light[:, 2]).sum()) * share
+        theirs += float(((inside + specular[:, 0]) * light[:, 2]).sum()) * share
+    assert theirs == pytest.approx(ours, rel=0.003) and base > 1.04 * albedo
+
+
+def test_metals_keep_their_albedo_in_usd_and_no_base_color_is_above_one():
+    albedo, _, metallic = colours(1000)
+    assert torch.allclose(usd_base_color(albedo, torch.ones(1000)), albedo)
+    base = usd_base_color(albedo, metallic)
+    assert (base >= albedo - 1e-6).all() and base.max() <= 1
 
 
 def test_what_is_read_back_is_the_albedo_where_a_base_color_reached_it():

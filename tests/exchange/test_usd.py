@@ -11,10 +11,12 @@ import torch
 from PIL import Image
 
 from drgs.convert.export_asset import display_sh, export_asset
+from drgs.convert.gltf_reflectance import usd_base_color
 from drgs.exchange.exr import decode_environment
 from drgs.exchange.gaussian_ply import FLAT_ENOUGH
 from drgs.exchange.usd import BASE_COLOR, ENVIRONMENT, SURFACE
 from drgs.maths.color import srgb_from_linear
+from drgs.scene.asset import Asset
 from drgs.scene.environment import uv_from_direction
 from tests.convert.test_export_asset import ball_asset
 
@@ -119,6 +121,11 @@ def test_the_object_for_ar_stands_on_the_ground_in_metres(folder):
     assert np.allclose([shown.GetMin(), shown.GetMax()], [[-0.5, 0, -0.5], [0.5, 1, 0.5]], atol=1e-3)
 
 
+def base_colors(asset: Asset) -> torch.Tensor:
+    """As UsdPreviewSurface wants them."""
+    return usd_base_color(asset.mesh.albedo, asset.mesh.metallic)
+
+
 def test_the_textures_are_bound_with_their_colour_spaces_and_hold_the_materials(folder):
     from pxr import UsdGeom, UsdShade
 
@@ -147,7 +154,7 @@ def test_the_textures_are_bound_with_their_colour_spaces_and_hold_the_materials(
             reader: np.asarray(Image.open(io.BytesIO(picture(stage, reader)))) for reader in ("base_color", "occlusion_roughness_metallic")
         }
         faces = asset.mesh.faces.long()
-        colors = srgb_from_linear(asset.mesh.albedo)[faces].reshape(-1, 3).numpy()
+        colors = srgb_from_linear(base_colors(asset))[faces].reshape(-1, 3).numpy()
         others = torch.stack([asset.mesh.roughness, asset.mesh.metallic], -1)[faces].reshape(-1, 2).numpy()
         assert np.abs(lookup(pictures["base_color"], corners) - colors).max() < 0.05
         found = lookup(pictures["occlusion_roughness_metallic"], corners)
@@ -184,7 +191,7 @@ def test_the_scene_keeps_world_units_the_mesh_and_its_materials_at_vertices(fold
     assert np.array_equal(np.array(surface.GetPointsAttr().Get()), asset.mesh.vertices.numpy())
     primvars = UsdGeom.PrimvarsAPI(surface)
     for name, given in {
-        "displayColor": asset.mesh.albedo,
+        "displayColor": base_colors(asset),
         "drgs:roughness": asset.mesh.roughness,
         "drgs:metallic": asset.mesh.metallic,
     }.items():
