@@ -26,9 +26,9 @@ from torch import Tensor
 
 from drgs.convert.bake_textures import TexturedMesh, bake_textures
 from drgs.convert.gltf_reflectance import BASE_COLOR_MARK, gltf_base_color, usd_base_color
-from drgs.convert.material_variants import AS_CAPTURED, Variants, refuse_variants, variant_meshes
+from drgs.convert.material_variants import Variants, refuse_variants, variant_meshes
 from drgs.convert.page.encode_page import encode_page
-from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, TEXTURED_FORMATS, ExportFormat, refuse_faces
+from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, TEXTURED_FORMATS, VARIANT_FORMATS, ExportFormat, refuse_faces
 from drgs.exchange.exr import encode_environment
 from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
 from drgs.exchange.glb import GlbMesh, GlbPoints, GlbVariant, encode_glb
@@ -40,6 +40,7 @@ from drgs.maths.color import srgb_from_linear
 from drgs.maths.frames import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from drgs.maths.spherical_harmonics import map_radiance, rotate_sh
 from drgs.scene.asset import Asset
+from drgs.scene.edits import AS_CAPTURED
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh, on_cpu
 
@@ -47,12 +48,20 @@ _UPRIGHT_FROM_WORLD = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=t
 """z up to y up."""
 
 
-def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int | None = None, variants: Variants | None = None) -> str:
+def export_asset(
+    asset: Asset,
+    out: Path | str,
+    format: ExportFormat,
+    faces: int | None = None,
+    variants: Variants | None = None,
+    shown: str = AS_CAPTURED,
+) -> str:
     """Write one file; an existing one is replaced at once.
 
     Args:
         faces: the most that a textured mesh has; the detail of those left out goes into its textures. None: DEFAULT_FACES.
         variants: other materials of a GLB's mesh, by KHR_materials_variants; textures are baked for each.
+        shown: what a file with variants calls the asset as it is.
 
     Returns:
         What the file leaves out or shows otherwise, in words; empty where it has all that its format can hold.
@@ -71,8 +80,8 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int
         raise ValueError(f"format {format!r} needs Gaussians, and this asset has only a mesh; export it as glb")
     refuse_faces(faces, (format,))
     if variants is not None:
-        if format not in ("glb", "mesh"):
-            raise ValueError(f"format {format!r} holds no material variants; expected glb or mesh")
+        if format not in VARIANT_FORMATS:
+            raise ValueError(f"format {format!r} holds no material variants; expected {' or '.join(VARIANT_FORMATS)}")
         refuse_variants(variants)
     if format in ("usd", "usdz"):
         refuse_unwritable(out, for_ar=format == "usdz")
@@ -94,7 +103,7 @@ def export_asset(asset: Asset, out: Path | str, format: ExportFormat, faces: int
             elif format == "usdz":
                 write_ar_usdz(temporary, _usd_scene(asset, textured))
             else:
-                temporary.write_bytes(_textured_glb(asset, textured, list(variants or ()), with_splats=format == "glb"))
+                temporary.write_bytes(_textured_glb(asset, textured, [shown, *(variants or ())], with_splats=format == "glb"))
         elif format == "spz":
             splats = _upright_splats(asset)
             wide = int((splats["scales"][:, :2].min(1) < SMALLEST_SCALE).sum())
@@ -128,7 +137,7 @@ def _file_bytes(asset: Asset, format: str) -> bytes:
 def _textured_glb(asset: Asset, textured: TexturedMesh, names: Sequence[str], with_splats: bool) -> bytes:
     """
     Args:
-        names: of the variants.
+        names: of the asset as it is, then of the variants.
         with_splats: the Gaussians too, where there are some: 260 bytes each.
     """
     mesh, atlas = textured.mesh, textured.atlas
@@ -147,11 +156,11 @@ def _textured_glb(asset: Asset, textured: TexturedMesh, names: Sequence[str], wi
         return factors, {"occlusionTexture": {"index": surface}, **textures}
 
     others = []
-    for name, (base_color, surface) in zip(names, textured.variants, strict=True):
+    for name, (base_color, surface) in zip(names[1:], textured.variants, strict=True):
         others.append(GlbVariant(name, *material(len(images), len(images) + 1)))
         images += [encode_png(base_color), encode_png(surface)]
     points = _splat_points(asset.gaussians) if with_splats and asset.gaussians is not None and len(asset.gaussians.centers) else None
-    glb = GlbMesh(attributes, atlas.faces, *material(0, 1), tuple(images), AS_CAPTURED if others else "object", tuple(others))
+    glb = GlbMesh(attributes, atlas.faces, *material(0, 1), tuple(images), names[0] if others else "object", tuple(others))
     return encode_glb(glb, asset.meters_per_unit, points)
 
 

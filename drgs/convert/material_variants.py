@@ -5,22 +5,20 @@ A file of variants is a JSON object: {"Gold": [{"op": "material", ...}], "Matt":
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from drgs.deform.pose_scene import pose_scene
 from drgs.scene.asset import Asset
-from drgs.scene.edits import Edit, MaterialEdit, parse_edits
+from drgs.scene.edits import AS_CAPTURED, AS_SHOWN, LONGEST_VARIANT_NAME, Edit, MaterialEdit, parse_edits
 from drgs.scene.mesh import TriangleMesh
+from drgs.scene.variants import MOST_VARIANTS
 
-Variants = Mapping[str, Sequence[Edit]]
-MOST_VARIANTS = 32
-"""Each has textures of its own."""
-LONGEST_NAME = 100
-AS_CAPTURED = "As captured"
-"""What a file calls the asset without any of them."""
+Variants = Mapping[str, Sequence[Edit] | TriangleMesh]
+"""Material edits by name, or what they make of the mesh."""
 
 
-def load_variants(path: Path) -> Variants:
+def load_variants(path: Path) -> dict[str, list[Edit]]:
     """Read a file of variants.
 
     Raises:
@@ -48,10 +46,12 @@ def refuse_variants(variants: Variants) -> None:
     if not 1 <= len(variants) <= MOST_VARIANTS:
         raise ValueError(f"found {len(variants)} variants; expected 1 to {MOST_VARIANTS}")
     for name, edits in variants.items():
-        if not name.strip() or len(name) > LONGEST_NAME or name == AS_CAPTURED:
+        if not name.strip() or len(name) > LONGEST_VARIANT_NAME or name in (AS_CAPTURED, AS_SHOWN):
             raise ValueError(
-                f"a variant is called {name[:LONGEST_NAME]!r}; expected 1 to {LONGEST_NAME} characters, other than {AS_CAPTURED!r}"
+                f"a variant is called {name[:LONGEST_VARIANT_NAME]!r}; expected 1 to {LONGEST_VARIANT_NAME} characters, other than {AS_CAPTURED!r} and {AS_SHOWN!r}"
             )
+        if isinstance(edits, TriangleMesh):
+            continue
         other = next((edit.op for edit in edits if not isinstance(edit, MaterialEdit)), None)
         if other is not None:
             raise ValueError(
@@ -65,4 +65,23 @@ def variant_meshes(asset: Asset, variants: Variants) -> list[TriangleMesh]:
     Raises:
         ValueError: an edit that does not fit this asset.
     """
-    return [pose_scene(asset, edits).mesh for edits in variants.values()]
+    return [worn if isinstance(worn, TriangleMesh) else pose_scene(asset, worn).mesh for worn in variants.values()]
+
+
+def worn_meshes(asset: Asset, shape: TriangleMesh, variants: Mapping[str, Sequence[Edit]], files: Path) -> dict[str, TriangleMesh]:
+    """A mesh in the materials of each variant.
+
+    Args:
+        asset: what the variants are of.
+        shape: its mesh, perhaps moved by other edits.
+        files: the folder that edits name files in, and lead out of nowhere.
+
+    Raises:
+        ValueError: an edit that does not fit this asset, or a file that is missing or damaged.
+    """
+
+    def worn(edits: Sequence[Edit]) -> TriangleMesh:
+        mesh = pose_scene(asset, edits, files, confine=True).mesh
+        return replace(shape, albedo=mesh.albedo, roughness=mesh.roughness, metallic=mesh.metallic)
+
+    return {name: worn(edits) for name, edits in variants.items()}

@@ -25,6 +25,7 @@ from drgs.scene.edits import (
     PoseEdit,
     SimulateEdit,
     UnreadableEdit,
+    VariantEdit,
     shared_beginning,
     split_rig_clip,
 )
@@ -151,6 +152,8 @@ class _SortedList:
             self.sums.append(last._replace(light=Light(edit.rotation, edit.intensity, named)))
         elif isinstance(edit, MatterEdit):
             parse_simulation_scene(edit.scene)  # refused here, not when somebody simulates
+            self.sums.append(last)
+        elif isinstance(edit, VariantEdit):
             self.sums.append(last)
         else:
             word = _word(edit, files)

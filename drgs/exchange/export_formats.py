@@ -87,6 +87,8 @@ SPLAT_KINDS: dict[SplatFormat, FileKind] = {
     ),
 }
 """By splat-transform, where it is installed."""
+VARIANT_FORMATS: tuple[ExportFormat, ...] = ("glb", "mesh")
+"""They hold other materials of the same mesh."""
 TEXTURED_FORMATS: tuple[ExportFormat, ...] = tuple(name for name in EXPORT_FORMATS if FILE_KINDS[name].textured)
 
 

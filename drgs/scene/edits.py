@@ -14,6 +14,9 @@ SMALLEST = 1e-12
 """Of what is divided by."""
 MAX_INTENSITY = 1e6
 MAX_SECONDS = 1e6
+LONGEST_VARIANT_NAME = 100
+AS_CAPTURED, AS_SHOWN = "As captured", "As shown"
+"""What files call the asset without any of its variants: as it is, or with material edits."""
 
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -252,6 +255,28 @@ class MatterEdit(_Plain):
     """As of a simulate edit."""
 
 
+class MaterialVariant(_Plain):
+    """What the object may be made of, by a name."""
+
+    name: Annotated[str, Field(min_length=1, max_length=LONGEST_VARIANT_NAME)]
+    edits: Annotated[list[MaterialEdit], Field(max_length=1000)]
+    """They apply to the asset as it is, in the place of other material edits."""
+
+    @model_validator(mode="after")
+    def _has_a_name(self) -> "MaterialVariant":
+        if self.name != self.name.strip() or not self.name.isprintable() or "/" in self.name or self.name in (AS_CAPTURED, AS_SHOWN):
+            raise ValueError(
+                f"a variant is called {self.name!r}; expected one line without slashes or blanks at its ends, other than {AS_CAPTURED!r} and {AS_SHOWN!r}"
+            )
+        return self
+
+
+class VariantEdit(MaterialVariant):
+    """Keeps a variant with the session. It changes nothing by itself; of two with one name the later counts."""
+
+    op: Literal["variant"]
+
+
 class UnreadableEdit(_Plain):
     """Stands where an edit was kept that this version does not read, so that those around it keep their places. It never applies."""
 
@@ -261,7 +286,8 @@ class UnreadableEdit(_Plain):
 
 
 Edit = Annotated[
-    MaterialEdit | EnvironmentEdit | DeformEdit | PoseEdit | SimulateEdit | MatterEdit | UnreadableEdit, Field(discriminator="op")
+    MaterialEdit | EnvironmentEdit | DeformEdit | PoseEdit | SimulateEdit | MatterEdit | VariantEdit | UnreadableEdit,
+    Field(discriminator="op"),
 ]
 _edits = TypeAdapter(list[Edit])
 

@@ -17,7 +17,16 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.staticfiles import StaticFiles
 
 from drgs import __version__
-from drgs_server.api import routes_assets, routes_captures, routes_jobs, routes_sessions, routes_uploads, routes_views, routes_weights
+from drgs_server.api import (
+    routes_assets,
+    routes_captures,
+    routes_jobs,
+    routes_sessions,
+    routes_uploads,
+    routes_variants,
+    routes_views,
+    routes_weights,
+)
 from drgs_server.api.body_limit import BodyLimit
 from drgs_server.api.context import ServerContext
 from drgs_server.api.docs_page import docs_page
@@ -53,6 +62,17 @@ BACKUP_SECONDS = 3600.0
 """Between two copies of the databases."""
 RETURN_SECONDS = 2.0
 """Between two times that freed memory is given back."""
+_ROUTES = (
+    routes_uploads,
+    routes_captures,
+    routes_jobs,
+    routes_assets,
+    routes_views,
+    routes_sessions,
+    routes_variants,
+    routes_weights,
+    stream,
+)
 VIEWER = Path(__file__).parent / "static"
 
 
@@ -115,7 +135,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     derive = app.openapi
     app.openapi = cache(lambda: complete_document(deepcopy(derive())))  # type: ignore[method-assign]
     add_problem_handlers(app, directory.told)
-    for routes in (routes_uploads, routes_captures, routes_jobs, routes_assets, routes_views, routes_sessions, routes_weights, stream):
+    for routes in _ROUTES:
         app.include_router(routes.router)
     _add_small_routes(app, context)
     _add_pages(app, settings)

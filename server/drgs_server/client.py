@@ -44,6 +44,7 @@ from drgs_server.api.rest_records import (
 )
 from drgs_server.client_stream import ServerError, Stream
 from drgs_server.client_upload import as_zip, send_in_parts, server_error
+from drgs_server.client_variants import SessionVariants
 from drgs_server.live.messages import EditLog, Settings
 from drgs_server.picture import Picture
 from drgs_worker.jobs.requests import BindingName, ExportRequest, LightName, PoseRequest, RedecoupleRequest, RenderRequest, SimulateRequest
@@ -315,6 +316,7 @@ class RemoteSession:
         self._client = client
         self.id = info.id
         self.asset_id = info.asset
+        self.variants = SessionVariants(client._call, info.id)
 
     def info(self) -> SessionInfo:
         return self._client._call("GET", f"/api/sessions/{self.id}", SessionInfo)

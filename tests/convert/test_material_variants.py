@@ -11,9 +11,10 @@ from test_export_asset import ball_asset
 from drgs.convert.bake_edits import bake_edits
 from drgs.convert.export_asset import export_asset
 from drgs.convert.import_mesh import import_mesh
-from drgs.convert.material_variants import AS_CAPTURED, load_variants
+from drgs.convert.material_variants import load_variants, worn_meshes
+from drgs.deform.pose_scene import pose_scene
 from drgs.exchange.glb import VARIANTS, decode_glb
-from drgs.scene.edits import parse_edits
+from drgs.scene.edits import AS_CAPTURED, parse_edits
 
 GOLD = [{"op": "material", "select": {"all": True}, "set": {"albedo": [1.0, 0.77, 0.34], "metallic": 1.0, "roughness": 0.2}}]
 DARK = [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.3, 0.3, 0.3]}, "mode": "multiply"}]
@@ -91,3 +92,15 @@ def test_a_file_that_is_none_is_refused_with_a_sentence(tmp_path: Path, text: st
 def test_formats_that_hold_none_refuse_them(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="expected glb or mesh"):
         export_asset(ball_asset(), tmp_path / "a.ply", "ply", variants={"Gold": parse_edits(GOLD)})
+
+
+def test_a_moved_mesh_in_a_variant_is_that_of_an_asset_that_wears_it_and_was_moved(tmp_path: Path) -> None:
+    asset = ball_asset()
+    twist = parse_edits([{"op": "deform", "map": {"type": "twist", "rate": 0.7}}])
+    cap = {"select": {"sphere": {"center": [0, 0, 2], "radius": 1.2, "falloff": 0.1}}}
+    capped = parse_edits([GOLD[0] | cap])
+    made = bake_edits(asset, [*parse_edits(DARK), *twist], tmp_path, 2)
+    worn, wanted = worn_meshes(asset, made.mesh, {"Cap": capped}, tmp_path)["Cap"], pose_scene(asset, [*twist, *capped]).mesh
+    for name in ("vertices", "normals", "faces", "albedo", "roughness", "metallic"):
+        assert torch.equal(getattr(worn, name), getattr(wanted, name)), name
+    assert not torch.equal(worn.metallic, made.mesh.metallic) and not torch.equal(worn.vertices, asset.mesh.vertices)

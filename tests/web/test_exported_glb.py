@@ -14,13 +14,12 @@ from playwright.sync_api import Browser
 from benchmarks.measures.three_picture import SeenByThree, three_picture
 from drgs.convert.bake_edits import bake_edits
 from drgs.convert.export_asset import export_asset
-from drgs.convert.material_variants import AS_CAPTURED
 from drgs.deform.pose_scene import pose_scene
 from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.asset import Asset
 from drgs.scene.camera import camera_from_opengl
-from drgs.scene.edits import parse_edits
+from drgs.scene.edits import AS_CAPTURED, parse_edits
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh, vertex_normals
 from drgs_server.client import Client

@@ -190,6 +190,14 @@ def test_an_export_gives_textured_meshes_the_faces_that_were_asked_for(job: Call
     assert 12 <= len(import_mesh(context.files / "asset-mesh.glb").mesh.faces) <= 20
 
 
+def test_an_export_has_the_variants_that_were_asked_for(job: Callable[..., JobContext]) -> None:
+    black = {"name": "Black", "edits": [material(albedo=[0, 0, 0])]}
+    context = job({"kind": "export", "asset": ASSET, "formats": ["mesh", "env"], "variants": [black]})
+    run(ExportRun(context))
+    text = (context.files / "asset-mesh.glb").read_bytes()
+    assert b'"variants":[{"name":"As captured"},{"name":"Black"}]' in text.replace(b": ", b":").replace(b", ", b",")
+
+
 def test_an_asset_without_its_build_cannot_be_re_decoupled(job: Callable[..., JobContext]) -> None:
     with pytest.raises(ValueError, match="geometry was not kept"):
         run(RedecoupleRun(job({"kind": "redecouple", "asset": ASSET, "preset": "full"})))

@@ -166,6 +166,9 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "SnapshotInfo": {"chrome": _SNAPSHOT},
     "SnapshotList": {"one": {"snapshots": [_SNAPSHOT]}},
     "TrainingViewList": {"one": {"views": [_VIEW], "has_photographs": True}},
+    "VariantList": {"one": {"variants": [{"name": "Polished", "edits": [_MATERIAL]}]}},
+    "VariantNameRequest": {"another name": {"name": "Chrome"}},
+    "VariantRequest": {"those in force": {"edits": None}, "others": {"edits": [_MATERIAL]}},
     "TokenRequest": {"token": {"token": "0" * 64}},
 }
 """By schema and a few words."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drgs.scene.edits import Edit, Triple
+from drgs.scene.edits import Edit, MaterialEdit, MaterialVariant, Triple
 from drgs.scene.strokes import StrokeList
 from drgs_server.live.messages import BrokenEdit, Row
 from drgs_worker.jobs.capture_report import CaptureFinding, CaptureReport
@@ -289,6 +289,20 @@ class SnapshotInfo(_Body):
 class SnapshotList(_Body):
     snapshots: list[SnapshotInfo]
     """Oldest first."""
+
+
+class VariantRequest(_Body):
+    edits: Annotated[list[MaterialEdit], Field(max_length=1000)] | None = None
+    """Those in force when absent."""
+
+
+class VariantNameRequest(_Body):
+    name: UserName
+
+
+class VariantList(_Body):
+    variants: list[MaterialVariant]
+    """In the order in which they came."""
 
 
 class SaveRequest(_Body):

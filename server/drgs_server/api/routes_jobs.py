@@ -25,7 +25,7 @@ from drgs_server.api.routes_captures import CAPTURE_PREFIX, folder_of_capture
 from drgs_server.api.uploads import receive_upload
 from drgs_server.api.zip_guard import single_folder, unpack_zip
 from drgs_worker.jobs.queue import JobNotInState, is_alive
-from drgs_worker.jobs.requests import JOB_REQUESTS, OWN_LIGHT, JobRequest, RedecoupleRequest, RenderRequest, SimulateRequest
+from drgs_worker.jobs.requests import JOB_REQUESTS, OWN_LIGHT, ExportRequest, JobRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 from drgs_worker.store.artifact_store import StoreAway
 from drgs_worker.store.artifacts import has_clip, refresh_job, share_artifact, unshare_artifact
 from drgs_worker.store.database import AssetRow, CaptureRow, JobRow, now
@@ -189,6 +189,10 @@ def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
             raise ProblemError(422, str(error)) from error
     elif isinstance(asked, RenderRequest):
         _check_render(context, asked)
+    elif isinstance(asked, ExportRequest):
+        for variant in asked.variants:
+            for edit in variant.edits:
+                context.sessions.references.check(edit)
     return row
 
 

@@ -2,7 +2,7 @@
 
 import re
 
-from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, UnreadableEdit
+from drgs.scene.edits import DeformEdit, Edit, EnvironmentEdit, MaterialEdit, PoseEdit, UnreadableEdit, VariantEdit
 from drgs_server.api.environments import EnvironmentStore
 from drgs_server.api.problems import ProblemError, artifact_problem
 from drgs_server.live.pose_edits import passes
@@ -36,6 +36,9 @@ class EditReferences:
             )
         if isinstance(edit, MaterialEdit) and edit.select.weights_file is not None and not self._has_weights(edit.select.weights_file):
             raise ProblemError(422, f"There are no weights {edit.select.weights_file[:100]!r}; POST them to /api/weights first.")
+        if isinstance(edit, VariantEdit):
+            for worn in edit.edits:
+                self.check(worn)
         if isinstance(edit, PoseEdit) and not self._has_clip(edit.clip):
             raise ProblemError(
                 422,
@@ -58,6 +61,8 @@ class EditReferences:
 
     def may_wait(self, edit: Edit) -> bool:
         """Whether `check` may have to fetch a file, and is nothing for the event loop."""
+        if isinstance(edit, VariantEdit):
+            return any(self.may_wait(worn) for worn in edit.edits)
         return isinstance(edit, PoseEdit) or (isinstance(edit, MaterialEdit) and bool(edit.select.weights_file))
 
     def _has_weights(self, name: str) -> bool:

@@ -33,6 +33,8 @@ export function describeEdit(edit: Edit): string {
       const { matter, pins } = edit.scene as { matter?: { preset?: string }; pins?: number[] };
       return `Matter: ${matter?.preset ?? 'of its own'}${pins?.length ? ', held' : ''}`;
     }
+    case 'variant':
+      return `Variant: ${edit.name}`;
     case 'unreadable':
       return 'Of another version';
   }

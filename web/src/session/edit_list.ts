@@ -19,6 +19,7 @@ const plain = ({ all, sphere, box, region, similar, vertex_weights, weights_file
 export const sameEdits = (a: Edit[], b: Edit[]) => a.length === b.length && a.every((edit, i) => agree(comparable(edit), comparable(b[i]!)));
 function comparable(edit: Edit): object {
   if (edit.op === 'material') return { op: edit.op, select: JSON.stringify(plain(edit.select)), set: JSON.stringify(valuesSet(edit.set)), mode: edit.mode ?? 'absolute' };
+  if (edit.op === 'variant') return { op: edit.op, name: edit.name, edits: JSON.stringify(edit.edits.map(comparable)) };
   // The server keeps scenes as they came: what one of two leaves out is a difference.
   return 'scene' in edit ? { ...edit, scene: JSON.stringify(edit.scene) } : edit;
 }

@@ -397,6 +397,8 @@ export interface ExportRequest {
   formats: ("ply" | "ply3" | "spz" | "glb" | "mesh" | "usdz" | "usd" | "env" | "html" | "zip")[];
   /** The most that textured meshes (glb, mesh, usdz, usd) have; 30 000 where nothing is said. */
   faces?: number | null;
+  /** Other materials, for the formats that hold some (glb, mesh). */
+  variants?: MaterialVariant[];
 }
 
 /** A part of the surface that is held: some vertices by number, or those around a picked point. */
@@ -538,6 +540,12 @@ export interface MaterialValues {
   albedo?: [number, number, number] | null;
   roughness?: number | null;
   metallic?: number | null;
+}
+
+/** What the object may be made of, by a name. */
+export interface MaterialVariant {
+  name: string;
+  edits: MaterialEdit[];
 }
 
 /** What simulations of the object begin with, for the viewers of a session. It moves nothing by itself. */
@@ -952,6 +960,13 @@ export interface UnreadableEdit {
   found: string;
 }
 
+/** Keeps a variant with the session. It changes nothing by itself; of two with one name the later counts. */
+export interface VariantEdit {
+  name: string;
+  edits: MaterialEdit[];
+  op: "variant";
+}
+
 /** A hidden page gets no frames. */
 export interface VisibilityMessage {
   type: "visibility";
@@ -997,4 +1012,5 @@ export type Edit =
   | PoseEdit
   | SimulateEdit
   | MatterEdit
+  | VariantEdit
   | UnreadableEdit;

@@ -30,7 +30,7 @@ const wanted = computed<Movers | null>(() => {
   const open = session.value?.id;
   const now = log.value.edits;
   if (open === undefined || !mesh.value || !localPicture.value || playing.value || isAnalytic(now)) return null;
-  return { session: open, edits: now.filter(({ op }) => op !== 'material' && op !== 'environment' && op !== 'matter') };
+  return { session: open, edits: now.filter(({ op }) => op !== 'material' && op !== 'environment' && op !== 'matter' && op !== 'variant') };
 });
 
 /** Vertex positions, three numbers each; null while only the server knows them. */

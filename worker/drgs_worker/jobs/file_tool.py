@@ -8,7 +8,8 @@ Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full
     pictures CAPTURE OUT        folder of a posed capture -> folder with its pictures as 0.jpg, 1.jpg, ..., in the order of look.json's cameras, without lens distortion
     masks CAPTURE STROKES OUT   the same and strokes (drgs/scene/strokes.py) -> folder with masks.json and sheet.jpg, on which the strokes' masks are outlined
     export ASSET OUT FORMAT FACES [EDITS ENVIRONMENTS N]    asset folder, with the edits put into it -> a format of drgs/exchange/export_formats.py, or zip
-                                (the asset itself); FACES: the most that a textured mesh has, 0 where nobody says
+                                (the asset itself); FACES: the most that a textured mesh has, 0 where nobody says. A GLB has the variants that the edits keep
+    export ASSET OUT FORMAT FACES VARIANTS ENVIRONMENTS     asset folder -> a GLB with the variants of a file (drgs/convert/material_variants.py)
     version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
 """
 
@@ -246,9 +247,31 @@ def export(asset_folder: Path, out: Path, format: Any, faces: int) -> None:
     write_export(load_asset(asset_folder), asset_folder, out, format, faces, lambda: picture.read_bytes() if picture.exists() else None)
 
 
+def export_variants(asset_folder: Path, out: Path, format: Any, faces: int, variants: Path, environments: Path) -> None:
+    from drgs.convert.export_asset import export_asset
+    from drgs.convert.material_variants import load_variants, worn_meshes
+    from drgs.scene.asset import load_asset
+
+    asset = load_asset(asset_folder)
+    export_asset(asset, out, format, faces or None, worn_meshes(asset, asset.mesh, load_variants(variants), environments))
+
+
 def export_edited(asset_folder: Path, out: Path, format: Any, faces: int, edits: Path, environments: Path, version: int) -> None:
-    made = edited_asset(asset_folder, edits, environments, version)
-    write_export(made, asset_folder, out, format, faces, lambda: thumbnail(made))
+    from drgs.convert.bake_edits import bake_edits
+    from drgs.convert.export_asset import export_asset
+    from drgs.convert.material_variants import worn_meshes
+    from drgs.exchange.export_formats import VARIANT_FORMATS
+    from drgs.scene.asset import load_asset
+    from drgs.scene.edits import AS_CAPTURED, AS_SHOWN, load_edits
+    from drgs.scene.variants import kept_variants, material_edits
+
+    asset, listed = load_asset(asset_folder), load_edits(edits)
+    made, variants = bake_edits(asset, listed, environments, version), kept_variants(listed)
+    if variants and format in VARIANT_FORMATS:
+        shown = AS_SHOWN if material_edits(listed) else AS_CAPTURED
+        export_asset(made, out, format, faces or None, worn_meshes(asset, made.mesh, variants, environments), shown)
+    else:
+        write_export(made, asset_folder, out, format, faces, lambda: thumbnail(made))
 
 
 def write_export(asset: "Asset", source: Path, out: Path, format: Any, faces: int, picture: Callable[[], bytes | None]) -> None:
@@ -281,6 +304,8 @@ def main(arguments: list[str]) -> int:
                 export(Path(asset), Path(out), format, int(faces))
             case ["export", asset, out, format, faces, edits, environments, version]:
                 export_edited(Path(asset), Path(out), format, int(faces), Path(edits), Path(environments), int(version))
+            case ["export", asset, out, format, faces, variants, environments]:
+                export_variants(Path(asset), Path(out), format, int(faces), Path(variants), Path(environments))
             case ["version", asset, out, edits, environments, version]:
                 make_version(Path(asset), Path(out), Path(edits), Path(environments), int(version))
             case _:

@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from drgs.exchange.export_formats import FEWEST_FACES, FILE_KINDS, MOST_FACES, DownloadFormat, refuse_faces
+from drgs.exchange.export_formats import FEWEST_FACES, FILE_KINDS, MOST_FACES, VARIANT_FORMATS, DownloadFormat, refuse_faces
 from drgs.maths.constants import STILL_BOUNCES
-from drgs.scene.edits import Coordinate, Edit, Triple
+from drgs.scene.edits import Coordinate, Edit, MaterialVariant, Triple
 from drgs.scene.strokes import StrokeList
 from drgs.scene.tone_curve import ToneCurve
+from drgs.scene.variants import MOST_VARIANTS
 from drgs_worker.store.user_names import PlainText, UserName
 
 JobKind = Literal["build", "pose", "redecouple", "simulate", "render", "export"]
@@ -262,11 +263,21 @@ class ExportRequest(_Job):
     formats: Annotated[list[DownloadFormat], Field(min_length=1, max_length=len(FILE_KINDS))]
     faces: Annotated[int, Field(ge=FEWEST_FACES, le=MOST_FACES)] | None = None
     """The most that textured meshes (glb, mesh, usdz, usd) have; 30 000 where nothing is said."""
+    variants: list[MaterialVariant] = Field(default_factory=list, max_length=MOST_VARIANTS)
+    """Other materials, for the formats that hold some (glb, mesh)."""
 
     @model_validator(mode="after")
     def _names_each_once(self) -> "ExportRequest":
         if len(set(self.formats)) < len(self.formats):
             raise ValueError(f"each format is written once; found {self.formats}")
+        return self
+
+    @model_validator(mode="after")
+    def _has_a_use_for_variants(self) -> "ExportRequest":
+        if self.variants and not set(self.formats) & set(VARIANT_FORMATS):
+            raise ValueError(f"none of the formats {self.formats} holds material variants; expected {' or '.join(VARIANT_FORMATS)}")
+        if len({variant.name for variant in self.variants}) < len(self.variants):
+            raise ValueError("two variants of this export have the same name")
         return self
 
     @model_validator(mode="after")

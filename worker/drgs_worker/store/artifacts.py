@@ -21,7 +21,7 @@ from pathlib import Path
 from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session
 
-from drgs.scene.edits import Edit, EnvironmentEdit, MaterialEdit, PoseEdit
+from drgs.scene.edits import Edit, EnvironmentEdit, MaterialEdit, PoseEdit, VariantEdit
 from drgs_worker.store.artifact_store import ArtifactMissing
 from drgs_worker.store.data_directory import DataDirectory, try_lock_file
 from drgs_worker.store.database import AssetRow, CaptureRow, JobRow
@@ -115,6 +115,8 @@ def fetch_edit_files(directory: DataDirectory, edits: Iterable[Edit]) -> None:
             fetch_clip(directory, edit.clip)
         elif isinstance(edit, MaterialEdit) and edit.select.weights_file is not None:
             has_weights(directory, edit.select.weights_file)
+        elif isinstance(edit, VariantEdit):
+            fetch_edit_files(directory, edit.edits)
 
 
 def fetch_capture(directory: DataDirectory, dataset: Path) -> Path:

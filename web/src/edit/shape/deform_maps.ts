@@ -7,7 +7,7 @@ export type AnalyticMap = TwistMap | BendMap | StretchMap | LatticeMap;
 
 /** Whether the browser can compute the shape: what simulations, clips, files of vertices and dragged handles do is asked of the server. */
 export function isAnalytic(edits: Edit[]): boolean {
-  return edits.every((edit) => edit.op === 'material' || edit.op === 'environment' || edit.op === 'matter' || (edit.op === 'deform' && (edit.map != null || (edit.handles != null && !edit.handles.drag?.length))));
+  return edits.every((edit) => edit.op === 'material' || edit.op === 'environment' || edit.op === 'matter' || edit.op === 'variant' || (edit.op === 'deform' && (edit.map != null || (edit.handles != null && !edit.handles.drag?.length))));
 }
 
 const mapsOf = (edits: Edit[]) => edits.flatMap((edit) => (edit.op === 'deform' && edit.map ? [edit.map] : []));

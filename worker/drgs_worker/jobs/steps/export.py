@@ -1,11 +1,13 @@
 """Exports: files for other programs, each written by the file tool in a process of its own."""
 
+import json
 import os
 import subprocess
 import sys
 
-from drgs.exchange.export_formats import FILE_KINDS, TEXTURED_FORMATS
+from drgs.exchange.export_formats import FILE_KINDS, TEXTURED_FORMATS, VARIANT_FORMATS
 from drgs.reconstruct.progress import Progress
+from drgs.scene.edits import plain_edit
 from drgs_worker.jobs.progress import JobStopped
 from drgs_worker.jobs.requests import ExportRequest
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
@@ -29,8 +31,20 @@ class ExportRun(AbstractJobRun):
         draft = out.with_name(f"draft-{out.name}")
         source = job.fetch_asset(self._asked.asset)
         faces = self._asked.faces if format in TEXTURED_FORMATS else None
+        variants = self._variants() if format in VARIANT_FORMATS else ()
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "drgs_worker.jobs.file_tool", "export", str(source), str(draft), format, str(faces or 0)],
+            [
+                sys.executable,
+                "-P",
+                "-m",
+                "drgs_worker.jobs.file_tool",
+                "export",
+                str(source),
+                str(draft),
+                format,
+                str(faces or 0),
+                *variants,
+            ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
@@ -55,3 +69,13 @@ class ExportRun(AbstractJobRun):
         os.replace(draft, out)
         done = self.steps.index(step) + 1
         job.progress(Progress("export", done, len(self.steps), done / len(self.steps), message=out.name))
+
+    def _variants(self) -> tuple[str, ...]:
+        """What the tool is told of them: the file that they are in, and where their edits find theirs."""
+        job, variants = self._job, self._asked.variants
+        if not variants:
+            return ()
+        job.fetch_edit_files([edit for variant in variants for edit in variant.edits])
+        listed = job.folder / "variants.json"
+        listed.write_text(json.dumps({variant.name: [plain_edit(edit) for edit in variant.edits] for variant in variants}))
+        return str(listed), str(job.directory.environments)
