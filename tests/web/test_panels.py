@@ -116,6 +116,40 @@ def test_matter_falls_and_its_time_can_be_set(ball: Viewer) -> None:
     ball.wait_for_edits(0)
 
 
+def test_a_variant_is_kept_named_and_put_in_force_by_the_strip(ball: Viewer) -> None:
+    page = ball.page
+    captured = ball.settled_color()
+    ball.open_tab("Material")
+    page.locator(".preset").get_by_role("button", name="Gold", exact=True).click()
+    ball.wait_for_edits(1)
+    gold = ball.settled_color()
+    page.get_by_role("button", name="Add what is shown").click()
+    ball.wait_for_edits(2)
+    expect(page.get_by_role("button", name="Add what is shown")).to_be_disabled()
+    name = page.get_by_label("Name of Variant 1")
+    name.fill("Gilt")
+    name.press("Enter")
+    wait_until(lambda: [edit["name"] for edit in ball.edits() if edit["op"] == "variant"] == ["Gilt"], "the new name")
+    expect(page.locator(".variants img")).to_have_count(2)
+    plain, gilt = (
+        np.asarray(Image.open(io.BytesIO(picture.screenshot())).convert("RGB"), float).mean((0, 1))
+        for picture in page.locator(".variants img").all()
+    )
+    assert np.abs(plain - gilt).max() > 8, (plain, gilt)
+    page.get_by_role("button", name="Apply captured materials").click()
+    assert [edit["op"] for edit in ball.wait_for_edits(1)] == ["variant"]
+    assert np.abs(np.subtract(ball.settled_color(), captured)).max() < TOO_SMALL_TO_SEE
+    page.get_by_role("button", name="Apply Gilt").click()
+    assert [edit["op"] for edit in ball.wait_for_edits(2)] == ["variant", "material"]
+    expect(page.get_by_role("button", name="Apply Gilt")).to_have_attribute("aria-pressed", "true")
+    assert np.abs(np.subtract(ball.settled_color(), gold)).max() < TOO_SMALL_TO_SEE
+    page.get_by_role("button", name="Remove Gilt").click()
+    assert [edit["op"] for edit in ball.wait_for_edits(1)] == ["material"]
+    page.locator(".stage").focus()
+    ball.undo()
+    assert [edit["op"] for edit in ball.wait_for_edits(2)] == ["variant", "material"]
+
+
 def test_four_lights_are_compared_and_one_is_put_in_force(ball: Viewer) -> None:
     page = ball.page
     ball.open_tab("Light")
@@ -210,6 +244,10 @@ def test_no_panel_has_a_serious_accessibility_fault(ball: Viewer, theme: str) ->
     if ball.page.evaluate("document.documentElement.dataset.theme") != theme:
         ball.page.keyboard.press("t")
     ball.page.evaluate(AXE.read_text())
+    ball.open_tab("Material")
+    ball.page.locator(".preset").get_by_role("button", name="Gold", exact=True).click()
+    ball.page.get_by_role("button", name="Add what is shown").click()
+    ball.wait_for_edits(2)
     faults = {}
     for tab in ("Material", "Light", "Shape", "View", "Export"):
         ball.open_tab(tab)

@@ -10,6 +10,7 @@ import { capturedEnvironmentThumbnail, light } from '../edit/light';
 import { materialThumbnails, namedMaterials } from '../edit/material/presets';
 import { flash, selectionWeights } from '../edit/material/selection';
 import { materials } from '../edit/material/values';
+import { variantMeans, variantThumbnails } from '../edit/material/variants';
 import { mesh } from '../edit/mesh';
 import { pinWeights } from '../edit/shape/pins';
 import { shapeTool } from '../edit/shape/shape_tools';
@@ -159,7 +160,7 @@ export class LocalLayer {
       this.dirty = true;
     });
     effect(() => {
-      if (namedMaterials.value && mesh.value) this.drawMaterials();
+      if (namedMaterials.value && variantMeans.value && mesh.value) this.drawMaterials();
     });
     effect(() => {
       const asset = openedAsset.value;
@@ -202,7 +203,10 @@ export class LocalLayer {
   /** Thumbnails of materials under the present light. */
   private drawMaterials(): void {
     if (!this.picture || !this.lit) return;
-    materialThumbnails.value = this.picture.drawMaterials(namedMaterials.value, MATERIAL_PIXELS);
+    const named = namedMaterials.value;
+    const pictures = this.picture.drawMaterials([...named, ...variantMeans.value], MATERIAL_PIXELS);
+    materialThumbnails.value = pictures.slice(0, named.length);
+    variantThumbnails.value = pictures.slice(named.length);
     this.resize();
   }
 }

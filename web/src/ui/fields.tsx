@@ -21,7 +21,7 @@ type EntryProps = { type: 'text' | 'number'; value: string | number; onEnter(tex
 >;
 
 /** A text or a number that counts once it is entered. What is being typed stays, whatever news of the value arrives meanwhile. */
-function Entry({ value, onEnter, ...attributes }: EntryProps) {
+export function Entry({ value, onEnter, ...attributes }: EntryProps) {
   const [typed, setTyped] = useState<string | null>(null);
   return (
     <input

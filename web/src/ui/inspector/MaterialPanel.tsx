@@ -10,12 +10,14 @@ import type { MaterialValues } from '../../session/protocol.gen';
 import { Choice, ColorField, Section, Slider } from '../fields';
 import { Icon } from '../icons';
 import { titleFor } from '../shortcuts';
+import { Variants } from './Variants';
 
 export function MaterialPanel() {
   return (
     <>
       <Part />
       <Values />
+      <Variants />
       <Presets />
     </>
   );
