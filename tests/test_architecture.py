@@ -190,6 +190,37 @@ def test_importing_the_client_brings_only_what_a_client_needs():
     assert result.returncode == 0, result.stderr
 
 
+def loaded_with(module: str) -> set[str]:
+    """Modules of the product, and names of other packages, that importing a module loads at once."""
+    loaded: set[str] = set()
+    front = [module]
+    while front:
+        name = front.pop()
+        above = [name.rsplit(".", k)[0] for k in range(name.count(".") + 1)]  # packages run their `__init__`
+        for found in {one for one in above if one in MODULES} - loaded:
+            loaded.add(found)
+            front += module_level_imports(syntax(MODULES[found]))
+        if name.split(".")[0] not in MODULES:
+            loaded |= {name, *above}
+    return loaded
+
+
+@pytest.mark.parametrize(
+    ("module", "late"),
+    [
+        ("drgs_worker.jobs.file_tool", {"torch", "warp", "scipy", "PIL", "pydantic", "sqlalchemy", "drgs.exchange"}),
+        ("drgs.scene.asset", {"warp", "scipy", "trimesh"}),
+        ("drgs.deform.pose_scene", {"warp", "scipy", "igl", "drgs.deform.mpm", "drgs.deform.arap", "drgs.exchange.gltf_rig"}),
+        ("drgs.render.render_frame", {"scipy", "drgs.deform", "drgs.render.integrate.wavefront"}),
+        ("drgs.convert.export_asset", {"igl", "trimesh", "drgs.deform.mpm", "drgs.convert.page", "drgs.reconstruct"}),
+        ("drgs.evaluate.look_at_capture", {"trimesh", "scipy.stats", "skimage.color", "skimage.filters", "drgs.render"}),
+    ],
+)
+def test_a_process_for_one_file_loads_what_it_needs_and_no_more(module: str, late: set[str]):
+    # Each look, upload and export is a process: what it imports, its caller waits for.
+    assert loaded_with(module) & late == set()
+
+
 def test_the_library_knows_no_http_and_no_service():
     network = {"aiohttp", "fastapi", "http", "httpx", "requests", "socket", "starlette", "urllib.request", "uvicorn", "websockets"}
     services = {"drgs_server", "drgs_worker"}

@@ -13,10 +13,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import igl
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
@@ -165,6 +163,8 @@ class _LargeSurface:
             weights = torch.where(nearer[:, None], found, weights)
         lost = (face < 0).nonzero()[:, 0]
         if len(lost):
+            import igl  # here and not above, like all below that only some exports need: each is a process of its own
+
             vertices, faces = _array(self._mesh.vertices).astype(np.float64), _array(self._mesh.faces)
             _, nearest, place = igl.point_mesh_squared_distance(_array(points[lost]).astype(np.float64), vertices, faces)
             a, b, c = (np.ascontiguousarray(vertices[faces[nearest, corner]]) for corner in range(3))
@@ -187,6 +187,8 @@ def _finely_divided(atlas: Atlas, mesh: TriangleMesh) -> tuple[Atlas, TriangleMe
     points, faces = _array(mesh.vertices)[atlas.vertex_of], atlas.faces
     attributes = np.concatenate([values, atlas.uv], -1)
     while 0 < len(points) < LEAST_CORNERS:
+        import trimesh
+
         points, faces, found = trimesh.remesh.subdivide(points, faces, vertex_attributes={"all": attributes})
         attributes = found["all"]
     fine = torch.from_numpy(np.ascontiguousarray(attributes, np.float32))

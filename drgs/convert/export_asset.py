@@ -27,7 +27,6 @@ from torch import Tensor
 from drgs.convert.bake_textures import TexturedMesh, bake_textures
 from drgs.convert.gltf_reflectance import BASE_COLOR_MARK, gltf_base_color, usd_base_color
 from drgs.convert.material_variants import Variants, refuse_variants, variant_meshes
-from drgs.convert.page.encode_page import encode_page
 from drgs.exchange.export_formats import DEFAULT_FACES, EXPORT_FORMATS, TEXTURED_FORMATS, VARIANT_FORMATS, ExportFormat, refuse_faces
 from drgs.exchange.exr import encode_environment
 from drgs.exchange.gaussian_ply import encode_gaussian_ply, log_thickness
@@ -110,6 +109,8 @@ def export_asset(
             left_out = f"{wide} of {len(splats['scales'])} splats wider than they are" if wide else ""
             temporary.write_bytes(encode_spz(splats))
         elif format == "html":
+            from drgs.convert.page.encode_page import encode_page  # here: only pages need it
+
             page = encode_page(asset)
             left_out = "" if page.faces == len(asset.mesh.faces) else f"{page.faces} of the mesh's {len(asset.mesh.faces)} faces"
             temporary.write_bytes(page.html)

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drgs.maths.constants import F0
-from drgs.reconstruct.fit.light.split_sum import brdf_table
 
 BASE_COLOR_MARK = {"drgs": {"base_color_for": "gltf"}}
 """`extras` of the `pbrMetallicRoughness` whose base colour was made here."""
@@ -84,15 +83,21 @@ def scattered(f0: Float[Tensor, "point 3"], factors: Float[Tensor, "point 2"]) -
 
 def brdf_factors(n_dot_v: Float[Tensor, "point"], roughness: Float[Tensor, "point"]) -> Float[Tensor, "point 2"]:
     """F1 and F2 of split_sum.brdf_table, linear between its texels."""
-    return _looked_up(brdf_table().to(roughness), n_dot_v, roughness)
+    return _looked_up(_table(roughness), n_dot_v, roughness)
 
 
 def mean_factors(roughness: Float[Tensor, "point"]) -> Float[Tensor, "point 2"]:
     """The same, their mean over cosine-weighted views."""
-    table = brdf_table().to(roughness)
+    table = _table(roughness)
     n_dot_v = (torch.arange(table.shape[2], device=table.device) + 0.5) / table.shape[2]
     mean = (table * n_dot_v).sum(-1, keepdim=True) / n_dot_v.sum()
     return _looked_up(mean, torch.full_like(roughness, 0.5), roughness)
+
+
+def _table(like: Float[Tensor, "point"]) -> Float[Tensor, "2 rows columns"]:
+    from drgs.reconstruct.fit.light.split_sum import brdf_table  # here, with its kernels: few meshes that are read need it
+
+    return brdf_table().to(like)
 
 
 def _looked_up(

@@ -3,6 +3,8 @@
 Selections refer to the object at rest, so material, light and shape do not depend on each other: each is computed from its own
 edits, in their order, and remembered for the asset. A scene posed again with one kind of edit changed therefore holds the very
 same tensors for the rest, and a renderer sees by identity what it must rebuild.
+
+What handles, rigs and simulations need is imported when an edit asks for it: most processes that pose a scene have none of them.
 """
 
 import threading
@@ -21,11 +23,7 @@ from torch import Tensor
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
 from drgs.deform.clip import ClipFrame, frame_at, open_clip
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
-from drgs.deform.hold_handles import HeldObject
 from drgs.deform.maps import check_map, evaluate_map
-from drgs.deform.rig_clip import bind_rig
-from drgs.deform.simulate import Simulation
-from drgs.deform.simulation_scene import parse_simulation_scene
 from drgs.deform.sort_edits import EditFiles, EditSteps, ShapeEdit, SortedEdits, file_names, sort_edits
 from drgs.deform.vertex_sequence import vertices_at
 from drgs.scene.asset import Asset
@@ -101,7 +99,7 @@ def forget_simulations(asset: Asset) -> None:
             _memory.get(asset, OrderedDict()).pop(key, None)
 
 
-def _simulations(asset: Asset) -> dict[tuple, Simulation]:
+def _simulations(asset: Asset) -> dict[tuple, Any]:
     with _lock:
         return {key: value for key, value in _memory.get(asset, OrderedDict()).items() if key[0] == "simulation"}
 
@@ -270,6 +268,8 @@ def _deformed(
             )
     elif edit.handles is not None and edit.handles.drag:
         handles, points = edit.handles, vertices if centers is None else torch.cat([vertices, centers])
+        from drgs.deform.hold_handles import HeldObject
+
         # What is held is prepared once for all targets that a drag passes through.
         grips = ("handles", digest_before, _text_of_grips(edit))
         hold = partial(HeldObject, mesh.vertices, vertices, mesh.faces, handles, points)
@@ -287,13 +287,19 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: EditFiles, go_on
     centers, tangents = (None, None) if asset.gaussians is None else (asset.gaussians.centers, _rest(asset).tangents)
     rest = ClipFrame(asset.mesh.vertices, asset.mesh.normals, centers, tangents)
     if isinstance(edit, SimulateEdit):
+        from drgs.deform.simulation_scene import parse_simulation_scene
+
         scene = parse_simulation_scene(edit.scene)
         if edit.time == 0:
             return rest
+        from drgs.deform.simulate import Simulation
+
         scene_key = ("simulation", scene.model_dump_json(), *map(files.stamp, file_names(edit)))
         simulation = _remembered(asset, scene_key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True), go_on))
         frame = simulation.at(edit.time, go_on)
     elif (rig := split_rig_clip(edit.clip)) is not None:
+        from drgs.deform.rig_clip import bind_rig
+
         rig_key = ("rig", files.stamp(rig[0]), edit.model_dump_json(exclude={"time"}))
         bound = _remembered(asset, rig_key, lambda: bind_rig(files.path(rig[0]), rig[1], asset, rest, edit.rig))
         frame = bound.at(edit.time)

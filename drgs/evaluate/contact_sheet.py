@@ -24,7 +24,6 @@ from drgs.evaluate.doctor.picture_looks import files_of_capture
 from drgs.reconstruct.capture.load_views import has_cameras, read_capture
 from drgs.reconstruct.capture.load_views.checks import is_folder, pictures_in
 from drgs.reconstruct.capture.small_picture import PictureFile, SmallPicture, small_picture
-from drgs.reconstruct.pose.backdrop_masks import backdrop_mask
 from drgs.reconstruct.pose.list_photos import list_photos
 from drgs.reconstruct.pose.posed_dataset import film_of
 from drgs.reconstruct.pose.prepare_photos import BACKDROP_SHARE
@@ -236,6 +235,8 @@ class _TileDrawer:
         if mask is not None:
             self._given += 1
         elif self._guesses:
+            from drgs.reconstruct.pose.backdrop_masks import backdrop_mask  # here: a sheet of masks that are given needs none of it
+
             # Asked at the thumbnail's own size, where the search asks a larger picture: the outline is about the same.
             mask, ink = backdrop_mask(picture.color_srgb), GUESSED
             self._guessed += mask is not None

@@ -8,9 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.scene.binding import Binding
@@ -71,6 +68,8 @@ def select_surfels(centers: Tensor, mesh: TriangleMesh, binding: Binding | None,
         weights = (vertex_weights[mesh.faces[binding.face.long()].long()] * binding.barycentric).sum(-1)
         # Barycentrics that sum to 1 up to rounding must not leave a fully selected face at 0.9999999.
         return torch.where(weights > 1 - 1e-5, torch.ones_like(weights), weights.clamp(min=0))
+    from scipy.spatial import cKDTree  # here, like SciPy's graphs below: most edits that are posed need none of it
+
     _, nearest = cKDTree(mesh.vertices.cpu().numpy()).query(centers.detach().cpu().numpy())
     return vertex_weights[torch.as_tensor(nearest, device=vertex_weights.device)]
 
@@ -121,6 +120,9 @@ def _edges(mesh: TriangleMesh) -> Tensor:
 
 def _components(count: int, edges: Tensor) -> Tensor:
     """(vertex,) int64 label of each vertex's connected component."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     ends = edges.cpu().numpy()
     graph = coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, labels = connected_components(graph, directed=False)

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from drgs.deform import pose_scene as posing
+from drgs.deform import hold_handles as holding
 from drgs.deform.pose_scene import pose_scene
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.scene.asset import Asset
@@ -92,8 +92,8 @@ def test_handles_pull_what_earlier_edits_left_and_pick_on_the_object_at_rest():
 
 def test_a_drag_prepares_the_object_once_and_leaves_no_trace(monkeypatch):
     asset, made = bar_asset(), []
-    original = posing.HeldObject
-    monkeypatch.setattr(posing, "HeldObject", lambda *given: made.append(1) or original(*given))
+    original = holding.HeldObject
+    monkeypatch.setattr(holding, "HeldObject", lambda *given: made.append(1) or original(*given))
     for x in (0.2, 0.4, 0.6):
         last = pose(asset, handles(TOP | {"target": [x, 0, 2.0]}, pin=[BOTTOM]))
     assert len(made) == 1

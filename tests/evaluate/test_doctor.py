@@ -8,12 +8,17 @@ import pytest
 from PIL import Image
 
 from drgs.evaluate.doctor import doctor
+from drgs.evaluate.doctor.places import _ranks
 from drgs.scene.lens import Lens
 from tests.reconstruct import tiny_capture as tiny
 
 
 def _sentences(report: dict, level: str = "warning") -> str:
     return " | ".join(finding["sentence"] for finding in report["findings"] if finding["level"] == level)
+
+
+def test_equal_brightness_shares_the_mean_of_its_ranks() -> None:
+    assert _ranks(np.array([0.5, 0.1, 0.5, 0.2, 0.5])).tolist() == [4, 1, 4, 2, 4]
 
 
 @pytest.mark.slow

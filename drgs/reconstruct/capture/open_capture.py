@@ -13,7 +13,6 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from drgs.reconstruct.capture.build_box import BuildBox
-from drgs.reconstruct.capture.cut_to_box import cut_to_box
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import read_capture
 from drgs.reconstruct.capture.load_views.capture import Capture, without_masks
@@ -74,6 +73,8 @@ def open_capture(
 
 
 def _cut(views: Views, box: BuildBox, folder: Path) -> Views:
+    from drgs.reconstruct.capture.cut_to_box import cut_to_box  # here, with the tracer that it needs: most captures are not cut
+
     try:
         return cut_to_box(views, box)
     except CaptureFault as fault:

@@ -21,7 +21,6 @@ from drgs.exchange.pictures import as_eight_bits, exif_number, orientation_of, r
 from drgs.reconstruct.capture.camera_files import is_header_readable, opened_photograph
 from drgs.reconstruct.capture.laplacian_variance import laplacian_variance
 from drgs.reconstruct.capture.load_views.checks import check_least_side, image_size
-from drgs.reconstruct.pose.backdrop_masks import backdrop_mask
 from drgs.reconstruct.pose.list_photos import Photo
 from drgs.reconstruct.progress import BuildStopped
 
@@ -99,6 +98,8 @@ def with_backdrop_masks(
     Raises:
         BuildStopped: as asked.
     """
+    from drgs.reconstruct.pose.backdrop_masks import backdrop_mask  # here: who only looks at photographs needs none of it
+
     masked, others = [], {}
 
     def mask_of(photo: PreparedPhoto) -> UInt8[ndarray, "height width"] | None:

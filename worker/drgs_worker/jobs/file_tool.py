@@ -133,12 +133,13 @@ async def run_file_tool(*arguments: str) -> None:
 
 def make_asset(source: Path, out: Path) -> None:
     """A zipped asset is read and written anew, so that nothing else of the archive arrives."""
-    from drgs.convert.import_mesh import import_mesh
     from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs
     from drgs.scene.asset import load_asset, load_photographs, save_asset
     from drgs.scene.mesh import refuse_unusable
 
     if source.suffix != ".zip":
+        from drgs.convert.import_mesh import import_mesh
+
         asset, photographs = import_mesh(source), None
     else:
         asset, photographs = load_asset(source), load_photographs(source)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -52,6 +51,8 @@ def _read_points(
         raise ValueError(f"{named_in}: ply_file_path {ply_file_path!r} leads outside the capture folder.")
     if not is_file(path):
         raise ValueError(f"{path}: no such point file, but {named_in.name} names it as ply_file_path.")
+    import trimesh  # here, since few captures name such a file, and every look at one would load it
+
     try:
         cloud: Any = trimesh.load(path, file_type="ply", process=False)  # a mesh or a point cloud; what has no vertices is refused
         points = np.asarray(cloud.vertices, dtype=np.float32)
