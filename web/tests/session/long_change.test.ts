@@ -3,7 +3,10 @@ import { exportedFile } from '../../src/session/api';
 import { computing, LONG_MS, noteWaiting } from '../../src/session/long_change';
 import { attempt, notices } from '../../src/session/notices';
 
-beforeEach(() => void vi.useFakeTimers());
+beforeEach(() => {
+  vi.useFakeTimers();
+  notices.value = []; // files share their modules, and what another left is none of ours
+});
 afterEach(() => {
   noteWaiting(0);
   vi.useRealTimers();

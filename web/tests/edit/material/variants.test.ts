@@ -53,6 +53,7 @@ it.each(['Two', '', ' ', 'a/b', AS_CAPTURED, 'As shown'])('the name %j is refuse
   renameVariant('One', name);
   expect(draft.value).toBe(null);
   expect(notices.value.map(({ text }) => text)).toEqual([expect.stringContaining('No variant can be called')]);
+  notices.value = [];
 });
 
 it('means are of the whole object, the captured one first', () => {
