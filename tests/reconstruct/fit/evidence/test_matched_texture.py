@@ -1,6 +1,7 @@
 """Depths that several photographs agree on, of a floor whose pattern, place and photographs are known in closed form."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -97,4 +98,14 @@ def test_a_pattern_is_found_at_its_depth_whatever_the_exposure():
 @pytest.mark.parametrize(("kind", "metal"), [("plain", 0.0), ("mirror", 0.0), ("patterned", 1.0)])
 def test_plain_floors_mirrors_and_metal_say_nothing(kind: str, metal: float):
     mesh, found = depths_found(kind, metal)
+    assert not found.weight.any() and torch.equal(found.places, mesh.vertices)
+
+
+@pytest.mark.parametrize(("views", "radius"), [(1, 1.0), (2, 1.0), (9, 0.02), (9, 1e-6)])
+def test_one_view_two_and_an_object_of_a_pixel_say_nothing(views: int, radius: float):
+    mesh, all_views = sheet(), photographs_of_a_floor("patterned")
+    few = replace(
+        all_views, cameras=all_views.cameras[:views], images_srgb=all_views.images_srgb[:views], coverage=all_views.coverage[:views]
+    )
+    found = matched_texture(build_tracer(mesh), mesh.normals, torch.zeros(len(mesh.vertices)), mesh_edges(mesh.faces), few, radius)
     assert not found.weight.any() and torch.equal(found.places, mesh.vertices)
