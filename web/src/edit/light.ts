@@ -1,7 +1,7 @@
 /** The light in force, and the edits that change it. */
 
 import { computed, signal } from '@preact/signals';
-import { edits, replaceEdits } from '../session/edit_log';
+import { edits, reviseEdits } from '../session/edit_log';
 import type { Edit, EnvironmentEdit } from '../session/protocol.gen';
 import { sendThrottled } from './gestures';
 
@@ -35,7 +35,9 @@ export function editLight(change: Partial<Light>, key?: string): void {
 
 /** The asset's own environment again: the edits that named another go, for one without a file would keep it. */
 export function restoreCapturedLight(): void {
-  const { rotation, intensity } = light.value;
-  const others = edits.value.filter((edit) => edit.op !== 'environment');
-  replaceEdits(rotation || intensity !== 1 ? [...others, environmentEdit({ file: null, rotation, intensity })] : others);
+  reviseEdits((now) => {
+    const { rotation, intensity } = lightOf(now);
+    const others = now.filter((edit) => edit.op !== 'environment');
+    return rotation || intensity !== 1 ? [...others, environmentEdit({ file: null, rotation, intensity })] : others;
+  });
 }

@@ -3,7 +3,7 @@
  *
  * An edit at the log's end is sent at once. Any other change is a splice, which counts places in the log: it is shown as a draft, sent
  * once everything before it is answered, and only one is under way. What the user does meanwhile is queued, for it counts in the log
- * that will be.
+ * that will be: a change of the edits is a function of them, which is called again when its turn comes.
  */
 
 import { batch, computed, signal } from '@preact/signals';
@@ -33,8 +33,24 @@ export const broken = computed(() => new Map((log.value.broken ?? []).map(({ ind
 export const appliedEdits = () => log.value.edits.filter((_, place) => !broken.value.has(place));
 
 const sent = () => [...log.value.edits, ...pending.value.map(({ edit }) => edit)];
+/** A change of the edits; it may be called more than once. */
+type Revise = (edits: Edit[]) => Edit[];
+/** What the user did while a splice was under way, to be done when it is answered: a revision, or whatever else. */
+type Queued = { revise: Revise; key: string | null } | (() => void);
+const queue = signal<Queued[]>([]);
+const isRevision = (queued: Queued | undefined): queued is Exclude<Queued, () => void> => typeof queued === 'object';
+
+/** What `now` will be, as far as it is known: what an undo that waits takes back is the server's to say. */
+function revised(now: Edit[]): Edit[] {
+  for (const queued of queue.value) {
+    if (!isRevision(queued)) break;
+    now = queued.revise(now);
+  }
+  return now;
+}
+
 /** The edits in force on this page, so that a slider never jumps back to what the server still says. */
-export const edits = computed<Edit[]>(() => draft.value ?? sent());
+export const edits = computed<Edit[]>(() => revised(draft.value ?? sent()));
 
 interface Splice {
   after: Edit[];
@@ -49,15 +65,7 @@ interface Splice {
 }
 /** The one that the server has not answered yet. */
 let splice: Splice | null = null;
-/** What the user did since, to be done when it is answered. */
-let queue: (() => void)[] = [];
-
-interface Revision {
-  revise(edits: Edit[]): Edit[];
-  key: string;
-}
-/** The newest one in the queue. */
-let queuedRevision: Revision | null = null;
+const enqueue = (next: Queued) => void (queue.value = [...queue.value, next]);
 
 /** Of the history's edits, as many as shall be in force once those on their way are in the log. */
 let wanted: number | null = null;
@@ -121,7 +129,7 @@ export function forgetUnsent(): void {
 }
 
 /** Every edit that the user has made, wherever it is on its way. */
-export const editsToRestore = () => splice?.after ?? sent();
+export const editsToRestore = () => revised(splice?.after ?? sent());
 
 // ---- edits at the end ----------------------------------------------------------------------------------------------------
 
@@ -139,39 +147,32 @@ export function sendEdit(edit: Edit, coalesce: string | null): void {
 
 export const isSplicing = () => splice !== null;
 
-/** Make the log hold exactly these edits, in one step of undo. */
-export function replaceEdits(after: Edit[], coalesce: string | null = null): void {
-  if (splice) return void queue.push(() => replaceEdits(after, coalesce));
+/**
+ * Change the edits, in one step of undo; as fast as the server takes it. Of one gesture (`key`), a revision that is still queued gives way
+ * to the next, so each must say all that the last one said. A gesture is one step of undo.
+ */
+export function reviseEdits(revise: Revise, key: string | null = null): void {
+  if (splice) {
+    const last = queue.value.at(-1);
+    if (key !== null && isRevision(last) && last.key === key) queue.value = queue.value.slice(0, -1);
+    return enqueue({ revise, key });
+  }
   if (!stream) return;
-  splice = { after, coalesce, id: null, uploading: false, attempts: 3 };
+  const after = revise(draft.value ?? sent());
+  splice = { after, coalesce: key, id: null, uploading: false, attempts: 3 };
   draft.value = after;
   sendSplice();
 }
 
-/**
- * Change the edits as fast as the server takes it: of one gesture (`key`), a revision that is still queued gives way to the next, so each
- * must say all that the last one said. A gesture is one step of undo.
- */
-export function reviseEdits(revise: (edits: Edit[]) => Edit[], key: string): void {
-  if (queuedRevision?.key === key) return void (queuedRevision.revise = revise);
-  if (!splice) return replaceEdits(revise(edits.value), key);
-  const revision: Revision = { revise, key };
-  queuedRevision = revision; // the last one of an earlier gesture keeps its own place in the queue
-  queue.push(() => {
-    if (queuedRevision === revision) queuedRevision = null;
-    replaceEdits(revision.revise(edits.value), revision.key);
-  });
-}
-
 /** Show what `edit` does in place of the newest one that it replaces; the server hears of it by `commitDraft`. */
 export function draftEdit(edit: Edit, replaces: (other: Edit) => boolean): void {
-  if (splice) return void queue.push(() => draftEdit(edit, replaces));
+  if (splice) return enqueue(() => draftEdit(edit, replaces));
   draft.value = withReplaced(sent(), edit, replaces);
 }
 
 export function commitDraft(): void {
-  if (splice) queue.push(commitDraft);
-  else if (draft.value) replaceEdits(draft.value);
+  if (splice) enqueue(commitDraft);
+  else if (draft.value) reviseEdits((now) => now);
 }
 
 /** Send the splice under way, if everything before it is answered: only then are the places known that it counts. */
@@ -200,35 +201,44 @@ async function upload(current: Splice): Promise<void> {
 }
 
 function endSplice(): void {
-  splice = null; // first: who hears of the draft's end must find none under way
-  draft.value = null;
-  while (!splice && queue.length) queue.shift()!();
+  batch(() => {
+    splice = null;
+    draft.value = null;
+    while (!splice && queue.value.length) {
+      const [next, ...rest] = queue.value;
+      queue.value = rest;
+      if (isRevision(next)) reviseEdits(next.revise, next.key);
+      else next!();
+    }
+  });
 }
 
 function dropSplice(): void {
-  splice = queuedRevision = null;
-  queue = [];
-  draft.value = null;
+  batch(() => {
+    splice = null;
+    queue.value = [];
+    draft.value = null;
+  });
 }
 
 // ---- history -------------------------------------------------------------------------------------------------------------
 
 export function undo(): void {
-  if (splice) queue.push(undo);
+  if (splice) enqueue(undo);
   else if (log.value.can_undo || pending.value.length || stream?.awaits('redo')) stream?.undo();
 }
 
 export function redo(): void {
-  if (splice) queue.push(redo);
+  if (splice) enqueue(redo);
   else if (log.value.can_redo || stream?.awaits('undo')) stream?.redo();
 }
 
 /** To the log with `count` of the edits that the history shows in force. */
 export function goTo(count: number): void {
-  if (splice) return void queue.push(() => goTo(count));
+  if (splice) return enqueue(() => goTo(count));
   if (pending.value.length) return void (wanted = count); // the history's places count in a log that holds them
   const { edits: now, appended } = log.value;
-  if (now.length - count > appended) return replaceEdits(now.slice(0, count));
+  if (now.length - count > appended) return reviseEdits(() => now.slice(0, count));
   for (let steps = now.length - count; steps > 0; steps--) stream?.undo();
   for (let steps = count - now.length; steps > 0; steps--) stream?.redo();
 }

@@ -1,5 +1,5 @@
 import { beforeEach, expect, it, vi } from 'vitest';
-import { appliedEdits, attachStream, broken, commitDraft, draft, draftEdit, edits, goTo, log, receiveAccepted, receiveChange, receiveLog, receiveRejected, replaceEdits, resetLog, reviseEdits, sendEdit, undo } from '../../src/session/edit_log';
+import { appliedEdits, attachStream, broken, commitDraft, draft, draftEdit, edits, editsToRestore, goTo, log, receiveAccepted, receiveChange, receiveLog, receiveRejected, resetLog, reviseEdits, sendEdit, undo } from '../../src/session/edit_log';
 import type { Edit, EditLog } from '../../src/session/protocol.gen';
 import type { Stream } from '../../src/session/stream';
 
@@ -47,7 +47,7 @@ it('an edit is in force before the server has it, once, and an edit that changes
 it('a splice waits for what was sent before it, and then counts in the newest log', () => {
   sendEdit(turned(30), null);
   idle = false;
-  replaceEdits([turned(10), turned(30)]);
+  reviseEdits(() => [turned(10), turned(30)]);
   expect(edits.value).toEqual([10, 30].map(turned));
   expect(sent).toHaveLength(1);
   receiveLog(logWith(2, 10, 20, 30));
@@ -66,8 +66,26 @@ it('of a gesture only the newest revision waits while a splice is under way', ()
   expect(edits.value).toEqual([turned(3)]);
 });
 
+it('what waits for a splice is in force on this page, and what comes after it is made of it', () => {
+  const put = (rotation: number) => reviseEdits((now) => [...now, turned(rotation)]);
+  for (const rotation of [30, 40]) put(rotation);
+  expect(edits.value).toEqual([10, 20, 30, 40].map(turned));
+  reviseEdits((now) => now.filter((_, place) => place !== 0)); // of the log that will be: 40 stays in it
+  receiveLog(logWith(2, 10, 20, 30));
+  receiveAccepted(1, 2);
+  expect(sent[1]).toEqual(['splice', 2, 3, 0, [turned(40)], null]);
+  expect(edits.value).toEqual([20, 30, 40].map(turned));
+  expect(editsToRestore()).toEqual(edits.value);
+  receiveLog(logWith(3, 10, 20, 30, 40));
+  receiveAccepted(2, 3);
+  expect(sent[2]).toEqual(['splice', 3, 0, 1, [], null]);
+  undo(); // what it takes back is the server's to say
+  put(50);
+  expect(edits.value).toEqual([20, 30, 40].map(turned));
+});
+
 it('what the user does during a splice comes after it', () => {
-  replaceEdits([turned(10)]);
+  reviseEdits(() => [turned(10)]);
   undo();
   goTo(0);
   expect(sent).toHaveLength(1);
@@ -87,7 +105,7 @@ it('a place of the history is gone to once the edits on their way are in the log
 });
 
 it('a splice that another viewer was faster than is sent again, and given up after three times', () => {
-  replaceEdits([turned(10)]);
+  reviseEdits(() => [turned(10)]);
   for (let attempt = 1; attempt <= 3; attempt++) {
     receiveLog(logWith(1 + attempt, 10, 20));
     expect(receiveRejected(attempt, true)).toBe(false);
@@ -133,7 +151,7 @@ it('painted weights go up as a file before the edit that refers to it, and once'
     uploads.push(body.length);
     return { ok: true, json: async () => ({ file: 'weights/a.f32', vertices: body.length }) };
   });
-  replaceEdits([turned(10), turned(20), painted(0.1)]);
+  reviseEdits(() => [turned(10), turned(20), painted(0.1)]);
   expect(sent).toEqual([]);
   await vi.waitUntil(() => sent.length);
   const stored = (roughness: number): Edit => ({ op: 'material', select: { weights_file: 'weights/a.f32' }, set: { roughness }, mode: 'absolute' });
@@ -141,9 +159,9 @@ it('painted weights go up as a file before the edit that refers to it, and once'
   receiveLog({ ...logWith(2, 10, 20), edits: [turned(10), turned(20), stored(0.1)] });
   receiveAccepted(1, 2);
   sent = [];
-  replaceEdits([turned(10), turned(20), painted(0.1)]);
+  reviseEdits(() => [turned(10), turned(20), painted(0.1)]);
   expect(draft.value).toBe(null); // it is what the log holds
-  replaceEdits([turned(10), turned(20), painted(0.9)]);
+  reviseEdits(() => [turned(10), turned(20), painted(0.9)]);
   await vi.waitUntil(() => sent.length);
   expect(sent).toEqual([['splice', 2, 2, 1, [stored(0.9)], null]]);
   expect(uploads).toEqual([30_000]);

@@ -2,7 +2,7 @@
 
 import { computed, signal } from '@preact/signals';
 import { sameSelection, valuesSet } from '../../session/edit_list';
-import { draftEdit, edits, replaceEdits } from '../../session/edit_log';
+import { draftEdit, edits, reviseEdits } from '../../session/edit_log';
 import type { Edit, MaterialEdit, MaterialValues, Selection } from '../../session/protocol.gen';
 import { sendThrottled } from '../gestures';
 import { mesh } from '../mesh';
@@ -32,7 +32,10 @@ export function editMaterial(set: MaterialValues): void {
 const keysSet = (set: MaterialValues) => (Object.keys(set) as Value[]).filter((key) => set[key] != null).sort().join();
 
 /** Take back what edits did to a value of the selection. */
-export const resetMaterial = (key: Value) => replaceEdits(withoutValue(edits.value, selection.value, key));
+export function resetMaterial(key: Value): void {
+  const select = selection.value;
+  reviseEdits((now) => withoutValue(now, select, key));
+}
 
 const touches = (edit: Edit, select: Selection, key: Value): edit is MaterialEdit => edit.op === 'material' && edit.set[key] != null && sameSelection(edit.select, select);
 

@@ -43,7 +43,8 @@ const isMatter = (edit: Edit) => edit.op === 'matter';
 const floorAt = (drop: number) => ({ height: bounds.value.minimum[2] - drop * objectHeight(), friction: 0.5 });
 const objectHeight = () => Math.max(1e-9, bounds.value.maximum[2] - bounds.value.minimum[2]);
 
-function sceneOf(now: Edit[]): Scene {
+/** As the edits have it. */
+export function sceneOf(now: Edit[]): Scene {
   const edit = now.findLast(isMatter);
   const set = edit?.op === 'matter' ? (edit.scene as Partial<Scene>) : {};
   return { matter: { preset: 'jelly' }, floor: floorAt(DROP_HEIGHT), duration: SECONDS, fps: FPS, particles: PARTICLES.quick, ...set };

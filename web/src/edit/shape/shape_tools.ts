@@ -2,7 +2,7 @@
 
 import { computed, effect, signal } from '@preact/signals';
 import { withReplaced } from '../../session/edit_list';
-import { commitDraft, draftEdit, edits, replaceEdits, reviseEdits } from '../../session/edit_log';
+import { commitDraft, draftEdit, edits, reviseEdits } from '../../session/edit_log';
 import { notify } from '../../session/notices';
 import type { Edit, LatticeMap } from '../../session/protocol.gen';
 import { openedAsset } from '../../session/session';
@@ -48,7 +48,7 @@ export function newestMap<T extends MapType>(type: T): Extract<AnalyticMap, { ty
 /** Show a map in place of the newest one of its type; sent by `commitDraft`. */
 export const draftMap = (map: AnalyticMap) => draftEdit({ op: 'deform', map }, hasMap(map.type));
 
-export const removeMaps = (type: MapType) => replaceEdits(edits.value.filter((edit) => !hasMap(type)(edit)));
+export const removeMaps = (type: MapType) => reviseEdits((now) => now.filter((edit) => !hasMap(type)(edit)));
 
 export const lattice = computed<LatticeMap | null>(() => newestMap('lattice'));
 const shownLattice = () => lattice.value ?? restLattice(bounds.value);
@@ -152,7 +152,7 @@ export function putBack(key: string): void {
   if (shapeTool.value !== 'lattice') return changeHandle(key, (handle) => ({ ...handle, target: null, turn: [0, 0, 0] }));
   const map = lattice.value;
   const corner = map && cornersOf(map).find(({ number }) => number === cornerNumber(key));
-  if (corner) replaceEdits(withReplaced(edits.value, { op: 'deform', map: withCorner(map, corner.number, corner.rest) }, hasMap('lattice')));
+  if (corner) reviseEdits((now) => withReplaced(now, { op: 'deform', map: withCorner(map, corner.number, corner.rest) }, hasMap('lattice')));
 }
 
 /** The Delete key: a handle goes, a corner goes back. */
@@ -164,4 +164,4 @@ export function removeChosen(): void {
   chosenKey.value = null;
 }
 
-export const removeHandles = () => replaceEdits(withHandles(edits.value, []));
+export const removeHandles = () => reviseEdits((now) => withHandles(now, []));

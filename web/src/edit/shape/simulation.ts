@@ -2,13 +2,13 @@
 
 import { computed, effect, signal } from '@preact/signals';
 import { withReplaced } from '../../session/edit_list';
-import { draft, edits, pending, replaceEdits, reviseEdits } from '../../session/edit_log';
+import { draft, edits, pending, reviseEdits } from '../../session/edit_log';
 import { isActive, jobName, jobs, startJob } from '../../session/jobs';
 import { preference } from '../../session/preferences';
 import type { Edit, JobInfo, PoseEdit, SimulateEdit } from '../../session/protocol.gen';
 import { session } from '../../session/session';
 import { newKey } from '../gestures';
-import { FPS, matter, scene, seconds } from './matter';
+import { FPS, matter, scene, sceneOf, seconds } from './matter';
 
 /** Of a clip whose length this browser does not know [s]. */
 const LONGEST_CLIP = 5;
@@ -48,19 +48,19 @@ export const clipOf = (job: JobInfo) => `clips/${job.id}`;
 /** One for each film: however slowly it plays, undo takes it away in one step. */
 let filmKey = newKey();
 
-export const simulate = () => start({ op: 'simulate', scene: scene.value, time: 0 });
-export const playClip = (clip: string) => start({ op: 'pose', clip, time: 0 });
+export const simulate = () => start((now) => ({ op: 'simulate', scene: { ...sceneOf(now) }, time: 0 }));
+export const playClip = (clip: string) => start(() => ({ op: 'pose', clip, time: 0 }));
 
 /** From the first moment on, in place of whatever moved before. */
-function start(edit: Moment): void {
+function start(first: (now: Edit[]) => Moment): void {
   filmKey = newKey();
-  replaceEdits([...edits.value.filter((other) => !isMoment(other)), edit], filmKey);
+  reviseEdits((now) => [...now.filter((other) => !isMoment(other)), first(now)], filmKey);
   playing.value = true;
 }
 
 export function removeMotion(): void {
   playing.value = false;
-  replaceEdits(edits.value.filter((edit) => !isMoment(edit)));
+  reviseEdits((now) => now.filter((edit) => !isMoment(edit)));
 }
 
 /** Have a worker simulate all of it, so that the picture is not held up; the clip can then be played, and rendered by other jobs. */

@@ -1,7 +1,7 @@
 /** The edits in force and those undone; a click goes to the state after that edit. One that the server skips says why, and can be taken out. */
 
 import { describeEdit } from '../../edit/describe_edit';
-import { broken, goTo, log, replaceEdits } from '../../session/edit_log';
+import { broken, goTo, log, reviseEdits } from '../../session/edit_log';
 import { Section } from '../fields';
 
 export function History() {
@@ -12,7 +12,7 @@ export function History() {
         {text}
       </button>
       {skipped && (
-        <button class="take-out" aria-label={`Take out ${text}, which is skipped`} title="Take this edit out" onClick={() => replaceEdits(edits.toSpliced(count - 1, 1))}>
+        <button class="take-out" aria-label={`Take out ${text}, which is skipped`} title="Take this edit out" onClick={() => reviseEdits((now) => now.filter((edit) => edit !== edits[count - 1]))}>
           ×
         </button>
       )}
