@@ -11,10 +11,16 @@ Gradients never decide this: a darker light and a diffuse part trade places with
 Errors of shape and light spoil the predicted mirror S_v, not the constant E, so they count against metal alone: real paint hardly ever says
 "metal", real metal says "paint" wherever its normals are off. So the benefit of the doubt is metal's, and each place hears its surroundings.
 Where light turns with the camera, what arrives at paint changes from view to view as well, and is predicted nearly as badly: then there is less of it.
+And no metal is dark: what reflects less than a tenth in its brightest channel is lacquer, however well a dark mirror explains it.
+
+The same sums say how bright the light is (light_scale). d and f trade places with it, but what matter of any kind reflects at grazing angles (B_v),
+and paint at any (0.04), does not.
 
 In: the mesh through its tracer, photographs, light. Out: evidence in -1 (no metal) .. 1 (metal) a vertex, near 0 where nothing is known.
 """
 
+import math
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -41,6 +47,11 @@ DOUBT = 0.4
 """Of the residuals' logarithms: by how much metal may explain worse and is believed, where it leaves much unexplained."""
 DOUBT_TURNED = 0.2
 """The same where light turns with the camera. Drafts, metallic RMSE of bunny and teapot: .45 and .38 with 0.4, .17 and .42 with 0.2, .09 and .54 with 0."""
+DARKEST = (0.1, 0.2)
+"""Reflectance of metal, in its brightest channel: below the first none is that dark, from the second on nothing speaks against it. Of captures whose
+truth is known true metal has 0.34 and more, carved bronze 0.15 and more; black and dark red lacquer, explained as metal, 0.15 and less."""
+TOO_DARK = 1.4
+"""Of the residuals' logarithms: by how much metal must explain better to be believed where none is that dark."""
 LOST = 0.45
 """Relative error of the better explanation above which neither says much: there the shape is wrong, not the paint."""
 STRONGEST = 2.0
@@ -53,11 +64,59 @@ DECISIVE = 0.3
 """Agreement of a place and its surroundings, -1..1, at which evidence is 0.76."""
 
 
-def metal_evidence(tracer: AbstractTracer, targets: list[ViewTarget], light_of: LightOf, edges: MeshEdges) -> Float[Tensor, "vertex"]:
+SCALES = tuple(2 ** (k / 2) for k in range(-6, 7))
+"""Of the light, that are compared."""
+RIGHT_SCALE = 1.4
+"""Factor either way within which the light's brightness is let be: captures whose truth is known are found within 1.25."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSums:
+    """Sums over the views of each vertex, (vertex, 3), of products of the photograph p, what white paint sends back e, and of the mirror lobe the parts
+    that go with the reflectance, a, and without, b; errors are relative (DARK)."""
+
+    pp: Tensor
+    pe: Tensor
+    pa: Tensor
+    pb: Tensor
+    ee: Tensor
+    ea: Tensor
+    eb: Tensor
+    aa: Tensor
+    ab: Tensor
+    bb: Tensor
+    views: Float[Tensor, "vertex"]
+    """Number of them."""
+
+    @property
+    def floor(self) -> Float[Tensor, "vertex"]:
+        """Of an error: the photographs' noise."""
+        return 3 * NOISE**2 * self.views
+
+    def error_of_paint(self, scale: float = 1.0) -> Float[Tensor, "vertex"]:
+        """That the best paint leaves under the light times `scale`."""
+        f = F0 * scale
+        ey = self.pe - scale * self.eb - f * self.ea
+        yy = self.pp - 2 * scale * self.pb + scale**2 * self.bb - 2 * f * (self.pa - scale * self.ab) + f**2 * self.aa
+        d = (ey / self.ee.clamp(min=1e-12)).clamp(0, scale)
+        return (yy - 2 * d * ey + d**2 * self.ee).clamp(min=0).sum(-1)
+
+    def error_of_metal(self, scale: float = 1.0) -> Float[Tensor, "vertex"]:
+        """That the best metal leaves under the light times `scale`."""
+        f, ay = self.reflectance(scale), self.pa - scale * self.ab
+        yy = self.pp - 2 * scale * self.pb + scale**2 * self.bb
+        return (yy - 2 * f * ay + f**2 * self.aa).clamp(min=0).sum(-1)
+
+    def reflectance(self, scale: float = 1.0) -> Float[Tensor, "vertex 3"]:
+        """Of that metal, times `scale`."""
+        return ((self.pa - scale * self.ab) / self.aa.clamp(min=1e-12)).clamp(0, scale)
+
+
+def view_sums(tracer: AbstractTracer, targets: list[ViewTarget], light_of: LightOf) -> ViewSums:
     """Of the tracer's mesh, whose roughness is taken as known."""
     mesh = tracer.mesh
     count, device = len(mesh.vertices), mesh.vertices.device
-    sums = torch.zeros(7, count, 3, device=device)  # w, E y0, E^2 (of no metal); A y, A^2, y^2 (of metal); y0^2
+    sums = torch.zeros(10, count, 3, device=device)
     views = torch.zeros(count, device=device)
     for target in targets:
         here = seen_vertices(tracer, target)
@@ -74,28 +133,54 @@ def metal_evidence(tracer: AbstractTracer, targets: list[ViewTarget], light_of: 
         lit = partial(shaded, transmittance=transmittance, hit_radiance=met, open_share=light.open_share[seen])
         b = lit(diffuse_albedo=0 * white, f0=0 * white)
         a, e = lit(diffuse_albedo=0 * white, f0=white) - b, lit(diffuse_albedo=white, f0=0 * white) - b
-        y = photo - b
-        y0 = y - F0 * a
         weight = 1 / (photo + DARK) ** 2
-        for k, term in enumerate((torch.ones_like(y), e * y0, e * e, a * y, a * a, y * y, y0 * y0)):
-            sums[k].index_add_(0, seen, weight * term)
+        terms = (photo, e, a, b)
+        products = (first * second for k, first in enumerate(terms) for second in terms[k:])
+        for k, product in enumerate(products):
+            sums[k].index_add_(0, seen, weight * product)
         views.index_add_(0, seen, torch.ones_like(roughness))
-    _, ey, ee, ay, aa, yy, y0y0 = sums
-    diffuse = (ey / ee.clamp(min=1e-12)).clamp(0, 1)
-    plain = (y0y0 - 2 * diffuse * ey + diffuse**2 * ee).clamp(min=0).sum(-1)
-    reflectance = (ay / aa.clamp(min=1e-12)).clamp(0, 1)
-    metal = (yy - 2 * reflectance * ay + reflectance**2 * aa).clamp(min=0).sum(-1)
-    floor = 3 * NOISE**2 * views
-    plain, metal = (_averaged(error + floor, views, edges) for error in (plain, metal))
-    floor = _averaged(floor, views, edges)
+    pp, pe, pa, pb, ee, ea, eb, aa, ab, bb = sums.unbind()
+    return ViewSums(pp, pe, pa, pb, ee, ea, eb, aa, ab, bb, views)
+
+
+def metal_evidence(sums: ViewSums, edges: MeshEdges, turned: bool, scale: float = 1.0) -> Float[Tensor, "vertex"]:
+    """What the sums of a mesh with these edges say under the light times `scale`. `turned`: the light turns with the camera."""
+    views, noise = sums.views, sums.floor
+    plain = _averaged(sums.error_of_paint(scale) + noise, views, edges)
+    metal = _averaged(sums.error_of_metal(scale) + noise, views, edges)
+    floor = _averaged(noise, views, edges)
     unexplained = 1 - floor / metal.clamp(min=1e-12)
     relative_error = ((torch.minimum(plain, metal) - floor).clamp(min=0) / 3).sqrt()
     trust = 1 / (1 + (relative_error / LOST) ** 4)
-    doubt = DOUBT if all(target.light_from_world is None for target in targets) else DOUBT_TURNED
+    brightest = _averaged(sums.reflectance(scale).amax(-1) / scale * views, views, edges)
+    dark = ((DARKEST[1] - brightest) / (DARKEST[1] - DARKEST[0])).clamp(0, 1)
+    doubt = (DOUBT_TURNED if turned else DOUBT) - TOO_DARK * dark * dark * (3 - 2 * dark)
     better = torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) + doubt * trust * unexplained
     strength = torch.where(views >= FEWEST_VIEWS, trust * better.abs().clamp(max=STRONGEST), torch.zeros_like(better))
     kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER)
     return torch.tanh(kind / DECISIVE)
+
+
+def light_scale(sums: ViewSums) -> float:
+    """By what factor the light should be brighter, and paint and metal darker, to explain the photographs best; 1 where it is within RIGHT_SCALE of right.
+
+    Light that is three times too bright makes chrome look like lead: its pictures are right, and those under any other light too dark.
+    """
+    seen = sums.views >= FEWEST_VIEWS
+    if not bool(seen.any()):
+        return 1.0
+
+    def left(scale: float) -> float:
+        error = torch.minimum(sums.error_of_metal(scale), sums.error_of_paint(scale)) + sums.floor
+        return float(torch.log(error[seen] / sums.views[seen]).mean())
+
+    errors = [left(scale) for scale in SCALES]
+    best = min(range(len(SCALES)), key=errors.__getitem__)
+    scale = SCALES[best]
+    if 0 < best < len(SCALES) - 1:
+        below, here, above = errors[best - 1 : best + 2]
+        scale *= (SCALES[1] / SCALES[0]) ** ((below - above) / (2 * max(below - 2 * here + above, 1e-9)))
+    return scale if abs(math.log(scale)) > math.log(RIGHT_SCALE) else 1.0
 
 
 def _averaged(error: Tensor, views: Tensor, edges: MeshEdges) -> Tensor:

@@ -109,7 +109,7 @@ class _Steps:
         total, rounds = self.settings.iterations, self.settings.rounds
         if done < total and done * rounds // total > (done - 1) * rounds // total:
             self.surface.move(self.settings.moves)
-            self.surface.look_for_metal(self.targets)
+            self.surface.look_for_metal(self.targets, self.settings.moves)
 
     def step(self, iteration: int) -> StepLoss:
         parameters, settings = self.state.parameters, self.settings

@@ -156,7 +156,7 @@ class _Steps:
         """Where normals and outlines say, and what is metal there."""
         self.surface.move(self.settings.moves)
         if self.state.iteration > self.settings.metal_from * self.settings.iterations:
-            self.surface.look_for_metal(self.targets)
+            self.surface.look_for_metal(self.targets, self.settings.moves)
 
     def step(self, iteration: int) -> StepLoss:
         if iteration == 0:

@@ -4,6 +4,7 @@ In: the state of a fit on the mesh (fit_surface, fit_mesh_materials), its faces,
 nearer to theirs, the share of an open sky's irradiance that arrives at each, and on demand what is metal; a tracer of the moved mesh.
 """
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -12,12 +13,13 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
 from drgs.reconstruct.fit.evidence.matched_texture import matched_texture
-from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
+from drgs.reconstruct.fit.evidence.metal_evidence import light_scale, metal_evidence, view_sums
 from drgs.reconstruct.fit.fit_loop import FitState
-from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.environment_pyramid import ENVIRONMENT_PYRAMID, environment_table
 from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, irradiance_share
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
+from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
@@ -141,11 +143,17 @@ class MovingSurface:
         return light_of_views(tables, parameters["open_share"], torch.sigmoid(parameters["albedo_logits"].detach()), self._sky)
 
     @torch.no_grad()
-    def look_for_metal(self, targets: list[ViewTarget]) -> None:
-        """What the photographs say now of which places are metal."""
+    def look_for_metal(self, targets: list[ViewTarget], settings: MoveSettings) -> None:
+        """What the photographs say now of which places are metal, and of how bright the light is."""
         parameters = self._state.parameters
         tables = filter_environment(environment_table(parameters))
-        parameters["metal"].copy_(metal_evidence(self.tracer, targets, self.light_of(tables), self.edges))
+        sums = view_sums(self.tracer, targets, self.light_of(tables))
+        scale = light_scale(sums)
+        parameters["metal"].copy_(metal_evidence(sums, self.edges, self._sky is not None, scale))
+        if scale != 1:
+            parameters[f"environment_{ENVIRONMENT_PYRAMID[0]}"] += math.log(scale)
+            parameters["albedo_logits"].copy_(logits_of_shares(torch.sigmoid(parameters["albedo_logits"]) / scale))
+            self.relight(settings.share_rays)
 
 
 def mesh_from_surface_fit(state: FitState, faces: Tensor) -> TriangleMesh:

@@ -7,7 +7,7 @@ import torch
 
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.color import srgb_from_linear
-from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
+from drgs.reconstruct.fit.evidence.metal_evidence import light_scale, metal_evidence, view_sums
 from drgs.reconstruct.fit.light.mesh_light import LightOf, at_corners, corner_weights
 from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
@@ -64,13 +64,18 @@ def pictures(mesh: TriangleMesh, tables: torch.Tensor, turned: bool = False) -> 
     return targets
 
 
+def evidence_of(mesh: TriangleMesh, targets: list[ViewTarget], tables: torch.Tensor) -> torch.Tensor:
+    """Under light that nothing keeps from arriving and that stands still."""
+    return metal_evidence(view_sums(build_tracer(mesh), targets, open_light(mesh, tables)), mesh_edges(mesh.faces), False)
+
+
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_each_is_known_for_what_it_is_whatever_was_thought_before(metallic: float):
     mesh = dataclasses.replace(sphere_mesh(subdivisions=3, albedo=0.6, roughness=0.25), metallic=torch.full((642,), metallic))
     tables = filter_environment(light())
     targets = pictures(mesh, tables)
     guessed = dataclasses.replace(mesh, metallic=torch.full((642,), 0.5), albedo=torch.full((642, 3), 0.3))
-    evidence = metal_evidence(build_tracer(guessed), targets, open_light(mesh, tables), mesh_edges(mesh.faces))
+    evidence = evidence_of(guessed, targets, tables)
     seen = evidence != 0  # the twelve views go around the equator
     assert float(seen.float().mean()) > 0.3
     assert float(((2 * metallic - 1) * evidence > 0.5)[seen].float().mean()) > 0.95
@@ -80,7 +85,7 @@ def test_a_sphere_half_of_metal_is_divided_where_it_is():
     mesh = sphere_mesh(subdivisions=4, albedo=0.6, roughness=0.3)
     mesh = dataclasses.replace(mesh, metallic=(mesh.vertices[:, 2] > 0).float())
     tables = filter_environment(light())
-    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), open_light(mesh, tables), mesh_edges(mesh.faces))
+    evidence = evidence_of(mesh, pictures(mesh, tables), tables)
     away = (mesh.vertices[:, 2].abs() > 0.3) & (evidence != 0)
     assert int(away.sum()) > 200
     right = (evidence > 0) == (mesh.vertices[:, 2] > 0)
@@ -90,7 +95,7 @@ def test_a_sphere_half_of_metal_is_divided_where_it_is():
 def test_what_no_view_shows_is_left_open():
     mesh = sphere_mesh(subdivisions=3)
     tables = filter_environment(light())
-    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables)[:1], open_light(mesh, tables), mesh_edges(mesh.faces))
+    evidence = evidence_of(mesh, pictures(mesh, tables)[:1], tables)
     assert float(evidence.abs().max()) == 0.0
 
 
@@ -101,7 +106,7 @@ def test_wrong_normals_do_not_turn_one_into_the_other(metallic: float):
     targets = pictures(mesh, tables)
     tilt = 0.15 * torch.sin(9 * mesh.vertices.roll(1, 1))
     tilted = dataclasses.replace(mesh, normals=torch.nn.functional.normalize(mesh.normals + tilt, dim=-1))
-    evidence = metal_evidence(build_tracer(tilted), targets, open_light(mesh, tables), mesh_edges(mesh.faces))
+    evidence = evidence_of(tilted, targets, tables)
     around = mesh.vertices[:, 2].abs() < 0.6
     assert float(((2 * metallic - 1) * evidence > 0)[around].float().mean()) > 0.98
 
@@ -109,7 +114,7 @@ def test_wrong_normals_do_not_turn_one_into_the_other(metallic: float):
 def test_paint_that_looks_the_same_from_everywhere_is_not_called_metal_for_want_of_proof():
     mesh = sphere_mesh(subdivisions=3, albedo=0.6, roughness=1.0)
     tables = filter_environment(torch.ones(128, 256, 3))
-    evidence = metal_evidence(build_tracer(mesh), pictures(mesh, tables), open_light(mesh, tables), mesh_edges(mesh.faces))
+    evidence = evidence_of(mesh, pictures(mesh, tables), tables)
     assert float(evidence.max()) < 0.3
 
 
@@ -122,6 +127,31 @@ def test_under_light_that_turns_with_the_camera_each_is_known_as_well(metallic: 
     tilted = dataclasses.replace(mesh, normals=torch.nn.functional.normalize(mesh.normals + tilt, dim=-1))
     tracer = build_tracer(tilted)
     light_of = light_of_views(tables, torch.ones_like(mesh.vertices), mesh.albedo, seen_sky(tracer))
-    evidence = metal_evidence(tracer, targets, light_of, mesh_edges(mesh.faces))
+    evidence = metal_evidence(view_sums(tracer, targets, light_of), mesh_edges(mesh.faces), True)
     around = mesh.vertices[:, 2].abs() < 0.6
     assert float(((2 * metallic - 1) * evidence > 0)[around].float().mean()) > 0.95
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+@pytest.mark.parametrize("wrong", [0.3, 1.0, 3.0])
+def test_light_is_found_as_bright_as_it_is_whatever_the_paint_was_thought_to_be(metallic: float, wrong: float):
+    mesh = dataclasses.replace(sphere_mesh(subdivisions=3, albedo=0.3, roughness=0.25), metallic=torch.full((642,), metallic))
+    targets = pictures(mesh, filter_environment(light()))
+    guessed = dataclasses.replace(mesh, albedo=mesh.albedo / wrong if wrong > 1 else mesh.albedo)
+    tables = filter_environment(wrong * light())
+    sums = view_sums(build_tracer(guessed), targets, open_light(guessed, tables))
+    assert light_scale(sums) == (1.0 if wrong == 1 else pytest.approx(1 / wrong, rel=0.1))
+    assert light_scale(view_sums(build_tracer(guessed), [], open_light(guessed, tables))) == 1.0  # of nothing nothing follows
+
+
+@pytest.mark.parametrize(("albedo", "called_metal"), [(0.08, False), (0.4, True)])
+def test_no_metal_is_dark(albedo: float, called_metal: bool):
+    mesh = dataclasses.replace(sphere_mesh(subdivisions=3, albedo=albedo, roughness=0.25), metallic=torch.ones(642))
+    tables = filter_environment(light())
+    targets = pictures(mesh, tables)
+    tilted = dataclasses.replace(
+        mesh, normals=torch.nn.functional.normalize(mesh.normals + 0.15 * torch.sin(9 * mesh.vertices.roll(1, 1)), dim=-1)
+    )
+    evidence = evidence_of(tilted, targets, tables)
+    around = mesh.vertices[:, 2].abs() < 0.6
+    assert float(((evidence > 0) == called_metal)[around].float().mean()) > 0.9

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence
+from drgs.reconstruct.fit.evidence.metal_evidence import metal_evidence, view_sums
 from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.view_targets import ViewTarget
@@ -25,7 +25,7 @@ def ball(metallic: float, roughness: float = 0.25) -> TriangleMesh:
 
 def certainty_of(mesh: TriangleMesh, targets: list[ViewTarget], tables: Tensor) -> Certainty:
     tracer, light_of = build_tracer(mesh), open_light(mesh, tables)
-    evidence = metal_evidence(tracer, targets, light_of, mesh_edges(mesh.faces))
+    evidence = metal_evidence(view_sums(tracer, targets, light_of), mesh_edges(mesh.faces), False)
     return vertex_certainty(tracer, targets, light_of, evidence)
 
 

@@ -1,0 +1,50 @@
+"""A drawn capture: what the build reads is there, and the maps are of the matter that was asked for."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from benchmarks import draw_scene
+from drgs.evaluate.metrics import score_renders
+from drgs.exchange.exr import encode_environment
+from drgs.reconstruct.capture.load_views import load_views
+from tests.render.closed_form_scenes import sphere_mesh
+
+
+def small_scene(folder: Path) -> Path:
+    """A ball, seen by three cameras at one place."""
+    folder.mkdir()
+    ball = sphere_mesh(subdivisions=2)
+    trimesh.Trimesh(ball.vertices.numpy(), ball.faces.numpy(), process=False).export(folder / "gt_mesh.ply")
+    pose = np.eye(4)
+    pose[2, 3] = 4
+    frames = [{"file_path": f"./SET/r_00{k}", "transform_matrix": pose.tolist()} for k in range(3)]
+    for name in ("train", "test"):
+        text = json.dumps({"camera_angle_x": 0.55, "w": 16, "h": 16, "frames": frames})
+        (folder / f"transforms_{name}.json").write_text(text.replace("SET", name))
+    for name, radiance in (("lamp", 0.5), ("sky", 1.0)):
+        (folder / f"{name}.exr").write_bytes(encode_environment(np.full((8, 16, 3), radiance, np.float32)))
+    return folder
+
+
+def test_the_capture_is_one_that_builds_read_and_scores_are_made_of(tmp_path: Path):
+    scene = small_scene(tmp_path / "scene")
+    chosen = ["--matter", "chrome", "--light", str(scene / "lamp.exr"), "--new-light", str(scene / "sky.exr"), "--spp", "8"]
+    draw_scene.main([str(scene), str(tmp_path / "out"), *chosen])
+    views = load_views(tmp_path / "out", 64)
+    assert len(views.cameras) == 3 and views.has_masks
+    with np.load(tmp_path / "out" / "test" / "r_000_aov.npz") as stored:
+        inside = stored["aov"][..., 9] > 0.5
+        assert inside.any() and not inside.all()
+        assert stored["aov"][inside][:, 8].min() == 1.0 and stored["aov"][inside][:, 7] == pytest.approx(0.12, abs=1e-3)
+    # Chrome under even light is as bright as its albedo says.
+    seen = np.asarray(Image.open(tmp_path / "out" / "relight" / "sky" / "r_000.png").convert("RGB"), np.float64)[inside] / 255
+    assert seen[:, 0].mean() == pytest.approx(0.93, abs=0.03)
+    figures = score_renders(tmp_path / "out", tmp_path / "out")
+    assert figures["views"]["psnr"] > 90
+    with pytest.raises(ValueError, match="is there already"):
+        draw_scene.main([str(scene), str(tmp_path / "out"), *chosen])
