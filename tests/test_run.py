@@ -33,14 +33,14 @@ def test_scripts_are_executable_and_parse(script: str):
 def test_help_names_every_command():
     result = run("help")
     assert result.returncode == 0
-    assert all(f"./run {name}" in result.stdout for name in ("setup", "demo", "test", "lint", "docs", "bench", "wheel"))
+    assert all(f"./run {name}" in result.stdout for name in ("setup", "demo", "test", "lint", "docs", "bench", "wheel", "blender"))
 
 
 @posix
 def test_an_unknown_command_is_refused_with_those_there_are():
     result = run("nonsense")
     assert result.returncode == 2
-    assert "'nonsense'" in result.stderr and "setup, demo, test, lint, docs, bench or wheel" in result.stderr
+    assert "'nonsense'" in result.stderr and "setup, demo, test, lint, docs, bench, wheel or blender" in result.stderr
 
 
 FAKE_PYTHON = """#!/bin/sh
