@@ -29,7 +29,7 @@ export async function takeFile(file: File, onProgress: (progress: UploadProgress
     await attempt(refreshCaptures());
     void openCapture(added);
   } else {
-    notify(`“${file.name}” is none of the kinds that can be dropped here: photos, a film, a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr).`);
+    notify(`“${file.name}” is none of the kinds that can be dropped here: photos, a film, a capture (.zip), an asset’s folder, a mesh (.glb, .obj, .ply) or a light (.exr, .hdr).`);
   }
 }
 

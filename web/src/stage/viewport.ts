@@ -192,6 +192,7 @@ export class Viewport {
     this.camera.updateProjectionMatrix();
     this.showAll(this.homeDirection, false);
     this.controls.update(0);
+    this.updateLayers();
   };
 
   private onFrame = (header: FrameHeader, picture: ImageBitmap, cameraNumber: number) => {
@@ -212,6 +213,8 @@ export class Viewport {
   }
 
   private updateLayers(): void {
+    // The mesh may come before the server has said where to look at it from: until then it would be seen from a place of no meaning.
+    if (this.framedAsset !== openedAsset.value) return;
     const picture = !this.local.standsIn ? 'traced' : this.fresh ? 'fresh' : 'stale';
     if (this.stage.dataset.picture === picture || !(this.traced.exists || picture === 'stale')) return;
     this.stage.dataset.picture = picture;
@@ -231,6 +234,7 @@ export class Viewport {
       this.updateFresh();
     });
     effect(() => {
+      if (openedAsset.value !== this.framedAsset) this.stage.removeAttribute('data-picture');
       session.value;
       this.cameraNumber = -1; // a new stream counts anew
       untracked(() => this.setFresh(false));

@@ -204,7 +204,7 @@ function DropZone() {
   }, []);
   return over ? (
     <div class="dropzone">
-      <p>Drop photos, their folder, a film, a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr)</p>
+      <p>Drop photos, their folder, a film, a capture (.zip), an asset’s folder, a mesh (.glb, .obj, .ply) or a light (.exr, .hdr)</p>
     </div>
   ) : null;
 }

@@ -43,8 +43,9 @@ export function Inspector() {
           </button>
         ))}
       </div>
-      <div id="tab-page" class="tab-page" role="tabpanel" aria-labelledby={`tab-${chosen.id}`} tabIndex={0}>
-        <chosen.Panel key={chosen.id} />
+      {/* The key: each page begins at its top, however far the one before was scrolled. */}
+      <div key={chosen.id} id="tab-page" class="tab-page" role="tabpanel" aria-labelledby={`tab-${chosen.id}`} tabIndex={0}>
+        <chosen.Panel />
       </div>
       <History />
     </aside>

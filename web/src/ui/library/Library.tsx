@@ -76,7 +76,7 @@ function NewBuild() {
           void takeFiles(chosen);
         }}
       />
-      <p class="hint">Or drop photos, their folder, a film, a capture (.zip), a mesh (.glb, .obj, .ply) or a light (.exr, .hdr) anywhere on this page.</p>
+      <p class="hint">Or drop photos, their folder, a film, a capture (.zip), an asset’s folder, a mesh (.glb, .obj, .ply) or a light (.exr, .hdr) anywhere on this page.</p>
       {uploading.value && <Upload {...uploading.value} />}
     </Section>
   );
@@ -103,7 +103,7 @@ function Assets() {
       {list === null ? (
         <p class="hint">Asking the server…</p>
       ) : list.length === 0 ? (
-        <p class="hint">None yet. Build the sample to get one.</p>
+        <p class="hint">None yet. Build the sample to get one, or drop the folder of one that a command has built.</p>
       ) : (
         <ul class="assets">
           {list.map((asset) => (

@@ -1,0 +1,59 @@
+"""What somebody meets who follows the tutorial for the first time: an asset from the command line, its first picture, and the pages of the inspector."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, WebSocketRoute, expect
+
+from drgs.convert.import_mesh import import_mesh
+from drgs.scene.asset import save_asset
+from tests.web.browser import RunningServer
+from tests.web.conftest import Viewer, shown_page, wait_until
+from tests.web.test_dropped_photos import drop_folder
+
+
+@pytest.fixture
+def page(server: RunningServer, browser: Browser) -> Iterator[Viewer]:
+    """A page of one test alone, on which nothing is open."""
+    with shown_page(server, browser) as shown:
+        yield shown
+
+
+def test_the_folder_of_an_asset_that_a_command_wrote_opens_when_dropped(page: Viewer, ball_file: Path, tmp_path: Path) -> None:
+    save_asset(import_mesh(ball_file), tmp_path / "teal ball")
+    drop_folder(page, tmp_path / "teal ball")
+    expect(page.page.get_by_role("heading", name="teal ball", exact=True)).to_be_visible()
+    page.settle()
+
+
+def test_the_mesh_is_not_drawn_before_the_camera_has_its_place(page: Viewer, ball_asset: str) -> None:
+    held: list[tuple[WebSocketRoute, str | bytes]] = []
+    holds = True
+
+    def hold(socket: WebSocketRoute) -> None:
+        """A server that takes its time over the asset, while the mesh comes quickly."""
+        socket.connect_to_server().on_message(lambda message: held.append((socket, message)) if holds else socket.send(message))
+
+    page.page.route_web_socket("**/*", hold)
+    page.page.goto("about:blank")
+    page.page.goto(f"{page.server.address}/#token={page.server.token}&asset={ball_asset}")
+    wait_until(lambda: "overlay" in page.stage() and held, "mesh and light in the browser")
+    for _ in range(2):
+        page.page.keyboard.press("p")  # the local picture off and on: the page looks anew at what it may show
+    assert "picture" not in page.stage()
+    holds = False
+    for socket, message in held:
+        socket.send(message)
+    wait_until(lambda: page.stage().get("picture") in ("stale", "fresh"), "a picture")
+    page.settle()
+
+
+def test_each_page_of_the_inspector_begins_at_its_top(ball: Viewer) -> None:
+    for name, first in (("Light", "Captured"), ("Shape", "Twist"), ("Export", "Width"), ("Material", "Region")):
+        panel = ball.page.get_by_role("tabpanel")
+        panel.evaluate("panel => { panel.scrollTop = panel.scrollHeight; }")
+        assert panel.evaluate("panel => panel.scrollTop") > 0
+        ball.open_tab(name)
+        expect(ball.page.get_by_role("tabpanel", name=name)).to_be_visible()
+        assert ball.page.get_by_role("tabpanel").evaluate("panel => panel.scrollTop") == 0, f"{name}, where {first} is on top"
