@@ -243,7 +243,7 @@ def build(
         print(json.dumps({"stage": "done", "fraction": 1.0, "asset": str(out), "provenance": asset.provenance}), flush=True)
     else:
         print(
-            f"Asset written to {out}: {len(asset.mesh.faces)} faces. To look at it: drgs serve, and drop the folder, zipped, on its page",
+            f"Asset written to {out}: {len(asset.mesh.faces)} faces. To look at it: drgs serve, and drop the folder on its page",
             file=sys.stderr,
         )
     wrong = complaint(asset.provenance["outline_agreement"])
@@ -305,7 +305,9 @@ def render(
         frames = render_cameras(scene, views, out, settings, aov, advance, light_from_world(opened, changes))
     if as_json:
         print(json.dumps({"out": str(out), "frames": frames}))
-    elif explain:
+    else:
+        print(f"{len(frames)} {'picture' if len(frames) == 1 else 'pictures'} written to {out}", file=sys.stderr)
+    if explain and not as_json:
         for frame in frames:
             for left_out in frame["skipped"]:
                 print(f"{frame['name']}: left out {left_out['what']}: {left_out['why']} ({left_out['bound']})")
@@ -446,6 +448,8 @@ def doctor(
         _print_document({name: value for name, value in report.items() if name not in ("findings", "advice", "summary", "marks")}, as_json)
         for line in [f"{finding['level']}: {finding['sentence']}" for finding in report["findings"]] + report["advice"]:
             print(line)
+        if not report["findings"]:
+            print("Nothing was found that would hurt a build.")
         if sheet is not None:
             print(f"All pictures: {sheet}")
     else:

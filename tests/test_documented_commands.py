@@ -68,11 +68,14 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 def test_the_tutorial_can_be_followed(reader: Path):
+    said = ""
     for name, *arguments in commands(ROOT / "docs" / "tutorial.md"):
         if name in SLOW_OR_ENDLESS:
             continue
         result = CliRunner().invoke(app, [name, *arguments])
         assert result.exit_code == 0, f"drgs {name} {' '.join(arguments)}: {result.output}"
+        said += result.output
+    assert "Nothing was found that would hurt a build." in said and "1 picture written to out/gold" in said and "views.psnr" in said
     made = {path.name for path in reader.iterdir()}
-    assert {"sheet.png", "sample.html", "sample.glb", "sample.ply", "sample.spz", "light.exr"} <= made
+    assert {"sheet.png", "sample.html", "sample.glb", "sample.ply", "sample.spz", "light.exr", "sample.usdz"} <= made
     assert list((reader / "out" / "gold").glob("*.png")) and list((reader / "out" / "pictures").glob("*.png"))
