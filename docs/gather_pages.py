@@ -22,6 +22,8 @@ GATHERED = {
     "changelog.md": "CHANGELOG.md",
 }
 """Page of the site: file of the repository."""
+WIDTH = 76
+"""Of commands' help, in characters: a page shows that many side by side."""
 LIST_ITEM = re.compile(r"(- |1\. )")
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
@@ -76,12 +78,12 @@ def commands_page() -> str:
     from drgs.cli import app
 
     group = typer.main.get_command(app)
-    context = typer.Context(group, info_name="drgs", terminal_width=88, max_content_width=88)
+    context = typer.Context(group, info_name="drgs", terminal_width=WIDTH, max_content_width=WIDTH)
     parts = ["# Commands", "Wrong input ends with one sentence on stderr; with `--json`, stdout holds one JSON document and nothing else."]
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         if command is None or command.hidden:
             continue
-        inner = typer.Context(command, info_name=name, parent=context, terminal_width=88, max_content_width=88)
+        inner = typer.Context(command, info_name=name, parent=context, terminal_width=WIDTH, max_content_width=WIDTH)
         parts += [f"## drgs {name}", f"```text\n{command.get_help(inner).strip()}\n```"]
     return "\n\n".join(parts) + "\n"

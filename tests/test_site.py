@@ -1,5 +1,6 @@
 """The documents build as a site, strictly and from what is here: every page in the menu, every link and every name of the API found."""
 
+import html
 import os
 import re
 import subprocess
@@ -33,6 +34,21 @@ def test_the_readme_is_the_first_page(site: Path):
 def test_every_command_is_described_as_it_describes_itself(site: Path):
     page = (site / "commands.html").read_text()
     assert all(f"Usage: drgs {name} " in page for name in ("build", "render", "import", "export", "simulate", "eval", "doctor", "serve"))
+
+
+@pytest.mark.slow
+def test_no_line_of_a_commands_help_is_cut_by_its_box(site: Path):
+    from docs.gather_pages import WIDTH
+
+    blocks = re.findall(r"<code>(.*?)</code></pre>", (site / "commands.html").read_text(), re.DOTALL)
+    lines = [html.unescape(re.sub("<[^>]+>", "", line)) for block in blocks for line in block.splitlines()]
+    assert len(lines) > 100 and [line for line in lines if len(line) > WIDTH] == []
+
+
+@pytest.mark.slow
+def test_pages_lead_on_to_the_next(site: Path):
+    page = (site / "tutorial.html").read_text()
+    assert re.search(r'rel="prev".*?rel="next"', page, re.DOTALL) and "md-footer__link--next" in page
 
 
 def test_the_api_has_every_public_name(site: Path):
