@@ -116,6 +116,31 @@ def test_wrong_edits_are_one_sentence_that_names_the_field(tmp_path: Path):
     assert "0..1" in result.stderr
 
 
+def test_an_edit_that_lacks_a_field_is_named_with_its_file_and_where_edits_are_described(tmp_path: Path):
+    edits = tmp_path / "gold.json"
+    edits.write_text('[{"op": "material", "set": {"roughness": 0.3}}]')
+    result = drgs_here("render", tmp_path, tmp_path / "out", "--cameras", tmp_path / "transforms.json", "--edits", edits)
+    assert_one_sentence(result)
+    assert f"{edits}: edits: 0.material.select: Field required" in result.stderr and "docs/protocol.md" in result.stderr
+
+
+def test_a_folder_in_the_place_of_a_file_of_cameras_is_one_sentence(tmp_path: Path):
+    result = drgs_here("render", tmp_path, tmp_path / "out", "--cameras", tmp_path)
+    assert_one_sentence(result)
+    assert "is a folder; expected a file of cameras, such as an asset's cameras.json" in result.stderr
+
+
+@pytest.mark.parametrize("command", ["doctor", "build"])
+@pytest.mark.parametrize("file", ["mesh.glb", "thumb.jpg"])
+def test_an_asset_in_the_place_of_photographs_is_called_one(tmp_path: Path, command: str, file: str):
+    (tmp_path / "cup").mkdir()
+    (tmp_path / "cup" / "asset.json").write_text("{}")
+    (tmp_path / "cup" / file).touch()
+    result = drgs_here(command, tmp_path / "cup", *([tmp_path / "out"] if command == "build" else []))
+    assert_one_sentence(result)
+    assert "is an asset, which a build wrote; expected photographs or a capture" in result.stderr
+
+
 def test_pose_says_in_one_sentence_what_is_wrong_with_a_folder(tmp_path: Path):
     (tmp_path / "photos").mkdir()
     result = drgs_here("pose", tmp_path / "photos", tmp_path / "posed", "--json")

@@ -348,6 +348,13 @@ def _begin_alike(one: tuple[Edit, ...], other: tuple[Edit, ...], count: int) -> 
 
 
 def load_edits(path: Path) -> list[Edit]:
-    """Read an edits file: a JSON list, or one edit alone."""
+    """Read an edits file: a JSON list, or one edit alone.
+
+    Raises:
+        ValueError: one sentence naming the file and the first wrong field.
+    """
     text = path.read_text().strip()
-    return parse_edits(text if text.startswith("[") else f"[{text}]")
+    try:
+        return parse_edits(text if text.startswith("[") else f"[{text}]")
+    except ValueError as error:
+        raise ValueError(f"{path}: {error} (edits are counted from 0; docs/protocol.md says what each of them holds)") from error

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drgs.reconstruct.capture.camera_files import check_readers, is_photograph, without_developed
-from drgs.reconstruct.capture.load_views.checks import find_masks, is_folder
+from drgs.reconstruct.capture.load_views.checks import find_masks, is_folder, refuse_asset
 from drgs.reconstruct.capture.load_views.colmap import find_model
 from drgs.reconstruct.capture.load_views.metashape import find_cameras_file
 
@@ -35,7 +35,7 @@ def list_photos(folder: Path) -> list[Photo]:
     """The photographs of a folder, sorted by path.
 
     Raises:
-        ValueError: one sentence: no folder, posed already, too few pictures, or masks that do not fit them.
+        ValueError: one sentence: no folder, an asset, posed already, too few pictures, or masks that do not fit them.
     """
     if not is_folder(folder):
         raise ValueError(f"{folder}: no such folder, expected one with photographs.")
@@ -44,6 +44,7 @@ def list_photos(folder: Path) -> list[Photo]:
     images = without_developed([path for path in files if is_photograph(path)])
     check_readers(images)
     if len(images) < FEWEST_PHOTOS:
+        refuse_asset(folder)
         others = Counter(path.suffix.lower() for path in files if path.suffix.lower() in OTHER_SUFFIXES)
         beside = f" (and {', '.join(f'{count} {suffix} files' for suffix, count in others.most_common())})" if others else ""
         raise ValueError(

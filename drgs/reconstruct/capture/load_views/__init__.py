@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from drgs.reconstruct.capture.load_views.capture import Capture, Pinhole, camera_of, without_masks
-from drgs.reconstruct.capture.load_views.checks import check_photographs, image_size, is_file, is_folder
+from drgs.reconstruct.capture.load_views.checks import check_photographs, image_size, is_file, is_folder, refuse_asset
 from drgs.reconstruct.capture.load_views.colmap import find_model, read_colmap
 from drgs.reconstruct.capture.load_views.metashape import find_cameras_file, read_metashape
 from drgs.reconstruct.capture.load_views.nerf_synthetic import read_nerf_synthetic
@@ -71,6 +71,7 @@ def read_capture(folder: Path, split: Literal["train", "test"] = "train") -> Cap
     elif find_cameras_file(folder) is not None:
         capture = read_metashape(folder)
     else:
+        refuse_asset(folder)
         raise ValueError(
             f"{folder}: not a capture, expected transforms_train.json (NeRF-synthetic), transforms.json (nerfstudio), "
             "sparse/0/cameras.bin or .txt (COLMAP), *.xml (Metashape) or *-camera.pkl (NeRO)."
@@ -98,6 +99,10 @@ def load_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera
         ValueError: one sentence.
     """
     path = Path(path)
+    if path.is_dir():
+        raise ValueError(
+            f"{path}: is a folder; expected a file of cameras, such as an asset's cameras.json or a capture's transforms_test.json"
+        )
     document = read_transforms(path)
     frames = document["frames"]
     first_size = _first_image_size(path.parent, frames[0]["file_path"])

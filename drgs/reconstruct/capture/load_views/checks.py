@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image, UnidentifiedImageError
 
+from drgs.exchange.package import MANIFEST
 from drgs.reconstruct.capture.load_views.capture import Photograph, Pinhole
 
 FEWEST_VIEWS = 3
@@ -79,6 +80,15 @@ def is_folder(path: Path) -> bool:
         return path.is_dir()
     except OSError:
         return False
+
+
+def refuse_asset(folder: Path) -> None:
+    """
+    Raises:
+        ValueError: the folder, in which neither cameras nor enough photographs were found, is what a build writes.
+    """
+    if (folder / MANIFEST).is_file():
+        raise ValueError(f"{folder}: is an asset, which a build wrote; expected photographs or a capture. To look at it: drgs serve.")
 
 
 def shown(value: object) -> str:
