@@ -5,7 +5,7 @@
       NAME splats   the 2D Gaussians as points and discs, hidden, for they lie where the mesh lies
       ...           the photographs' cameras; the first one becomes the scene's, with the size of its picture
 
-The scene gets a world with the asset's light. Nothing else of the scene is changed. read_asset reads, add_... make objects; this file has the
+The scene gets a world with the asset's light, and Cycles as many transparent bounces as discs need. Nothing else of the scene is changed. read_asset reads, add_... make objects; this file has the
 operator and its place in the menu.
 """
 
