@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from jaxtyping import Int
+from torch import Tensor
+
 from drgs.deform.pose_scene import pose_scene
 from drgs.scene.asset import Asset
 from drgs.scene.edits import AS_CAPTURED, AS_SHOWN, LONGEST_VARIANT_NAME, Edit, MaterialEdit, parse_edits
@@ -68,13 +71,20 @@ def variant_meshes(asset: Asset, variants: Variants) -> list[TriangleMesh]:
     return [worn if isinstance(worn, TriangleMesh) else pose_scene(asset, worn).mesh for worn in variants.values()]
 
 
-def worn_meshes(asset: Asset, shape: TriangleMesh, variants: Mapping[str, Sequence[Edit]], files: Path) -> dict[str, TriangleMesh]:
+def worn_meshes(
+    asset: Asset,
+    shape: TriangleMesh,
+    variants: Mapping[str, Sequence[Edit]],
+    files: Path,
+    source: Int[Tensor, "vertex"] | None = None,
+) -> dict[str, TriangleMesh]:
     """A mesh in the materials of each variant.
 
     Args:
         asset: what the variants are of.
         shape: its mesh, perhaps moved by other edits.
         files: the folder that edits name files in, and lead out of nowhere.
+        source: the posed scene's `vertex_source`, where other edits have made grains of it.
 
     Raises:
         ValueError: an edit that does not fit this asset, or a file that is missing or damaged.
@@ -82,6 +92,7 @@ def worn_meshes(asset: Asset, shape: TriangleMesh, variants: Mapping[str, Sequen
 
     def worn(edits: Sequence[Edit]) -> TriangleMesh:
         mesh = pose_scene(asset, edits, files, confine=True).mesh
-        return replace(shape, albedo=mesh.albedo, roughness=mesh.roughness, metallic=mesh.metallic)
+        of = slice(None) if source is None else source
+        return replace(shape, albedo=mesh.albedo[of], roughness=mesh.roughness[of], metallic=mesh.metallic[of])
 
     return {name: worn(edits) for name, edits in variants.items()}

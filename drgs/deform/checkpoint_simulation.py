@@ -7,14 +7,14 @@ have saved time.
 
 import json
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from drgs.deform.clip import ClipFrame, write_manifest
+from drgs.deform.clip import ClipFrame, parted_of_arrays, write_manifest
 from drgs.deform.mpm import State
 from drgs.deform.simulation_progress import SimulationProgress
 
@@ -30,7 +30,7 @@ def save_progress(folder: Path, progress: SimulationProgress, of: str, fps: floa
     folder.mkdir(parents=True, exist_ok=True)
     newest = len(progress.frames) - 1
     for index in (0, newest) if newest == 1 else (newest,):  # the first, at rest, was there before any was computed
-        _write(folder / _name(index), {name: value for name, value in vars(progress.frames[index]).items() if value is not None}, {})
+        _write(folder / _name(index), progress.frames[index].arrays, {})
     tensors = {name: value for name, value in vars(progress.state).items() if isinstance(value, Tensor)}
     # JSON keeps every bit of a float64.
     facts = {"of": of, "frames": newest + 1, "time": progress.state.time, "still": progress.still, "totals": progress.totals}
@@ -63,11 +63,10 @@ def read_progress(folder: Path, start: SimulationProgress, of: str) -> Simulatio
 
 def _read_frame(path: Path, like: ClipFrame) -> ClipFrame:
     arrays = load_file(path, device=str(like.vertices.device))
-    frame = ClipFrame(arrays["vertices"], arrays["normals"], arrays.get("centers"), arrays.get("tangents"))
-    if any(
-        (a is None) != (b is None) or (a is not None and b is not None and a.shape != b.shape)
-        for a, b in zip(vars(frame).values(), vars(like).values(), strict=True)
-    ):
+    parted = parted_of_arrays(arrays, len(like.vertices), 0 if like.centers is None else len(like.centers))
+    frame = ClipFrame(arrays["vertices"], arrays["normals"], arrays.get("centers"), arrays.get("tangents"), parted)
+    own, wanted = (replace(one, parted=None).arrays for one in (frame, like))
+    if {name: values.shape for name, values in own.items()} != {name: values.shape for name, values in wanted.items()}:
         raise ValueError(f"{path.name} is of another asset")
     return frame
 

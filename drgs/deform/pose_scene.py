@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
-from drgs.deform.clip import ClipFrame, frame_at, open_clip
+from drgs.deform.clip import ClipFrame, Parted, frame_at, open_clip
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.maps import check_map, evaluate_map
 from drgs.deform.sort_edits import EditFiles, EditSteps, ShapeEdit, SortedEdits, file_names, sort_edits
@@ -83,7 +83,18 @@ def pose_scene(
     for name in light.files:
         environment = _environment(asset, name, files, environments)
     horizons = None if by_kind.shape.count else asset.horizons
-    return PosedScene(surfels, mesh, environment, light.rotation_degrees, light.intensity, horizons, asset.primary)
+    scene = PosedScene(surfels, mesh, environment, light.rotation_degrees, light.intensity, horizons, asset.primary)
+    return scene if shape.parted is None else _with_grains(asset, scene, shape.parted, by_kind)
+
+
+def _with_grains(asset: Asset, scene: PosedScene, parted: Parted, by_kind: SortedEdits) -> PosedScene:
+    from drgs.deform.show_grains import grains_of, show_grains
+
+    shape, material = _key("shape", by_kind.shape), _key("material", by_kind.material)
+    grains = _remembered(asset, ("grains", shape), lambda: grains_of(scene.mesh, scene.surfels, parted))
+    # One tensor as long as shape and materials stay, by which a renderer sees that nothing has changed.
+    shown = _remembered(asset, ("shown grains", shape, material), lambda: show_grains(scene, grains))
+    return replace(scene, mesh=shown.mesh, surfels=shown.surfels, vertex_source=shown.vertex_source, surfel_source=shown.surfel_source)
 
 
 def simulation_bytes(asset: Asset) -> int:
@@ -109,7 +120,7 @@ PoseParts = dict[str, Tensor]
 
 
 def known_parts(asset: Asset, by_kind: SortedEdits) -> PoseParts | None:
-    """What these edits have made of the asset, where it is still remembered."""
+    """What these edits have made of the asset, where it is still remembered and hangs together."""
     materials: tuple[Materials, Materials | None] | None = _materials_at_rest(asset)
     shape: _Shape | None = _shape_at_rest(asset)
     with _lock:
@@ -118,7 +129,7 @@ def known_parts(asset: Asset, by_kind: SortedEdits) -> PoseParts | None:
             materials = kept.get(_key("material", by_kind.material))
         if by_kind.shape.count:
             shape = kept.get(_key("shape", by_kind.shape))
-    if materials is None or shape is None:
+    if materials is None or shape is None or shape.parted is not None:
         return None
     of_mesh, of_surfels = materials
     parts = {f"mesh.{name}": values for name, values in vars(of_mesh).items()} | {
@@ -158,6 +169,7 @@ class _Shape:
     normals: Float[Tensor, "vertex 3"]
     centers: Float[Tensor, "surfel 3"] | None
     tangents: Float[Tensor, "surfel 3 2"] | None
+    parted: Parted | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +239,7 @@ def _shape_after(asset: Asset, edits: EditSteps[ShapeEdit], files: EditFiles, go
     def apply(before: _Shape, index: int) -> _Shape:
         edit = edits.edit(index)
         after = _deformed(asset, before, edit, edits.digest(index), files, go_on)
-        if not all(torch.isfinite(values).all() for values in vars(after).values() if values is not None):
+        if not all(torch.isfinite(values).all() for values in vars(after).values() if isinstance(values, Tensor)):
             raise ValueError(f"the {edit.op} edit {edit.model_dump_json()[:120]} moves parts of this object to infinity")
         return after
 
@@ -242,11 +254,11 @@ def _deformed(
         digest_before: of the edits that made `before`.
     """
     mesh, gaussians = asset.mesh, asset.gaussians
-    vertices, normals, centers, tangents = before.vertices, before.normals, before.centers, before.tangents
+    vertices, normals, centers, tangents, parted = before.vertices, before.normals, before.centers, before.tangents, before.parted
     if isinstance(edit, PoseEdit | SimulateEdit):
         # Like a file of vertices, it says where everything is, whatever came before.
         frame = _moment(asset, edit, files, go_on)
-        vertices, normals, centers, tangents = frame.vertices, frame.normals, frame.centers, frame.tangents
+        vertices, normals, centers, tangents, parted = frame.vertices, frame.normals, frame.centers, frame.tangents, frame.parted
     elif edit.map is not None:
         check_map(edit.map, vertices)
         vertices, gradient = evaluate_map(edit.map, vertices)
@@ -254,10 +266,12 @@ def _deformed(
         if centers is not None and tangents is not None:
             centers, gradient = evaluate_map(edit.map, centers)
             tangents = carry_tangents(tangents, gradient)
+        if parted is not None:
+            parted = replace(parted, centers=evaluate_map(edit.map, parted.centers)[0])
     elif edit.vertices is not None:
         # The file says where the vertices are, whatever came before: everything is carried from rest.
         vertices = vertices_at(files.path(edit.vertices, or_folder=True), edit.time, edit.frames_per_second, mesh)
-        gradient = vertex_gradients(mesh.vertices, vertices, mesh.faces)
+        gradient, parted = vertex_gradients(mesh.vertices, vertices, mesh.faces), None
         normals = carry_normals(mesh.normals, gradient)
         if gaussians is not None:
             if asset.binding is None:
@@ -267,7 +281,8 @@ def _deformed(
                 mesh.vertices, vertices, mesh.faces, gradient, asset.binding, gaussians.centers, rest_tangents
             )
     elif edit.handles is not None and edit.handles.drag:
-        handles, points = edit.handles, vertices if centers is None else torch.cat([vertices, centers])
+        handles, places = edit.handles, [vertices, centers, None if parted is None else parted.centers]
+        points, sizes = torch.cat([part for part in places if part is not None]), [0 if part is None else len(part) for part in places]
         from drgs.deform.hold_handles import HeldObject
 
         # What is held is prepared once for all targets that a drag passes through.
@@ -275,11 +290,13 @@ def _deformed(
         hold = partial(HeldObject, mesh.vertices, vertices, mesh.faces, handles, points)
         held: HeldObject = _remembered(asset, grips, hold)
         positions, gradient = held.pull(handles)
-        count = len(vertices)
-        vertices, normals = positions[:count].contiguous(), carry_normals(normals, gradient[:count])
+        (vertices, of_centers, of_grains), turned = positions.split(sizes), gradient.split(sizes)
+        vertices, normals = vertices.contiguous(), carry_normals(normals, turned[0])
         if centers is not None and tangents is not None:
-            centers, tangents = positions[count:].contiguous(), carry_tangents(tangents, gradient[count:])
-    return _Shape(vertices, normals, centers, tangents)
+            centers, tangents = of_centers.contiguous(), carry_tangents(tangents, turned[1])
+        if parted is not None:
+            parted = replace(parted, centers=of_grains.contiguous())
+    return _Shape(vertices, normals, centers, tangents, parted)
 
 
 def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: EditFiles, go_on: Callable[[], None] | None) -> ClipFrame:
@@ -312,6 +329,10 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: EditFiles, go_on
                 f"this one {len(asset.mesh.vertices)} and {surfels}"
             )
         frame = frame_at(clip, edit.time, asset.mesh.vertices.device)
+        if frame.parted is not None and len(frame.parted.cut) != len(asset.mesh.faces):
+            raise ValueError(
+                f"the clip {edit.clip} was made for another object: it has {len(frame.parted.cut)} faces, this one {len(asset.mesh.faces)}"
+            )
     return frame
 
 

@@ -41,6 +41,7 @@ from drgs.deform.mpm import (
     rest_state,
 )
 from drgs.deform.mpm.records import Triple
+from drgs.deform.part_matter import bonds_at_rest, part_matter
 from drgs.deform.simulation_progress import SimulationProgress
 from drgs.deform.simulation_scene import Files, SimulationScene, make_condition, make_material, make_shape, refuse_files
 from drgs.scene.asset import Asset
@@ -78,6 +79,10 @@ class SimulationReport:
     sleeping_frames: int
     """Frames in which nothing was computed because everything was at rest."""
     reached_wall: bool
+    cut_faces: int
+    """Faces of the mesh that would span matter that has come apart, and are not shown; the most of any frame."""
+    grains: int
+    """Particles that are shown in their place, each as a grain; the most of any frame."""
     warnings: tuple[str, ...]
 
 
@@ -116,6 +121,9 @@ class Simulation:
             go_on()
         gmls = GmlsSettings(isolated=3 * self.model.grid.dx, variant="paper_centred" if scene.variant == "paper" else "taylor")
         self._weights: Weights = build_weights(self.model.rest, points, gmls, (local, mesh.faces))
+        self._bonds = bonds_at_rest(
+            self.model, filled.interior, local, mesh.faces, points[len(local) :] if len(points) > len(local) else None
+        )
         # Sand and fluids mix: what their particles have turned says nothing about the surface, which the moved mesh still tells.
         mixes = (self.model.laws == LAWS.index("drucker_prager")) | (self.model.laws == LAWS.index("fluid"))
         self._loose = mixes[self._weights.neighbours[:, 0].long()]
@@ -123,7 +131,15 @@ class Simulation:
         _, nearest = cKDTree(local.cpu().numpy()).query(points.cpu().numpy()) if bool(self._loose.any()) else (None, [])
         self._nearest_vertex = torch.as_tensor(nearest, device=local.device)
         self._state = _first_state(self.model, scene)
-        self._totals: dict[str, int | bool] = {"substeps": 0, "retries": 0, "frozen": 0, "sleeping": 0, "wall": False}
+        self._totals: dict[str, int | bool] = {
+            "substeps": 0,
+            "retries": 0,
+            "frozen": 0,
+            "sleeping": 0,
+            "wall": False,
+            "cut": 0,
+            "grains": 0,
+        }
         self._still = 0
         tangents = None if asset.gaussians is None else surfel_tangents(asset.gaussians)
         self._rest_tangents = tangents
@@ -136,7 +152,7 @@ class Simulation:
         totals = self._totals
         return SimulationReport(
             len(self.model.rest), self.model.grid.dx, totals["substeps"], totals["retries"], totals["frozen"], len(self._frames),
-            totals["sleeping"], bool(totals["wall"]), self.warnings,
+            totals["sleeping"], bool(totals["wall"]), totals["cut"], totals["grains"], self.warnings,
         )  # fmt: skip
 
     @property
@@ -150,8 +166,8 @@ class Simulation:
         return self._frame_bytes
 
     def _append(self, frame: ClipFrame) -> None:
-        before = {id(values) for values in vars(self._frames[-1]).values()}
-        self._frame_bytes += sum(values.nbytes for values in vars(frame).values() if values is not None and id(values) not in before)
+        before = {id(values) for values in self._frames[-1].arrays.values()}
+        self._frame_bytes += sum(values.nbytes for values in frame.arrays.values() if id(values) not in before)
         self._frames.append(frame)
 
     @property
@@ -166,7 +182,7 @@ class Simulation:
             self._frames, self._frame_bytes, self._state = list(progress.frames[:1]), 0, progress.state
             for frame in progress.frames[1:]:
                 self._append(frame)
-            self._totals, self._still = dict(progress.totals), progress.still
+            self._totals, self._still = self._totals | progress.totals, progress.still
 
     def frame(self, index: int, go_on: Callable[[], None] | None = None) -> ClipFrame:
         """Frame `index`, or the last of the scene if it has fewer; computed now if need be.
@@ -224,11 +240,15 @@ class Simulation:
             gradients = torch.where(self._loose[:, None, None], of_mesh[self._nearest_vertex], gradients)
         positions = (positions.double() + self._center.to(positions.device)).float()
         gradients = limit_stretch(gradients)
+        parted = part_matter(self._bonds, state.positions, self._center)
+        if parted is not None:
+            self._totals["cut"] = max(self._totals["cut"], int(parted.cut.sum()))
+            self._totals["grains"] = max(self._totals["grains"], int(parted.shown.sum()))
         normals = carry_normals(mesh.normals, gradients[:vertices])
         if self._rest_tangents is None:
-            return ClipFrame(positions, normals, None, None)
+            return ClipFrame(positions, normals, None, None, parted)
         tangents = carry_tangents(self._rest_tangents, gradients[vertices:])
-        return ClipFrame(positions[:vertices].contiguous(), normals, positions[vertices:].contiguous(), tangents)
+        return ClipFrame(positions[:vertices].contiguous(), normals, positions[vertices:].contiguous(), tangents, parted)
 
 
 def simulate(

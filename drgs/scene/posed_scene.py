@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from drgs.scene.environment import Environment
@@ -40,6 +40,10 @@ class PosedScene:
     """The asset's, while its mesh is at rest."""
     preferred: PrimarySurface | None = None
     """The asset's `primary`."""
+    vertex_source: Int[Tensor, "vertex"] | None = None
+    """Where matter came apart: the asset's vertex that each vertex of the mesh has its material from, its own ones first. None: the asset's mesh."""
+    surfel_source: Int[Tensor, "grain_surfel"] | None = None
+    """The same of the surfels behind the asset's own."""
 
     @property
     def primary(self) -> PrimarySurface:

@@ -7,7 +7,7 @@ less certain of roughness and metallic, in place of albedo (0..1): white is know
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.scene.binding import Binding
@@ -15,20 +15,26 @@ from drgs.scene.certainty import Certainty
 from drgs.scene.posed_scene import PosedScene
 
 
-def paint_certainty(scene: PosedScene, certainty: Certainty | None, binding: Binding | None) -> PosedScene | None:
+def paint_certainty(
+    scene: PosedScene, faces: Int[Tensor, "face 3"], certainty: Certainty | None, binding: Binding | None
+) -> PosedScene | None:
     """None where nothing is known of what cameras see: there is no certainty, or none for Gaussians that are not bound to the mesh.
 
     Args:
-        certainty: of the scene's vertices. binding: of the scene's Gaussians.
+        faces: of the asset's mesh. certainty: of its vertices. binding: of its Gaussians.
     """
     if certainty is None or (scene.primary == "gaussians" and binding is None):
         return None
     colors = certainty_colors(certainty)
     surfels = scene.surfels
     if surfels is not None and binding is not None:
-        corners = colors[scene.mesh.faces[binding.face.long()].long()]
+        corners = colors[faces[binding.face.long()].long()]
         blended = (binding.barycentric[..., None] * corners).sum(1).clamp(0, 1)
+        if scene.surfel_source is not None:
+            blended = torch.cat([blended, colors[scene.surfel_source]])
         surfels = replace(surfels, materials=replace(surfels.materials, albedo=blended))
+    if scene.vertex_source is not None:
+        colors = colors[scene.vertex_source]
     return replace(scene, mesh=replace(scene.mesh, albedo=colors), surfels=surfels)
 
 

@@ -138,7 +138,8 @@ class Pose(AbstractPose):
 
     def vertex_at(self, position_world: "Tensor") -> int:
         """Selections refer to the object at rest, whose vertices have the numbers of the moved ones."""
-        return int((self.scene.mesh.vertices - position_world).square().sum(-1).argmin())
+        nearest = (self.scene.mesh.vertices - position_world).square().sum(-1).argmin()
+        return int(nearest if self.scene.vertex_source is None else self.scene.vertex_source[nearest])
 
     def region_of(self, vertex: int) -> int:
         return int(self._regions[vertex])
@@ -189,7 +190,8 @@ class Pose(AbstractPose):
         return Still(bands, height, width, settings, linear)
 
     def vertices(self) -> Positions:
-        return self.scene.mesh.vertices.detach().cpu().numpy().astype("<f4")
+        # Of the asset's own: who asks knows no grains.
+        return self.scene.mesh.vertices[: len(self.asset.mesh.vertices)].detach().cpu().numpy().astype("<f4")
 
     def layers(self, camera: CameraMessage, settings: Settings, width: int, height: int) -> AbstractStill:
         from drgs.render.render_bands import render_bands
@@ -219,7 +221,7 @@ class Pose(AbstractPose):
         """The scene that wears it as its albedo; None where the asset holds none."""
         from drgs.render.visible.paint_certainty import paint_certainty
 
-        scene = paint_certainty(self.scene, self.asset.certainty, self.asset.binding)
+        scene = paint_certainty(self.scene, self.asset.mesh.faces, self.asset.certainty, self.asset.binding)
         return None if scene is None else (scene, self.tracer.with_materials(scene.mesh))
 
 

@@ -261,6 +261,7 @@ def export_edited(asset_folder: Path, out: Path, format: Any, faces: int, edits:
     from drgs.convert.bake_edits import bake_edits
     from drgs.convert.export_asset import export_asset
     from drgs.convert.material_variants import worn_meshes
+    from drgs.deform.pose_scene import pose_scene
     from drgs.exchange.export_formats import VARIANT_FORMATS
     from drgs.scene.asset import load_asset
     from drgs.scene.edits import AS_CAPTURED, AS_SHOWN, load_edits
@@ -270,7 +271,8 @@ def export_edited(asset_folder: Path, out: Path, format: Any, faces: int, edits:
     made, variants = bake_edits(asset, listed, environments, version), kept_variants(listed)
     if variants and format in VARIANT_FORMATS:
         shown = AS_SHOWN if material_edits(listed) else AS_CAPTURED
-        export_asset(made, out, format, faces or None, worn_meshes(asset, made.mesh, variants, environments), shown)
+        source = pose_scene(asset, listed, environments, confine=True).vertex_source
+        export_asset(made, out, format, faces or None, worn_meshes(asset, made.mesh, variants, environments, source), shown)
     else:
         write_export(made, asset_folder, out, format, faces, lambda: thumbnail(made))
 
