@@ -37,8 +37,8 @@ SURROUNDED_SHARE = 0.5
 """A particle of whose bonds this share leads to loose ones is loose as well, so that no scraps of the mesh are left among grains. Beside a plane it has 5 of 18."""
 SURROUNDED_ROUNDS = 3
 """How often that is asked: scraps as wide as so many particles on either side go."""
-PARTED_CELLS = 3.0
-"""Bonds have parted when they are longer than at rest by this [grid cells]: quadratic splines reach 1.5 cells, so that the two cannot feel each other."""
+PARTED_CELLS = 1.5
+"""Bonds have parted when they are longer than at rest by this [grid cells]: as far as a particle's quadratic spline reaches."""
 CRUMBLED_CELLS = 0.4
 """The same of sand and snow, which do not stretch: most of a spacing, by which particles roll off one another."""
 CRUMBLING = ("drucker_prager", "snow")
@@ -75,9 +75,17 @@ class Bonds:
     """Pairs of a face and a particle under it, each once."""
     deep: Bool[Tensor, "chosen"]
     """Under no face."""
+    over: Int[Tensor, "vertex"]
+    """The particle under each vertex of the mesh."""
+    over_length: Float[Tensor, "vertex"]
+    """How far it is at rest [world units]."""
+    corners: Int[Tensor, "face 3"]
+    edge_length: Float[Tensor, "face 3"]
+    """At rest [world units]."""
+    edge_reach: Float[Tensor, "face 3"]
+    """How much longer than at rest an edge may be [world units]; of wide faces as many times more as they are spacings wide."""
     under_surfel: Int[Tensor, "surfel"] | None
     """The particle under each surfel; None for an asset without."""
-    faces: int
 
 
 def bonds_at_rest(
@@ -107,21 +115,29 @@ def bonds_at_rest(
     _, vertex = cKDTree(vertices.double().cpu().numpy()).query(
         _grain_places(rest, towards, share, MOST_SHIFT * spacing).reshape(-1, 3).double().cpu().numpy()
     )
+    over_length, over = tree.query(vertices.double().cpu().numpy())
+    edges = _edge_lengths(vertices, faces.long())
     surfel = None if centers is None else tree.query(centers.double().cpu().numpy())[1]
     laws, cell = model.laws[particle].long().cpu(), max(model.grid.dx, 2 * spacing)
     reach = torch.tensor([_cells(law) * cell for law in LAWS])[laws]
+
+    reach = reach.to(vertices.device)
+    wide = (edges / spacing).clamp(min=1)
+    edge_reach = reach[torch.from_numpy(over).to(vertices.device)[faces[:, 0].long()], None] * wide
 
     def tensor(array: NDArray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(vertices.device)
 
     return Bonds(
         particle, towards, share, MOST_SHIFT * spacing, (volumes / share.shape[1]).repeat_interleave(share.shape[1]), tensor(vertex), tensor(index), tensor(length).float(), tensor(length < BOND_SPACINGS * spacing),
-        reach.to(vertices.device), tensor(face), tensor(under), tensor(np.bincount(under, minlength=len(places)) == 0), None if surfel is None else tensor(surfel), len(faces),
+        reach, tensor(face), tensor(under), tensor(np.bincount(under, minlength=len(places)) == 0), tensor(over), tensor(over_length).float(), faces.long(), edges, edge_reach, None if surfel is None else tensor(surfel),
     )  # fmt: skip
 
 
-def part_matter(bonds: Bonds, positions: Float[Tensor, "particle 3"], origin: Float[Tensor, "3"]) -> Parted | None:
-    """What has come apart where particles are at (particle, 3); None where nothing has.
+def part_matter(
+    bonds: Bonds, positions: Float[Tensor, "particle 3"], vertices: Float[Tensor, "vertex 3"], origin: Float[Tensor, "3"]
+) -> Parted | None:
+    """What has come apart where particles are at (particle, 3) and have carried the mesh to (vertex, 3); None where nothing has.
 
     Args:
         origin: (3,) of the positions, in the world.
@@ -130,12 +146,15 @@ def part_matter(bonds: Bonds, positions: Float[Tensor, "particle 3"], origin: Fl
     length = (places[bonds.neighbours] - places[:, None]).norm(dim=-1)
     parted = bonds.bound & (length - bonds.rest_length > bonds.reach[:, None])
     loose = parted.any(1) & (parted.sum(1) >= LOOSE_SHARE * bonds.bound.sum(1))
-    if not bool(loose.any()):
+    # What follows the surface without weight can hang between two halves, and the mesh with it.
+    left = (vertices - places[bonds.over]).norm(dim=-1) - bonds.over_length > bonds.reach[bonds.over]
+    torn = left[bonds.corners].any(1) | (_edge_lengths(vertices, bonds.corners) - bonds.edge_length > bonds.edge_reach).any(1)
+    if not bool(loose.any()) and not bool(torn.any()):
         return None
     for _ in range(SURROUNDED_ROUNDS):
         around = (bonds.bound & loose[bonds.neighbours]).sum(1)
         loose = loose | ((around > 0) & (around >= SURROUNDED_SHARE * bonds.bound.sum(1)))
-    cut = torch.zeros(bonds.faces, dtype=torch.bool, device=positions.device)
+    cut = torn.clone()
     cut[bonds.face[loose[bonds.under]]] = True
     shown = loose.clone()
     shown[bonds.under[cut[bonds.face]]] = True
@@ -170,6 +189,11 @@ def _grain_places(
     """Where grains are, for particles at (chosen, 3)."""
     shift = share[..., None] * (particles[towards] - particles[:, None])
     return particles[:, None] + shift * (most_shift / shift.norm(dim=-1, keepdim=True).clamp(min=most_shift))
+
+
+def _edge_lengths(vertices: Float[Tensor, "vertex 3"], corners: Int[Tensor, "face 3"]) -> Float[Tensor, "face 3"]:
+    placed = vertices[corners]
+    return (placed - placed.roll(1, 1)).norm(dim=-1)
 
 
 def _covers(tree: cKDTree, vertices: NDArray, faces: NDArray, spacing: float) -> tuple[NDArray, NDArray]:

@@ -238,9 +238,9 @@ class Simulation:
             of_mesh = vertex_gradients(mesh.vertices, positions[:vertices], mesh.faces)
             of_mesh = limit_stretch(of_mesh, LARGEST_LOOSE_STRETCH)
             gradients = torch.where(self._loose[:, None, None], of_mesh[self._nearest_vertex], gradients)
+        parted = part_matter(self._bonds, state.positions, positions[:vertices], self._center)
         positions = (positions.double() + self._center.to(positions.device)).float()
         gradients = limit_stretch(gradients)
-        parted = part_matter(self._bonds, state.positions, self._center)
         if parted is not None:
             self._totals["cut"] = max(self._totals["cut"], int(parted.cut.sum()))
             self._totals["grains"] = max(self._totals["grains"], int(parted.shown.sum()))

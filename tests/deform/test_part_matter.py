@@ -47,18 +47,17 @@ def halves_apart(points, gap):
 
 @pytest.mark.parametrize("law", ["drucker_prager", "snow", "fixed_corotated", "von_mises", "fluid"])
 def test_rigid_motion_and_gentle_strain_part_nothing(law):
-    bonds, model, *_ = bonds_of(box(3), law)
+    bonds, model, vertices, *_ = bonds_of(box(3), law)
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -2.0, 0.5], [2.0, 0.0, 0.3], [-0.5, -0.3, 0.0]]))
-    assert part_matter(bonds, model.rest, HERE) is None
-    assert part_matter(bonds, model.rest @ turn.T + 40.0, HERE) is None
-    assert part_matter(bonds, model.rest * torch.tensor([1.3, 0.9, 0.9]), HERE) is None
+    for move in (torch.eye(3), turn, torch.diag(torch.tensor([1.3, 0.9, 0.9]))):
+        assert part_matter(bonds, model.rest @ move.T + 40.0, vertices @ move.T + 40.0, HERE) is None
 
 
 @pytest.mark.parametrize("law", ["drucker_prager", "fixed_corotated"])
 @pytest.mark.parametrize("times", [0, 1, 4])
 def test_between_two_halves_pulled_apart_no_face_is_left(law, times):
     bonds, model, vertices, faces, spacing = bonds_of(box(times), law)
-    apart = part_matter(bonds, halves_apart(model.rest, 8 * spacing), HERE)
+    apart = part_matter(bonds, halves_apart(model.rest, 8 * spacing), halves_apart(vertices, 8 * spacing), HERE)
     right = vertices[faces][..., 0] > PLANE
     across = right.any(1) & ~right.all(1)
     assert bool(across.any()) and bool(apart.cut[across].all())
@@ -70,24 +69,32 @@ def test_between_two_halves_pulled_apart_no_face_is_left(law, times):
         assert bool(far.any()) and not bool(apart.cut[far].any()) and not bool(shown[x > 4 * spacing].any())
     assert float(shown[x < 0.5 * spacing].float().mean()) > 0.95
     assert torch.equal(apart.gone, shown[bonds.under_surfel])
-    again = part_matter(bonds, halves_apart(model.rest, 8 * spacing), HERE)
+    again = part_matter(bonds, halves_apart(model.rest, 8 * spacing), halves_apart(vertices, 8 * spacing), HERE)
     assert all(torch.equal(a, b) for a, b in zip(vars(apart).values(), vars(again).values(), strict=True))
 
 
-def test_jelly_may_stretch_to_thrice_its_length_and_honey_never_parts():
+@pytest.mark.parametrize("times", [0, 3])
+def test_jelly_may_stretch_to_thrice_its_length_and_honey_never_parts(times):
     stretch = torch.tensor([3.0, 0.6, 0.6])
     for law, parts in (("fixed_corotated", False), ("fluid", False), ("drucker_prager", True)):
-        bonds, model, *_ = bonds_of(box(3), law)
-        assert (part_matter(bonds, model.rest * stretch, HERE) is not None) == parts
-    bonds, model, *_, spacing = bonds_of(box(3), "fluid")
-    assert part_matter(bonds, halves_apart(model.rest, 20 * spacing), HERE) is None
+        bonds, model, vertices, *_ = bonds_of(box(times), law)
+        assert (part_matter(bonds, model.rest * stretch, vertices * stretch, HERE) is not None) == parts
+    bonds, model, vertices, _, spacing = bonds_of(box(times), "fluid")
+    assert part_matter(bonds, halves_apart(model.rest, 20 * spacing), halves_apart(vertices, 20 * spacing), HERE) is None
+
+
+def test_a_surface_that_its_matter_has_left_is_cut():
+    bonds, model, vertices, faces, spacing = bonds_of(box(4), "fixed_corotated")
+    strand = vertices + (vertices[:, :1] > 0.8) * torch.tensor([[8 * spacing, 0.0, 0.0]])
+    parted = part_matter(bonds, model.rest, strand, HERE)
+    assert torch.equal(parted.cut, (vertices[faces][..., 0] > 0.8).any(1)) and bool(parted.shown.any())
 
 
 @pytest.mark.parametrize("most", [50_000, 250])
 def test_grains_have_the_volume_of_the_matter_and_are_no_more_than_their_bound(most, monkeypatch):
     monkeypatch.setattr(step, "MOST_GRAINS", most)
-    bonds, model, *_ = bonds_of(box(3))
-    scattered = part_matter(bonds, 5 * model.rest, HERE)
+    bonds, model, vertices, *_ = bonds_of(box(3))
+    scattered = part_matter(bonds, 5 * model.rest, 5 * vertices, HERE)
     assert bool(scattered.shown.all()) and bool(scattered.cut.all()) and len(scattered.shown) <= most
     assert float(scattered.volumes.sum()) == pytest.approx(2.0, rel=0.02)  # the box's, as well as the lattice tells it
 
