@@ -17,6 +17,7 @@ from torch import Tensor
 from benchmarks.measures.bench_scene import has_true_maps, read_light, read_rgba, read_true_maps
 from benchmarks.measures.peak_memory import measured
 from benchmarks.paper.cells import NotMade
+from benchmarks.paper.laws import laws, rgba_of
 from benchmarks.paper.sheets import Array, halved, object_window, sheet
 from benchmarks.paper.tables import SceneEvidence
 from benchmarks.paper.variant import AbstractVariant
@@ -191,10 +192,6 @@ def picture_of(evidence: SceneEvidence, edits: list[dict]) -> Array:
     return halved(on_white(rgba_of(frame_of(evidence, edits))))
 
 
-def rgba_of(frame: Frame) -> Array:
-    return array_of(frame.rgba_srgb.clamp(0, 1))
-
-
 def array_of(values: Tensor) -> Array:
     return values.detach().cpu().double().numpy()
 
@@ -227,6 +224,7 @@ FIGURES: dict[str, tuple[Figure, bool]] = {
     "material_maps": (material_maps, True),
     "strip": (strip, False),
     "matter": (matter, False),
+    "laws": (laws, False),
 }
 """By name, and whether the figure needs the scene's true maps."""
 COMPARISONS = ("comparison", "comparison_relit")

@@ -22,8 +22,8 @@ Figures of the paper itself are of other scenes and of other code, and are not b
 """
 MISSING = """## What is not here yet
 - LPIPS: its weights come with no package that we install; PSNR and SSIM only.
-- Deformed truth is of analytic maps (bend, twist); what is simulated is shown, not scored. Characters with skeletons (Fig. 7), clips of sand and metal, wire
-  frames over Fig. 3 and a film of the continuous deformation (a strip stands for Fig. 12) are missing.
+- Deformed truth is of analytic maps (bend, twist); what is simulated is shown, and of sand it is said how far its picture is from balls of its particles'
+  volume; no truth of a real fall is there. Characters with skeletons (Fig. 7), wire frames over Fig. 3 and films of clips (strips stand for them) are missing.
 - Learnable offset and opacity (Fig. 9) are a table of their own: `python -m benchmarks binding` ([results](../benchmarks/README.md)).
 - The other systems' geometry is ours, which is generous to them, and their barycentrics, scales, offsets and opacities are not learned through pictures, which
   is not. Harmonics are solved by least squares, not by tens of thousands of steps.
