@@ -19,13 +19,14 @@ def trace_spheres(
     towards = centers - origin
     # |o + t d - c|^2 = r^2 with |d| = 1: t = d.(c - o) - sqrt((d.(c - o))^2 - |c - o|^2 + r^2).
     beyond = towards.square().sum(-1) - radii.square()
-    found = []
-    for part in directions.split(RAYS_AT_ONCE):
-        along = part @ towards.T
+    # Filled in place: small results between large ones that come and go would keep the memory of all.
+    depth, ball = directions.new_empty(len(directions)), torch.empty(len(directions), dtype=torch.int64, device=centers.device)
+    for start in range(0, len(directions), RAYS_AT_ONCE):
+        part = slice(start, start + RAYS_AT_ONCE)
+        along = directions[part] @ towards.T
         inside = along.square() - beyond
         distance = torch.where((inside >= 0) & (along > 0), along - inside.clamp(min=0).sqrt(), torch.inf)
-        found.append(distance.min(-1))
-    depth, ball = (torch.cat([part[k] for part in found]) for k in (0, 1))
+        depth[part], ball[part] = distance.min(-1)
     hit = depth.isfinite()
     normal = (origin + depth.where(hit, torch.zeros_like(depth))[:, None] * directions - centers[ball]) / radii[ball][:, None]
     return depth, ball.where(hit, torch.full_like(ball, -1)), normal * hit[:, None]
