@@ -29,6 +29,7 @@ def test_balls_have_the_volume_and_the_materials_they_are_given(clips):
     assert torch.equal(made.albedo.reshape(2, -1, 3)[1, 0], clips.asset.mesh.albedo[5])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("action", MOMENTS)
 def test_an_object_is_dropped_twisted_and_torn(clips, action):
     scene = clips.scene(LAWS["jelly"], action)

@@ -73,6 +73,7 @@ def test_between_two_halves_pulled_apart_no_face_is_left(law, times):
     assert all(torch.equal(a, b) for a, b in zip(vars(apart).values(), vars(again).values(), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [0, 3])
 def test_jelly_may_stretch_to_thrice_its_length_and_honey_never_parts(times):
     stretch = torch.tensor([3.0, 0.6, 0.6])
@@ -109,6 +110,7 @@ def fallen(asset) -> ClipFrame:
     return Simulation(asset, parse_simulation_scene(SAND)).at(0.4)
 
 
+@pytest.mark.slow
 def test_a_fall_of_sand_says_how_many_faces_it_cut_and_free_fall_cuts_none(asset):
     simulation = Simulation(asset, parse_simulation_scene(SAND))
     last = simulation.at(0.4)

@@ -45,6 +45,7 @@ def asset() -> Asset:
     return replace(ball, mesh=mesh, binding=binding, certainty=known)
 
 
+@pytest.mark.slow
 def test_cut_faces_are_left_out_and_grains_wear_what_is_nearest_to_them(asset):
     scene = pose_scene(asset, parse_edits([FALL]))
     count, source = len(asset.mesh.vertices), scene.vertex_source
@@ -64,6 +65,7 @@ def test_cut_faces_are_left_out_and_grains_wear_what_is_nearest_to_them(asset):
     assert len(scene.surfels.centers) - len(faded) == len(scene.surfel_source) == 6 * len(grains) // 20
 
 
+@pytest.mark.slow
 def test_a_grain_has_the_volume_of_its_particle(asset):
     frame = Simulation(asset, parse_simulation_scene(SAND)).at(0.4)
     everything = replace(frame.parted, shown=torch.ones_like(frame.parted.shown), cut=torch.ones_like(frame.parted.cut))
