@@ -1,15 +1,17 @@
 """The command line keeps its manners: fast help, one sentence for wrong input, clean stdout."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from drgs import __version__
-from drgs.cli import app
+from drgs.cli import app, main
 from tests.patience import PATIENCE_SECONDS
 
 COMMANDS = ("pose", "build", "render", "import", "export", "simulate", "eval", "doctor", "serve", "worker", "bench")
@@ -28,6 +30,32 @@ def drgs_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """
     result = CliRunner().invoke(app, [*map(str, arguments)])
     return subprocess.CompletedProcess([], result.exit_code, result.stdout, result.stderr)
+
+
+ONE_BY_ONE = """
+import json, sys, drgs.cli
+for arguments in json.loads(sys.argv[1]):
+    sys.argv = ["drgs", *arguments]
+    try:
+        drgs.cli.main()
+    except SystemExit as end:
+        code = end.code
+    for stream in (sys.stdout, sys.stderr):
+        print(f"\\nended with {code}", file=stream, flush=True)
+"""
+
+
+def drgs_one_by_one(commands: list[list[str | Path]], **options: Any) -> list[subprocess.CompletedProcess[str]]:
+    """What each command says and ends with, of several in one process: to load what they need takes it two seconds of a core."""
+    given = json.dumps([[*map(str, arguments)] for arguments in commands])
+    done = subprocess.run([sys.executable, "-c", ONE_BY_ONE, given], capture_output=True, text=True, timeout=PATIENCE_SECONDS, **options)
+    assert done.returncode == 0, done.stderr
+    said, complained = (re.split(r"\nended with (.*)\n", text) for text in (done.stdout, done.stderr))
+    assert said[1::2] == complained[1::2] and len(said) == 2 * len(commands) + 1 and said[-1] == complained[-1] == ""
+    return [
+        subprocess.CompletedProcess([], int(code), out, err)
+        for out, code, err in zip(said[:-1:2], said[1::2], complained[:-1:2], strict=True)
+    ]
 
 
 def assert_one_sentence(result: subprocess.CompletedProcess[str], exit_code: int = 1) -> None:
@@ -75,16 +103,19 @@ def test_every_command_explains_itself(command: str):
 
 
 @pytest.mark.slow
-def test_a_dataset_that_does_not_exist_is_one_sentence(tmp_path: Path):
-    result = drgs("doctor", tmp_path / "nothing_here")
-    assert_one_sentence(result)
-    assert "nothing_here" in result.stderr
-
-
-@pytest.mark.slow
-def test_a_folder_that_is_no_capture_is_one_sentence(tmp_path: Path):
-    assert_one_sentence(drgs("build", tmp_path, tmp_path / "out"))
-    assert not (tmp_path / "out").exists()
+def test_wrong_input_is_one_sentence_of_each_command_that_loads_much(tmp_path: Path):
+    """One after another in a process, which no other test shares: a word that anything said while it is loaded would be seen."""
+    scene = tmp_path / "sim.json"
+    commands = [
+        ["doctor", tmp_path / "nothing_here"],
+        ["build", tmp_path, tmp_path / "out"],
+        ["simulate", tmp_path, tmp_path, "--scene", scene],
+    ]
+    results = drgs_one_by_one(commands)
+    for result in results:
+        assert_one_sentence(result)
+    assert "nothing_here" in results[0].stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
@@ -183,21 +214,15 @@ def test_export_takes_the_format_from_the_ending(ball: Path, name: str, start: b
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
-@pytest.mark.parametrize("name", ["a.glb", "a.usda", "a.usdc", "a.usdz"])
-def test_a_file_that_cannot_be_written_whole_is_one_sentence_and_leaves_nothing(ball: Path, name: str, tmp_path: Path):
+def test_files_that_cannot_be_written_whole_are_one_sentence_and_leave_nothing(ball: Path, tmp_path: Path):
     import resource
 
-    if name.startswith("a.usd"):
-        pytest.importorskip("pxr", reason="the optional package usd-core is not installed")
-    result = subprocess.run(
-        [sys.executable, "-m", "drgs.cli", "export", str(ball), str(tmp_path / name)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_SECONDS,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)),
-    )
-    assert_one_sentence(result)
-    assert "File too large" in result.stderr
+    pytest.importorskip("pxr", reason="the optional package usd-core is not installed")
+    files = [tmp_path / name for name in ("a.glb", "a.usda", "a.usdc", "a.usdz")]
+    limited = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))}
+    for result in drgs_one_by_one([["export", ball, file] for file in files], **limited):
+        assert_one_sentence(result)
+        assert "File too large" in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -231,15 +256,13 @@ def test_render_brings_light_to_the_picture_by_the_curve_that_is_asked_for(tmp_p
     assert pictures["standard"][".exr"] == pictures["filmic"][".exr"], "the light itself is the same"
 
 
-@pytest.mark.slow
-def test_simulate_says_that_it_is_not_there_yet(tmp_path: Path):
-    assert_one_sentence(drgs("simulate", tmp_path, tmp_path, "--scene", tmp_path / "sim.json"))
+def test_ctrl_c_ends_with_130_and_a_sentence(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+    def stop(path: Path) -> None:
+        raise KeyboardInterrupt
 
-
-@pytest.mark.slow
-def test_ctrl_c_ends_with_130_and_a_sentence():
-    program = "import drgs.cli as c, drgs.scene.edits as e\ndef stop(path): raise KeyboardInterrupt\ne.load_edits = stop\nc.main()"
-    arguments = ["render", "asset", "out", "--cameras", "c.json", "--edits", "e.json"]
-    result = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
-    assert result.returncode == 130
-    assert result.stderr == "drgs: stopped by Ctrl-C\n"
+    monkeypatch.setattr("drgs.scene.edits.load_edits", stop)
+    monkeypatch.setattr(sys, "argv", ["drgs", "render", "asset", "out", "--cameras", "c.json", "--edits", "e.json"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert capfd.readouterr().err == "drgs: stopped by Ctrl-C\n"
