@@ -198,19 +198,24 @@ def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stage", "after"), [("fit", 1), ("mesh", 1), ("surface", 1), ("surface", 4), ("materials", 1)])
-def test_a_stopped_build_leaves_a_checkpoint_and_resumes_to_the_same_bits(
-    build: Build, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str, after: int
+def test_a_build_stopped_in_every_stage_leaves_checkpoints_and_resumes_to_the_same_bits(
+    build: Build, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    """One build, stopped five times: what any stop loses, the end lacks."""
     monkeypatch.setattr(report_progress, "REPORT_SECONDS", 0.0)  # every step is told
-    progress: list[Progress] = []
     out = tmp_path / "sphere"
-    with pytest.raises(BuildStopped):
-        build_asset(capture, out, SETTINGS, progress.append, stop_when(stage, progress, after))
-    assert not out.exists()
-    checkpoint = {"surface": "surface.safetensors", "materials": "stage2.safetensors"}.get(stage, "stage1.safetensors")
-    assert (Path(f"{out}.build") / checkpoint).is_file()
-    resumed = asset_tensors(build_asset(capture, out, replace(SETTINGS, resume=True)))
+    told: list[Progress] = []
+    stops = (("fit", 1, "stage1"), ("mesh", 1, "stage1"), ("surface", 1, "surface"), ("surface", 3, "surface"), ("materials", 1, "stage2"))
+    for stage, after, checkpoint in stops:
+        told.clear()
+        with pytest.raises(BuildStopped):
+            build_asset(capture, out, replace(SETTINGS, resume=True), told.append, stop_when(stage, told, after))
+        assert not out.exists() and (Path(f"{out}.build") / f"{checkpoint}.safetensors").is_file()
+        assert told[-1].stage == stage and (stage in ("fit", "mesh") or "fit" not in {p.stage for p in told})
+        assert after == 1 or told[-1].message.startswith("pass 2 of 2")
+    told.clear()
+    resumed = asset_tensors(build_asset(capture, out, replace(SETTINGS, resume=True), told.append))
+    assert not {"fit", "surface"} & {p.stage for p in told}
     for name, value in asset_tensors(build.asset).items():
         assert torch.equal(resumed[name], value), name
     loaded = load_asset(out)
