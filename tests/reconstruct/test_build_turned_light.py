@@ -23,9 +23,9 @@ from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS, asset_tensors
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
 LONGER = replace(
     WITHOUT_HOLLOWS,
-    fit=replace(WITHOUT_HOLLOWS.fit, iterations=80),
-    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=40), WITHOUT_HOLLOWS.surface.mesh),
-    materials=MeshMaterialSettings(iterations=40, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
+    fit=replace(WITHOUT_HOLLOWS.fit, iterations=60),
+    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=30), WITHOUT_HOLLOWS.surface.mesh),
+    materials=MeshMaterialSettings(iterations=30, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
 )
 
 

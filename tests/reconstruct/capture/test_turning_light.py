@@ -18,6 +18,7 @@ from tests.reconstruct.tiny_capture import CX, CY, FX, FY, HEIGHT, SPHERE_CENTER
 
 LAMP = np.array([0.3, -0.8, -0.52])
 """In the camera's frame or in the object's: a direction."""
+PICTURES = 20
 
 
 def write_turntable(folder: Path, lamp_on_camera: bool, same_around: bool, cut_out: bool = False) -> Path:
@@ -26,7 +27,7 @@ def write_turntable(folder: Path, lamp_on_camera: bool, same_around: bool, cut_o
     generator = np.random.default_rng(0)
     room = 40 + 150 * generator.random((HEIGHT, WIDTH, 3))
     frames = []
-    for view in sphere_views(32):
+    for view in sphere_views(PICTURES):
         rays = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), -1)
         rays = np.concatenate([(rays - [CX, CY]) / [FX, FY], np.ones((HEIGHT, WIDTH, 1))], -1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
