@@ -5,6 +5,7 @@ Not run are what takes minutes (pose, build: other tests run them) and what does
 
 import re
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from drgs.scene.asset import save_asset
 from drgs.scene.camera import camera_from_opengl
 from drgs_worker.jobs.start_view import turntable_view
 from tests.convert.test_export_asset import ball_asset
+from tests.reconstruct.tiny_capture import FEW_VIEWS, sphere_views, write_nerf_synthetic
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -58,8 +60,12 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     intrinsics = torch.tensor([[400.0, 0, 160], [0, 400.0, 160], [0, 0, 1]])
     view = torch.from_numpy(turntable_view((-1, -1, 1), (1, 1, 3), 30, 20))
     save_asset(replace(asset, cameras=(camera_from_opengl(view, intrinsics, 320, 320, "front"),)), tmp_path / "out" / "sample")
-    (tmp_path / "examples").symlink_to(ROOT / "examples", target_is_directory=True)
-    (tmp_path / "photos").symlink_to(ROOT / "examples" / "sample_capture", target_is_directory=True)
+    # A ball for the sample, of which examining and rendering as many views takes a core ten seconds more.
+    sample = write_nerf_synthetic(tmp_path / "examples" / "sample_capture", sphere_views(FEW_VIEWS, square=True))
+    shutil.copytree(sample / "train", sample / "test")
+    (sample / "transforms_test.json").write_text((sample / "transforms_train.json").read_text().replace("./train/", "./test/"))
+    (tmp_path / "examples" / "environments").symlink_to(ROOT / "examples" / "environments", target_is_directory=True)
+    (tmp_path / "photos").symlink_to(sample, target_is_directory=True)
     (edits,) = re.findall(r"^```json\n(.*?)^```", (ROOT / "docs" / "tutorial.md").read_text(), re.MULTILINE | re.DOTALL)
     (tmp_path / "gold.json").write_text(edits)
     monkeypatch.chdir(tmp_path)
