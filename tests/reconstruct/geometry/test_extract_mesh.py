@@ -29,6 +29,8 @@ def box_distance(p: torch.Tensor) -> torch.Tensor:
     return q.clamp(min=0).norm(dim=-1) + q.amax(-1).clamp(max=0)
 
 
+FAR_BEHIND = 20.0
+"""Of a shape that is about 1 large, and 4 away from its cameras."""
 VOLUMES = {sphere_distance: 4 / 3 * math.pi * 0.7**3, torus_distance: 2 * math.pi**2 * 0.6 * 0.25**2, box_distance: 8 * 0.6 * 0.45 * 0.3}
 
 
@@ -54,18 +56,18 @@ def sphere_directions(count: int) -> torch.Tensor:
 
 def traced_depth(distance: Callable[[torch.Tensor], torch.Tensor], camera: Camera, center: torch.Tensor, scale: float) -> DepthMap:
     """Depth of a shape scaled and moved, by sphere tracing; coverage by the pixel centre."""
-    rays = camera_rays(camera, (camera.height, camera.width), torch.device("cpu")).double()
+    rays = camera_rays(camera, (camera.height, camera.width), torch.device("cpu")).double().reshape(-1, 3)
     length = rays.norm(dim=-1)
-    directions = rays / length[..., None] @ camera.camera_from_world[:3, :3].double()
+    directions = rays / length[:, None] @ camera.camera_from_world[:3, :3].double()
     origin = (camera.center_world.double() - center) / scale
-    t = torch.zeros_like(length)
-    gap = torch.ones_like(t)
+    t, gap = torch.zeros_like(length), torch.ones_like(length)
+    going = torch.arange(len(t))
     for _ in range(70):
-        gap = distance(origin + t[..., None] * directions)
-        t = t + gap.clamp(max=10)
-    hit = gap < 1e-4
-    depth = torch.where(hit, t * scale / length, torch.zeros_like(t))
-    return DepthMap(camera, depth.float(), hit.float())
+        gap[going] = distance(origin + t[going, None] * directions[going])
+        t[going] += gap[going].clamp(max=10)
+        going = going[(gap[going] > 1e-9) & (t[going] < FAR_BEHIND)]
+    depth = torch.where(gap < 1e-4, t * scale / length, torch.zeros_like(t))
+    return DepthMap(camera, depth.reshape(camera.height, camera.width).float(), (gap < 1e-4).reshape(camera.height, camera.width).float())
 
 
 def capture(
