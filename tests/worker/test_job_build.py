@@ -33,10 +33,12 @@ from tests.reconstruct.tiny_capture import FEW_VIEWS, sphere_views, write_nerf_s
 TINY = Preset(
     points=600,
     image_side=72,
-    fit=FitSettings(iterations=12, densify=DensifySettings(every=5, budget=700)),
+    fit=FitSettings(iterations=7, densify=DensifySettings(every=5, budget=700)),
     mesh=MeshSettings(resolution=48, face_limit=2000),
     surface=PassSettings(
-        2, SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)), replace(PASS_MESH, resolution=32, face_limit=500)
+        2,
+        SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(solves=1, share_rays=4)),
+        replace(PASS_MESH, resolution=32, face_limit=500),
     ),
     materials=MeshMaterialSettings(iterations=4, points_a_step=64, samples=SampleCounts(4, 2, 2)),
     detail=DetailSettings(most_faces=2000),

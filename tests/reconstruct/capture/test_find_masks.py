@@ -18,7 +18,7 @@ from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
 from drgs.scene.camera import pixel_rays_world
 from drgs.scene.environment import uv_from_direction
 from drgs.scene.views import Views
-from tests.reconstruct.test_build_asset import TINY, asset_tensors
+from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS, asset_tensors
 from tests.reconstruct.tiny_capture import FEW_VIEWS, HEIGHT, WIDTH, TinyView, sphere_views, write_nerf_synthetic
 
 CPU = torch.device("cpu")
@@ -95,8 +95,8 @@ def test_smaller_views_keep_the_mean_and_the_rays(unmasked: Views) -> None:
 @pytest.mark.slow
 def test_a_build_without_masks_stops_while_it_looks_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_nerf_synthetic(tmp_path / "unmasked", [before_surroundings(view) for view in sphere_views(FEW_VIEWS, square=True)])
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
-    monkeypatch.setattr(find_masks_module, "ITERATIONS", 40)
+    monkeypatch.setitem(PRESETS, "tiny", WITHOUT_HOLLOWS)
+    monkeypatch.setattr(find_masks_module, "ITERATIONS", 20)
     settings, heard = BuildSettings(preset="tiny", device="cpu"), []
     whole = asset_tensors(build_asset(folder, tmp_path / "whole", settings, heard.append))
     assert any(isinstance(line, Progress) and "looking for the object" in line.message for line in heard)
@@ -104,7 +104,7 @@ def test_a_build_without_masks_stops_while_it_looks_and_resumes(tmp_path: Path, 
         build_asset(folder, tmp_path / "stopped", settings, should_stop=lambda: True)
     asked = iter(range(10**6))
     with pytest.raises(BuildStopped):  # between two steps of stage 1, after the search
-        build_asset(folder, tmp_path / "stopped", settings, should_stop=lambda: next(asked) > 50)
+        build_asset(folder, tmp_path / "stopped", settings, should_stop=lambda: next(asked) > 26)
     resumed = asset_tensors(build_asset(folder, tmp_path / "stopped", dataclasses.replace(settings, resume=True)))
     assert whole.keys() == resumed.keys()
     exact = [name for name, value in whole.items() if torch.equal(value, resumed[name])]

@@ -25,10 +25,10 @@ from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.scene.strokes import Stroke, plain_strokes, read_strokes
 from drgs.scene.views import Views
 from tests.reconstruct.capture.test_find_masks import before_surroundings
-from tests.reconstruct.test_build_asset import TINY
+from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS
 from tests.reconstruct.tiny_capture import HEIGHT, SPHERE_CENTER, SPHERE_RADIUS, WIDTH, TinyView, sphere_views, write_nerf_synthetic
 
-STROKED = (3, 14)
+VIEW_COUNT, STROKED = 14, (3, 9)
 BLUE = np.array([0.2, 0.5, 0.9])
 """Of the surroundings, so that their colours are few of the ball's."""
 
@@ -52,7 +52,7 @@ def _one_torch_thread():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_nerf_synthetic(tmp_path_factory.mktemp("stroked"), [before_blue(view) for view in sphere_views(square=True)])
+    return write_nerf_synthetic(tmp_path_factory.mktemp("stroked"), [before_blue(view) for view in sphere_views(VIEW_COUNT, square=True)])
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def views(folder: Path) -> Views:
 
 @pytest.fixture(scope="module")
 def truth() -> torch.Tensor:
-    return torch.from_numpy(np.stack([view.rgba[..., 3] for view in sphere_views(square=True)])) > 127
+    return torch.from_numpy(np.stack([view.rgba[..., 3] for view in sphere_views(VIEW_COUNT, square=True)])) > 127
 
 
 def strokes_over(views: Views) -> list[Stroke]:
@@ -132,7 +132,7 @@ def test_strokes_that_say_too_little_are_refused(views: Views) -> None:
         masks_by_strokes(views, [over])
     with pytest.raises(CaptureFault, match="says what the object is"):
         masks_by_strokes(views, [around])
-    with pytest.raises(CaptureFault, match="called 'IMG_7', expected one of 24 names such as 'r_000'"):
+    with pytest.raises(CaptureFault, match="called 'IMG_7', expected one of 14 names such as 'r_000'"):
         masks_by_strokes(views, [over, around.model_copy(update={"picture": "IMG_7"})])
 
 
@@ -228,14 +228,14 @@ def test_the_doctor_draws_the_outlines_that_strokes_give(views: Views, folder: P
     assert done.exit_code == 0, done.output
     with Image.open(sheet) as drawn:
         green = (np.asarray(drawn.convert("RGB"), int) == GOOD).all(-1)
-    assert green.sum() > 24 * 70, "an outline in each of 24 pictures, of a ball that is some 35 pixels wide"
+    assert green.sum() > VIEW_COUNT * 70, "an outline in each of the pictures, of a ball that is some 35 pixels wide"
     alone = CliRunner().invoke(app, ["doctor", str(folder), "--strokes", str(file)])
     assert alone.exit_code == 2 and "expected --sheet FILE" in alone.output
 
 
 @pytest.mark.slow
 def test_a_build_takes_its_masks_from_strokes(views: Views, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setitem(PRESETS, "tiny", WITHOUT_HOLLOWS)
     strokes = tuple(strokes_over(views))
     asset = build_asset(folder, tmp_path / "ball", BuildSettings(preset="tiny", device="cpu", strokes=strokes))
     assert asset.provenance["strokes"] == plain_strokes(strokes)
