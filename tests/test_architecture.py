@@ -178,6 +178,7 @@ def test_server_and_worker_import_no_torch_at_module_level():
         assert not found, f"{name} imports {sorted(found)} when it is imported"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["drgs_server.app", "drgs_worker.run"])
 def test_importing_a_service_does_not_bring_torch_along(module: str):
     program = f"import sys, {module}; sys.exit(sorted({{'torch', 'warp'}} & set(sys.modules)) or None)"

@@ -65,6 +65,7 @@ def held(page: bytes) -> tuple[dict, dict[str, np.ndarray]]:
     return header, arrays
 
 
+@pytest.mark.slow
 def test_a_page_holds_shape_and_materials_of_the_mesh():
     asset = ball_asset()
     page = encode_page.encode_page(asset)

@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 
 import numpy as np
+import pytest
 from conftest import Service
 from test_rest import is_problem
 
@@ -12,6 +13,7 @@ from drgs_server.render.drgs_renderer import DrgsRenderer
 from tests.web.browser import write_ball
 
 
+@pytest.mark.slow
 def test_a_picture_under_another_light_is_that_of_a_session_with_it_and_no_edit(tmp_path: Path) -> None:
     write_ball(tmp_path / "ball.ply")
     service = Service(tmp_path, DrgsRenderer("cpu"))  # type: ignore[arg-type]

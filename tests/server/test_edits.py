@@ -39,6 +39,7 @@ def test_a_new_edit_forgets_what_was_undone() -> None:
         log.after("redo")
 
 
+@pytest.mark.slow
 @given(st.lists(st.sampled_from(["edit", "replace", "undo", "redo"]), max_size=40))
 @settings(max_examples=60, deadline=None)
 def test_the_log_behaves_like_two_stacks(kinds: list[str]) -> None:

@@ -30,6 +30,7 @@ def variants_of(service: Service, session: str) -> SessionVariants:
     return SessionVariants(call, session)
 
 
+@pytest.mark.slow
 def test_a_variant_is_kept_renamed_worn_and_undone(service: Service) -> None:
     session = service.open_session()
     variants = variants_of(service, session)

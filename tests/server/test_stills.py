@@ -117,6 +117,7 @@ def test_a_channel_holds_the_values_themselves(pose: AbstractPose) -> None:
     assert np.isinf(depth[0, 0, 0]) and 0.5 < depth[16, 24, 0] < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", ["final", "depth", "normal", "variance", "visibility", "indirect", "surfels", "certainty"])
 def test_a_picture_rendered_once_in_bands_has_the_pixels_of_one_that_is_refined(
     pose: AbstractPose, monkeypatch: pytest.MonkeyPatch, channel: Channel

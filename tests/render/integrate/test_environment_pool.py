@@ -123,6 +123,7 @@ def test_another_number_of_candidates_is_refused() -> None:
 # ---- the light ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_material", [False, True])
 @pytest.mark.parametrize("bounces", [0, 1, 3])
 def test_choosing_integrators_shade_as_the_reference_does(bounces: int, by_material: bool, device: str) -> None:
