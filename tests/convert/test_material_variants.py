@@ -8,6 +8,7 @@ import pytest
 import torch
 from test_export_asset import ball_asset
 
+from drgs.convert import bake_transfer
 from drgs.convert.bake_edits import bake_edits
 from drgs.convert.export_asset import export_asset
 from drgs.convert.import_mesh import import_mesh
@@ -18,6 +19,12 @@ from drgs.scene.edits import AS_CAPTURED, parse_edits
 
 GOLD = [{"op": "material", "select": {"all": True}, "set": {"albedo": [1.0, 0.77, 0.34], "metallic": 1.0, "roughness": 0.2}}]
 DARK = [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.3, 0.3, 0.3]}, "mode": "multiply"}]
+
+
+@pytest.fixture(autouse=True)
+def _rough_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How finely they are baked is not asked here, but takes most of the time."""
+    monkeypatch.setattr(bake_transfer, "DIRECTIONS", 16)
 
 
 def document(path: Path) -> dict:
