@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from drgs.convert import bake_transfer
 from drgs.convert.export_asset import display_sh, export_asset
 from drgs.convert.gltf_reflectance import usd_base_color
 from drgs.exchange.exr import decode_environment
@@ -62,10 +63,12 @@ def picture(stage, reader: str) -> bytes:
 def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("usd")
     asset = ball_asset()
-    export_asset(asset, folder / "ar.usdz", "usdz")
-    export_asset(asset, folder / "small.usdz", "usd", faces=300)
-    for name in ("scene.usdz", "scene.usda", "scene.usdc"):
-        export_asset(asset, folder / name, "usd")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bake_transfer, "DIRECTIONS", 16)  # how finely shadows are baked is not asked here
+        export_asset(asset, folder / "ar.usdz", "usdz")
+        export_asset(asset, folder / "small.usdz", "usd", faces=300)
+        for name in ("scene.usdz", "scene.usda", "scene.usdc"):
+            export_asset(asset, folder / name, "usd")
     return folder
 
 
