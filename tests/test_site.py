@@ -59,6 +59,7 @@ def test_the_api_has_every_public_name(site: Path):
     assert "drgs_server.client.Client.open_session" in (site / "api" / "client.html").read_text()
 
 
+@pytest.mark.slow
 def test_pages_load_nothing_from_elsewhere(site: Path):
     for path in site.rglob("*.html"):
         loaded = re.findall(r"<(?:script|img|link)[^>]*?(?:src|href)=[\"']?(https?:[^\"' >]+)", path.read_text())

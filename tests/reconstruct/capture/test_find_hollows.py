@@ -122,10 +122,12 @@ def test_a_mirror_keeps_its_hull() -> None:
     assert find_hollows(ball, hull, SETTINGS, 0, CPU) is hull
 
 
+@pytest.mark.slow
 def test_a_search_that_is_stopped_finds_nothing(painted: Views, drum: VisualHull) -> None:
     assert find_hollows(painted, drum, SETTINGS, 0, CPU, should_stop=lambda: True) is None
 
 
+@pytest.mark.slow
 def test_photographs_in_which_nothing_is_solid_keep_the_hull(painted: Views, drum: VisualHull) -> None:
     assert find_hollows(replace(painted, coverage=tuple(mask // 2 for mask in painted.coverage)), drum, SETTINGS, 0, CPU) is drum
 
@@ -158,6 +160,7 @@ def test_light_falls_off_by_beer_s_law_and_the_median_depth_follows() -> None:
     assert torch.isinf(constant_grid(5.0, inside=0.0).depths(rays)[0]).all()
 
 
+@pytest.mark.slow
 def test_what_is_told_is_deterministic(painted: Views) -> None:
     settings = replace(SETTINGS.grid, levels=((12, 6), (16, 4)), rays_a_step=64)
     generator = torch.Generator().manual_seed(3)
