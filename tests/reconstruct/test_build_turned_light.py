@@ -21,11 +21,12 @@ from tests.reconstruct.capture.test_turning_light import write_turntable
 from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS, asset_tensors
 
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
+FEW_RAYS = WITHOUT_HOLLOWS.surface.surface.moves
 LONGER = replace(
     WITHOUT_HOLLOWS,
-    fit=replace(WITHOUT_HOLLOWS.fit, iterations=60),
-    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=30), WITHOUT_HOLLOWS.surface.mesh),
-    materials=MeshMaterialSettings(iterations=30, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
+    fit=replace(WITHOUT_HOLLOWS.fit, iterations=40),
+    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=20, moves=FEW_RAYS), WITHOUT_HOLLOWS.surface.mesh),
+    materials=MeshMaterialSettings(iterations=20, moves=FEW_RAYS, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
 )
 
 
