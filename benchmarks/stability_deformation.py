@@ -57,6 +57,8 @@ LIMITS = """
 - **Thin parts**: what is thinner than one cell of the grid, such as a teapot's handle at 20 000 particles, has no matter between its sides to
   hold it together, and may tear; below three cells it bends too easily. `drgs simulate` says before the first frame where, and how many
   particles would do.
+- **Matter that parts**: a particle that lost 15 % of its bonds is loose: longer than at rest by 1.5 cells (by 0.4 in sand and snow). Faces over it are cut, and grains shown, at
+  most 50 000; a fluid never parts. Rigid motion cuts nothing, to the bit ([why](decisions/0009-matter-that-parts.md)).
 - **CUDA**: measured on the CPU only.
 """
 

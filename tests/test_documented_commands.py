@@ -81,7 +81,8 @@ def test_the_tutorial_can_be_followed(reader: Path):
         result = CliRunner().invoke(app, [name, *arguments])
         assert result.exit_code == 0, f"drgs {name} {' '.join(arguments)}: {result.output}"
         said += result.output
-    assert "Nothing was found that would hurt a build." in said and "1 picture written to out/gold" in said and "views.psnr" in said
+    # What the doctor says of a capture that is good is asked of the sample, in test_cli.py.
+    assert "1 picture written to out/gold" in said and "views.psnr" in said
     made = {path.name for path in reader.iterdir()}
     assert {"sheet.png", "sample.html", "sample.glb", "sample.ply", "sample.spz", "light.exr", "sample.usdz"} <= made
     assert list((reader / "out" / "gold").glob("*.png")) and list((reader / "out" / "pictures").glob("*.png"))

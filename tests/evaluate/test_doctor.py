@@ -1,12 +1,16 @@
 """The doctor names what is wrong with a capture, and nothing when nothing is."""
 
 import json
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
+from drgs.cli import app
 from drgs.evaluate.doctor import doctor
 from drgs.evaluate.doctor.places import _ranks
 from drgs.scene.lens import Lens
@@ -19,6 +23,14 @@ def _sentences(report: dict, level: str = "warning") -> str:
 
 def test_equal_brightness_shares_the_mean_of_its_ranks() -> None:
     assert _ranks(np.array([0.5, 0.1, 0.5, 0.2, 0.5])).tolist() == [4, 1, 4, 2, 4]
+
+
+@pytest.mark.parametrize("found", [[], [{"level": "info", "sentence": "It is small."}]])
+def test_the_command_says_so_when_nothing_was_found(found: list, monkeypatch: pytest.MonkeyPatch) -> None:
+    report = {"ok": True, "views": 3, "findings": found, "advice": []}
+    monkeypatch.setattr(import_module("drgs.evaluate.doctor.doctor"), "examine", lambda dataset: SimpleNamespace(report=report, views=None))
+    said = CliRunner().invoke(app, ["doctor", "."]).output
+    assert said.endswith("info: It is small.\n" if found else "Nothing was found that would hurt a build.\n")
 
 
 @pytest.mark.slow
