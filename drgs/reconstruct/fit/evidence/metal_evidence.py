@@ -66,8 +66,8 @@ DECISIVE = 0.3
 
 SCALES = tuple(2 ** (k / 2) for k in range(-6, 7))
 """Of the light, that are compared."""
-RIGHT_SCALE = 1.4
-"""Factor either way within which the light's brightness is let be: captures whose truth is known are found within 1.25."""
+RIGHT_SCALE = 1.2
+"""Factor either way within which the light's brightness is let be: finished captures whose light is right are found within 1.1."""
 
 
 @dataclass(frozen=True, eq=False)
