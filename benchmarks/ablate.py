@@ -26,7 +26,7 @@ from benchmarks.measures.measure_asset import PARTS, QualitySettings, measure_as
 from benchmarks.measures.report_table import flat_figures, markdown_table
 from benchmarks.measures.split_capture import scene_folder
 from benchmarks.measures.variants import Variant, apply_overrides, read_variants
-from drgs.reconstruct.build_asset import PRESETS
+from drgs.reconstruct.presets import PRESETS
 from drgs.scene.asset import load_asset
 
 DEFAULT_PARTS = ("figures", "mesh", "outlines", "primary", "light")

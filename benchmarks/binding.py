@@ -31,7 +31,7 @@ from drgs.deform.maps import evaluate_map
 from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.metrics import picture_figures, score_renders, truth_folders
 from drgs.maths.color import srgb_from_linear
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, build_asset, build_stages
+from drgs.reconstruct.build_asset import BuildSettings, build_asset, build_stages
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import load_cameras, load_views
 from drgs.reconstruct.checkpoints import read_tensors
@@ -41,6 +41,7 @@ from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, fit_m
 from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.reconstruct.geometry.mesh_from_gaussians import reduced_mesh
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
+from drgs.reconstruct.presets import PRESETS
 from drgs.reconstruct.stages import CHECKPOINTS, read_geometry
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from benchmarks.measures.variants import apply_overrides
 from drgs.cli_progress import build_progress
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, build_asset
+from drgs.reconstruct.build_asset import BuildSettings, build_asset
+from drgs.reconstruct.presets import PRESETS
 
 
 def main(argument: str) -> None:

@@ -24,7 +24,7 @@ from benchmarks.paper.pages import write_pages
 from benchmarks.paper.tables import EvidenceSettings, SceneEvidence, bound_tensors, deformed_cell, static_cell
 from benchmarks.paper.variant import AbstractVariant
 from benchmarks.paper.variants import VARIANTS
-from drgs.reconstruct.build_asset import PRESETS
+from drgs.reconstruct.presets import PRESETS
 
 PARTS = ("static", "deformed", "figures")
 QUICK = EvidenceSettings(samples_per_pixel=32, budget=20_000, bake=BakeSettings(rounds=0), test_every=2)

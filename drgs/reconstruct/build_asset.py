@@ -1,6 +1,6 @@
 """A capture becomes an asset: read, fit surfels and light, extract the mesh, fit materials, bake, write.
 
-Reads like the method: each step is a function of its own file, each stage with what it keeps in `stages.py`; here they meet, with presets. Checkpoints live in OUT.build/ beside the asset; a build that was stopped or killed goes on from the last one.
+Reads like the method: each step is a function of its own file, each stage with what it keeps in `stages.py`; here they meet. Checkpoints live in OUT.build/ beside the asset; a build that was stopped or killed goes on from the last one.
 """
 
 import math
@@ -8,9 +8,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import UInt8
@@ -20,16 +20,13 @@ from drgs.exchange.photographs import encode_photographs
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
 from drgs.reconstruct.capture.cut_to_box import views_of
 from drgs.reconstruct.capture.exposures import with_gains_of_fit, with_gains_of_points
-from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.find_masks import masked_by_surfels
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
 from drgs.reconstruct.capture.open_capture import open_capture
-from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
 from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
-from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings, albedo_detail, divisions
 from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.fit_loop import FitState
@@ -37,17 +34,15 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
-from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
-from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
-from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings, SurfaceFit
-from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, gaussians_from_state
-from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings, gaussians_from_materials
-from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, gaussians_from_mesh_fit
+from drgs.reconstruct.fit.surface.surface_passes import SurfaceFit
+from drgs.reconstruct.fit.surfels.fit_gaussians import drawn_object, gaussians_from_state
+from drgs.reconstruct.fit.surfels.fit_materials import gaussians_from_materials
+from drgs.reconstruct.fit.surfels.fit_mesh_surfels import gaussians_from_mesh_fit
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
 from drgs.reconstruct.geometry.divide_faces import DividedFaces, divided_binding, divided_faces
-from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, FULL_MESH, MeshSettings, mesh_report
+from drgs.reconstruct.geometry.extract_mesh import mesh_report
 from drgs.reconstruct.geometry.face_surfels import radiating_surfels, surfels_on_faces_of
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
@@ -55,6 +50,7 @@ from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.outline_agreement import complaint, outline_agreement
 from drgs.reconstruct.pose.pose_photographs import PoseSettings
 from drgs.reconstruct.pose.posed_dataset import needs_poses, pose_source, provenance_of
+from drgs.reconstruct.presets import PRESETS, Preset
 from drgs.reconstruct.progress import POSED, STAGE_SHARES, BuildStopped, Progress
 from drgs.reconstruct.report_progress import BuildReporter
 from drgs.reconstruct.stages import (
@@ -76,7 +72,6 @@ from drgs.reconstruct.stages import (
 from drgs.render.intersect.horizon import find_horizons, stored_horizons
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import mesh_extent
-from drgs.render.records import SampleCounts
 from drgs.scene.asset import Asset, save_asset
 from drgs.scene.binding import Binding
 from drgs.scene.certainty import Certainty
@@ -112,71 +107,9 @@ class BuildSettings:
     """Preset of the stage `materials` alone: None is `preset`. It is how material and light are separated anew on kept geometry."""
 
 
-@dataclass(frozen=True)
-class Preset:
-    """All numbers that differ between draft, fast and full."""
-
-    points: int
-    image_side: int
-    """Photos are reduced to at most this [pixels]."""
-    fit: FitSettings
-    mesh: MeshSettings
-    surface: PassSettings = field(default_factory=PassSettings)
-    materials: MeshMaterialSettings = field(default_factory=MeshMaterialSettings)
-    detail: DetailSettings = field(default_factory=DetailSettings)
-    hollows: HollowSettings = field(default_factory=HollowSettings)
-    mesh_surfels: MeshFitSettings = field(default_factory=MeshFitSettings)
-    """For binding mesh: its fine-tuning."""
-    materials_on: Literal["mesh", "surfels"] = "mesh"
-    """surfels: the mesh stays as it was extracted, and materials are fitted on surfels, as in the paper; then `surface`, `materials` and
-    `detail` are idle."""
-    surfel_materials: MaterialSettings = field(default_factory=MaterialSettings)
-    """Of materials_on surfels. Bound to the mesh, that one has as many faces at most as surfels are allowed (fit.densify.budget)."""
-
-
 BINDINGS = tuple(STAGE_SHARES)
 POSING_SHARE = 0.7
 """Of the stage `read`, where pictures are posed in it."""
-PRESETS = {
-    "draft": Preset(
-        8_000,
-        256,
-        FitSettings(iterations=400, half_size_share=0.6, densify=DensifySettings(budget=12_000)),
-        replace(FAST_MESH, resolution=160, face_limit=30_000),
-        PassSettings(
-            3, SurfaceSettings(rounds=1, steps_a_round=50), replace(PASS_MESH, resolution=120, face_limit=30_000), carve_after=(1,)
-        ),
-        MeshMaterialSettings(iterations=80, points_a_step=1024),
-        DetailSettings(most_faces=0),
-        HollowSettings(RadianceGridSettings(levels=())),
-        MeshFitSettings(iterations=150),
-        surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
-    ),
-    "fast": Preset(
-        15_000,
-        512,
-        FitSettings(iterations=800, densify=DensifySettings(budget=30_000)),
-        FAST_MESH,
-        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carve_after=(2,)),
-        MeshMaterialSettings(iterations=180),
-        DetailSettings(),
-        HollowSettings(),
-        MeshFitSettings(iterations=300),
-        surfel_materials=MaterialSettings(iterations=300),
-    ),
-    "full": Preset(
-        25_000,
-        1024,
-        FitSettings(iterations=1400, half_size_share=0.25, most_pixels=320_000, densify=DensifySettings(budget=40_000)),
-        FULL_MESH,
-        PassSettings(10, mesh=replace(PASS_MESH, resolution=320, face_limit=200_000), carve_after=(), try_after=(2, 4, 6, 8)),
-        MeshMaterialSettings(iterations=1200, rounds=3, points_a_step=4096),
-        DetailSettings(most_faces=400_000),
-        HollowSettings(),
-        MeshFitSettings(iterations=500),
-        surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
-    ),
-}
 
 
 def build_asset(

@@ -12,7 +12,7 @@ from benchmarks.measures.build_process import built_asset, read_events
 from benchmarks.measures.build_variant import variant_command
 from benchmarks.measures.fit_curves import curves_of, write_curves
 from benchmarks.measures.variants import Variant, apply_overrides, read_variants
-from drgs.reconstruct.build_asset import PRESETS
+from drgs.reconstruct.presets import PRESETS
 from drgs.scene.asset import Asset, load_asset, save_asset
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, write_nerf_synthetic, write_nerfstudio
 from tests.render.closed_form_scenes import constant_sky, mesh_of

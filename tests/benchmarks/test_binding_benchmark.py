@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from benchmarks import binding
-from drgs.reconstruct.build_asset import PRESETS
+from drgs.reconstruct.presets import PRESETS
 from tests.deform.test_pose_scene import plate_asset
 from tests.reconstruct.test_build_asset import TINY
 from tests.reconstruct.tiny_capture import sphere_views, write_nerf_synthetic

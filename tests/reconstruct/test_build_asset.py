@@ -15,7 +15,7 @@ from PIL import Image
 
 from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photograph
 from drgs.reconstruct import report_progress
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, Preset, Progress, build_asset, calibrations, kept_photographs
+from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, Progress, build_asset, calibrations, kept_photographs
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.densify import DensifySettings
@@ -31,6 +31,7 @@ from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings
 from drgs.reconstruct.geometry.bind_gaussians import points_from_binding
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen
+from drgs.reconstruct.presets import PRESETS, Preset
 from drgs.reconstruct.report_progress import encode_preview
 from drgs.reconstruct.stages import stage_two_preview
 from drgs.render.records import SampleCounts

@@ -9,9 +9,10 @@ import torch
 import trimesh
 
 from drgs.evaluate.evaluate_asset import evaluate_asset
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, build_asset
+from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
 from drgs.reconstruct.capture import find_masks as find_masks_module
 from drgs.reconstruct.capture.build_box import BuildBox
+from drgs.reconstruct.presets import PRESETS
 from drgs.scene.asset import Asset, load_asset, load_photographs
 from tests.reconstruct.capture.test_find_masks import before_surroundings
 from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS

@@ -8,10 +8,11 @@ import pytest
 import torch
 from PIL import Image
 
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, build_asset
+from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.surface_passes import PassSettings
+from drgs.reconstruct.presets import PRESETS
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
 from drgs.scene.asset import Asset, light_from_world, load_asset, save_asset

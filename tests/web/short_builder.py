@@ -17,7 +17,7 @@ MESH, PASS = {"resolution": 96, "face_limit": 10_000}, {"resolution": 80, "face_
 
 
 def build(request: BuildRequest, tell: Tell, should_stop: Callable[[], bool]) -> Iterator[str]:
-    from drgs.reconstruct.build_asset import PRESETS
+    from drgs.reconstruct.presets import PRESETS
 
     draft = PRESETS["draft"]
     fit = replace(draft.fit, iterations=FIT_ITERATIONS, densify=replace(draft.fit.densify, budget=MOST_SURFELS))

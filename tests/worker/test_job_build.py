@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from drgs.reconstruct.build_asset import PRESETS, Preset
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.densify import DensifySettings
@@ -19,6 +18,7 @@ from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
+from drgs.reconstruct.presets import PRESETS, Preset
 from drgs.reconstruct.progress import STAGE_SHARES, Progress
 from drgs.render.records import SampleCounts
 from drgs.scene.asset import load_asset

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, Progress, build_asset
+from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, Progress, build_asset
 from drgs.reconstruct.capture import find_masks as find_masks_module
 from drgs.reconstruct.capture.find_masks import find_masks, smaller_views
 from drgs.reconstruct.capture.initial_points import initial_points
@@ -15,6 +15,7 @@ from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.light.environment_pyramid import background_image
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
+from drgs.reconstruct.presets import PRESETS
 from drgs.scene.camera import pixel_rays_world
 from drgs.scene.environment import uv_from_direction
 from drgs.scene.views import Views

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from drgs.cli import app
 from drgs.evaluate.contact_sheet import GOOD
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, build_asset
+from drgs.reconstruct.build_asset import BuildSettings, build_asset
 from drgs.reconstruct.capture.load_views import load_unmasked_views, load_views, read_capture
 from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
@@ -22,6 +22,7 @@ from drgs.reconstruct.capture.masks_by_strokes.color_shares import CELLS, cells_
 from drgs.reconstruct.capture.masks_by_strokes.cut_picture import cut_picture, edges_of, undecided
 from drgs.reconstruct.capture.masks_by_strokes.vote_volume import Region, silhouette, vote_volume
 from drgs.reconstruct.capture.open_capture import open_capture
+from drgs.reconstruct.presets import PRESETS
 from drgs.scene.strokes import Stroke, plain_strokes, read_strokes
 from drgs.scene.views import Views
 from tests.reconstruct.capture.test_find_masks import before_surroundings

@@ -9,10 +9,11 @@ import pytest
 from PIL import Image
 
 from drgs.evaluate.doctor import doctor
-from drgs.reconstruct.build_asset import PRESETS, BuildSettings, BuildStopped, build_asset
+from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
 from drgs.reconstruct.pose.pose_photographs import PoseSettings
 from drgs.reconstruct.pose.posed_dataset import film_of, needs_poses, pose_source
 from drgs.reconstruct.pose.prepare_photos import PreparedPhoto, with_backdrop_masks
+from drgs.reconstruct.presets import PRESETS
 from drgs.reconstruct.progress import Progress
 from tests.reconstruct import tiny_capture
 from tests.reconstruct.pose.textured_scene import orbit, write_photographs

@@ -1,0 +1,84 @@
+"""The presets of a build: all numbers that differ between draft, fast and full.
+
+In: nothing. Out: PRESETS, by name; each a Preset, settings of every stage.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from drgs.reconstruct.capture.find_hollows import HollowSettings
+from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
+from drgs.reconstruct.fit.densify import DensifySettings
+from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings
+from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
+from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings
+from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings
+from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, FULL_MESH, MeshSettings
+from drgs.render.records import SampleCounts
+
+
+@dataclass(frozen=True)
+class Preset:
+    """All numbers that differ between draft, fast and full."""
+
+    points: int
+    image_side: int
+    """Photos are reduced to at most this [pixels]."""
+    fit: FitSettings
+    mesh: MeshSettings
+    surface: PassSettings = field(default_factory=PassSettings)
+    materials: MeshMaterialSettings = field(default_factory=MeshMaterialSettings)
+    detail: DetailSettings = field(default_factory=DetailSettings)
+    hollows: HollowSettings = field(default_factory=HollowSettings)
+    mesh_surfels: MeshFitSettings = field(default_factory=MeshFitSettings)
+    """For binding mesh: its fine-tuning."""
+    materials_on: Literal["mesh", "surfels"] = "mesh"
+    """surfels: the mesh stays as it was extracted, and materials are fitted on surfels, as in the paper; then `surface`, `materials` and
+    `detail` are idle."""
+    surfel_materials: MaterialSettings = field(default_factory=MaterialSettings)
+    """Of materials_on surfels. Bound to the mesh, that one has as many faces at most as surfels are allowed (fit.densify.budget)."""
+
+
+PRESETS = {
+    "draft": Preset(
+        8_000,
+        256,
+        FitSettings(iterations=400, half_size_share=0.6, densify=DensifySettings(budget=12_000)),
+        replace(FAST_MESH, resolution=160, face_limit=30_000),
+        PassSettings(
+            3, SurfaceSettings(rounds=1, steps_a_round=50), replace(PASS_MESH, resolution=120, face_limit=30_000), carve_after=(1,)
+        ),
+        MeshMaterialSettings(iterations=80, points_a_step=1024),
+        DetailSettings(most_faces=0),
+        HollowSettings(RadianceGridSettings(levels=())),
+        MeshFitSettings(iterations=150),
+        surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
+    ),
+    "fast": Preset(
+        15_000,
+        512,
+        FitSettings(iterations=800, densify=DensifySettings(budget=30_000)),
+        FAST_MESH,
+        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carve_after=(2,)),
+        MeshMaterialSettings(iterations=180),
+        DetailSettings(),
+        HollowSettings(),
+        MeshFitSettings(iterations=300),
+        surfel_materials=MaterialSettings(iterations=300),
+    ),
+    "full": Preset(
+        25_000,
+        1024,
+        FitSettings(iterations=1400, half_size_share=0.25, most_pixels=320_000, densify=DensifySettings(budget=40_000)),
+        FULL_MESH,
+        PassSettings(10, mesh=replace(PASS_MESH, resolution=320, face_limit=200_000), carve_after=(), try_after=(2, 4, 6, 8)),
+        MeshMaterialSettings(iterations=1200, rounds=3, points_a_step=4096),
+        DetailSettings(most_faces=400_000),
+        HollowSettings(),
+        MeshFitSettings(iterations=500),
+        surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
+    ),
+}
