@@ -11,7 +11,6 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,12 +18,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from drgs.cli_options import (
+    EXPORT_HELP,
+    AssetPath,
+    BindingKind,
+    DataFolder,
+    DatasetPath,
+    Denoiser,
+    DeviceName,
+    Json,
+    LightKind,
+    Matching,
+    Preset,
+    Primary,
+    StrokesPath,
+)
 from drgs.exchange.export_formats import (
     DEFAULT_FACES,
-    EXPORT_FORMATS,
     FEWEST_FACES,
-    FILE_KINDS,
-    SPLAT_KINDS,
     CommandFormat,
     command_format_of,
     refuse_faces,
@@ -64,70 +75,6 @@ class _Commands(TyperGroup):
 
 
 app = typer.Typer(cls=_Commands, add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
-
-
-class Preset(StrEnum):
-    draft = "draft"
-    fast = "fast"
-    full = "full"
-
-
-class BindingKind(StrEnum):
-    particles = "particles"
-    mesh = "mesh"
-
-
-class LightKind(StrEnum):
-    auto = "auto"
-    object = "object"
-    camera = "camera"
-
-
-class DeviceName(StrEnum):
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
-
-
-class Primary(StrEnum):
-    gaussians = "gaussians"
-    mesh = "mesh"
-
-
-class Matching(StrEnum):
-    auto = "auto"
-    exhaustive = "exhaustive"
-    sequential = "sequential"
-
-
-class Denoiser(StrEnum):
-    none = "none"
-    svgf = "svgf"
-    oidn = "oidn"
-
-
-EXPORT_HELP = "; ".join(
-    f"{name}: {kind.title}" for name, kind in (*((name, FILE_KINDS[name]) for name in EXPORT_FORMATS), *SPLAT_KINDS.items())
-)
-AssetPath = Annotated[Path, typer.Argument(metavar="ASSET", help="Asset folder, or the same zipped.")]
-DatasetPath = Annotated[
-    Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP, Metashape or NeRO folder; pictures or a film.")
-]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
-StrokesPath = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Strokes (JSON) over some pictures that say what is the object and what is not: masks of all follow from them.",
-        show_default="the capture's own masks, else what is found",
-    ),
-]
-DataFolder = Annotated[
-    Path | None,
-    typer.Option(
-        "--data", help="Folder of assets, jobs and the token.", show_default="data in a checkout, else a folder of the user's own"
-    ),
-]
 
 
 def _print_version(wanted: bool) -> None:
