@@ -11,7 +11,7 @@ Gradients never decide this: a darker light and a diffuse part trade places with
 Errors of shape and light spoil the predicted mirror S_v, not the constant E, so they count against metal alone: real paint hardly ever says
 "metal", real metal says "paint" wherever its normals are off. So the benefit of the doubt is metal's, and each place hears its surroundings.
 Where light turns with the camera, what arrives at paint changes from view to view as well, and is predicted nearly as badly: then there is less of it.
-And no metal is dark: what reflects less than a tenth in its brightest channel is lacquer, however well a dark mirror explains it.
+And no metal is dark: what reflects less than a twelfth in its brightest channel is lacquer, however well a dark mirror explains it.
 
 The same sums say how bright the light is (light_scale). d and f trade places with it, but what matter of any kind reflects at grazing angles (B_v),
 and paint at any (0.04), does not.
@@ -47,11 +47,11 @@ DOUBT = 0.4
 """Of the residuals' logarithms: by how much metal may explain worse and is believed, where it leaves much unexplained."""
 DOUBT_TURNED = 0.2
 """The same where light turns with the camera. Drafts, metallic RMSE of bunny and teapot: .45 and .38 with 0.4, .17 and .42 with 0.2, .09 and .54 with 0."""
-DARKEST = (0.1, 0.2)
+DARKEST = (0.08, 0.16)
 """Reflectance of metal, in its brightest channel: below the first none is that dark, from the second on nothing speaks against it. Of captures whose
 truth is known true metal has 0.34 and more, carved bronze 0.15 and more; black and dark red lacquer, explained as metal, 0.15 and less."""
-TOO_DARK = 1.4
-"""Of the residuals' logarithms: by how much metal must explain better to be believed where none is that dark."""
+TOO_DARK = 1.0
+"""Taken off the doubt where no metal is that dark: there it must explain better."""
 LOST = 0.45
 """Relative error of the better explanation above which neither says much: there the shape is wrong, not the paint."""
 STRONGEST = 2.0
