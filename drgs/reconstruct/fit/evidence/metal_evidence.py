@@ -162,7 +162,8 @@ def metal_evidence(sums: ViewSums, edges: MeshEdges, turned: bool, scale: float 
 
 
 def light_scale(sums: ViewSums) -> float:
-    """By what factor the light should be brighter, and paint and metal darker, to explain the photographs best; 1 where it is within RIGHT_SCALE of right.
+    """By what factor the light should be brighter, and paint and metal darker, to explain the photographs best; 1 where it is within RIGHT_SCALE of right,
+    and where the photographs bound it on one side only.
 
     Light that is three times too bright makes chrome look like lead: its pictures are right, and those under any other light too dark.
     """
@@ -176,10 +177,10 @@ def light_scale(sums: ViewSums) -> float:
 
     errors = [left(scale) for scale in SCALES]
     best = min(range(len(SCALES)), key=errors.__getitem__)
-    scale = SCALES[best]
-    if 0 < best < len(SCALES) - 1:
-        below, here, above = errors[best - 1 : best + 2]
-        scale *= (SCALES[1] / SCALES[0]) ** ((below - above) / (2 * max(below - 2 * here + above, 1e-9)))
+    if best in (0, len(SCALES) - 1):
+        return 1.0  # no light is too dim for what is black
+    below, here, above = errors[best - 1 : best + 2]
+    scale = SCALES[best] * (SCALES[1] / SCALES[0]) ** ((below - above) / (2 * max(below - 2 * here + above, 1e-9)))
     return scale if abs(math.log(scale)) > math.log(RIGHT_SCALE) else 1.0
 
 

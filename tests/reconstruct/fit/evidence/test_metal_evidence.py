@@ -155,3 +155,12 @@ def test_no_metal_is_dark(albedo: float, called_metal: bool):
     evidence = evidence_of(tilted, targets, tables)
     around = mesh.vertices[:, 2].abs() < 0.6
     assert float(((evidence > 0) == called_metal)[around].float().mean()) > 0.9
+
+
+def test_what_is_black_in_all_photographs_does_not_dim_the_light():
+    mesh = sphere_mesh(subdivisions=3, albedo=0.3, roughness=0.25)
+    tables = filter_environment(light())
+    black = [dataclasses.replace(target, photo=0 * target.photo, saturation=0 * target.saturation) for target in pictures(mesh, tables)]
+    sums = view_sums(build_tracer(mesh), black, open_light(mesh, tables))
+    assert light_scale(sums) == 1.0
+    assert bool(torch.isfinite(metal_evidence(sums, mesh_edges(mesh.faces), False)).all())
