@@ -23,21 +23,19 @@ from torch import Tensor
 
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, radiance_along
+from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, radiance_along
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, display_image
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
-from drgs.reconstruct.fit.surface.shade_surface import SOLID
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, seen_twice
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.render.integrate.environment_table import build_environment_table
 from drgs.render.integrate.integrate_samples import integrate_samples
 from drgs.render.integrate.sample_rays import sample_rays
-from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Rays, SampleCounts, ShadingPoints
-from drgs.scene.camera import world_from_pixel
 from drgs.scene.environment import Environment
 from drgs.scene.views import Views
 
@@ -57,7 +55,8 @@ class MeshMaterialSettings:
     weight_bend: float = 0.0015
     weight_smooth: float = 0.05
     weight_metal: float = 0.3
-    weight_white_light: float = 0.02
+    weight_white_light: float = 0.002
+    """Ten times as much holds each direction's light to grey, whatever the photographs say, and a lamp's colour is missing where metal mirrors it."""
     weight_rough_light: float = 0.002
     seed: int = 0
 
@@ -120,10 +119,13 @@ class _Steps:
         materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
         terms: dict[str, Tensor] = {}
         squared_error = None
-        points, face_normal = self._points(target, self.solid[view], normals, materials)
-        if len(points.pixel):
-            photo = target.saturation.reshape(-1, 3)[points.pixel.long()]
-            first, second = (self._shown(points, face_normal, environment, photo, target, 2 * iteration + half) for half in (0, 1))
+        chosen = self._drawn(self.solid[view])
+        twice = seen_twice(target, chosen, self.surface.tracer, self.state.generator)
+        if len(twice[0].pixels):
+            photo = target.saturation.reshape(-1, 3)[twice[0].pixels]
+            first, second = (
+                self._shown(seen, normals, materials, environment, photo, target, 2 * iteration + half) for half, seen in enumerate(twice)
+            )
             terms["traced"] = crossed_halves(first, second, photo)
             mean = 0.5 * (first + second).detach()
             squared_error = float((mean.clamp(0, 1) - photo).square().mean())
@@ -133,38 +135,32 @@ class _Steps:
         )  # fmt: skip
         return StepLoss(terms, target.camera, squared_error)
 
-    def _points(self, target: ViewTarget, solid: Tensor, normals: Tensor, materials: dict[str, Tensor]) -> tuple[ShadingPoints, Tensor]:
-        """Points behind some of the view's pixels, each at a place of its pixel drawn anew, and the normals of their faces."""
-        device, generator = self.faces.device, self.state.generator
-        with torch.no_grad():
-            chosen = solid[
-                torch.randint(max(1, len(solid)), (min(self.settings.points_a_step, len(solid)),), generator=generator).to(device)
-            ]
-            place = torch.rand(len(chosen), 2, generator=generator).to(device)
-            width = target.camera.width
-            at = torch.stack([chosen % width, chosen // width], -1) + place
-            direction = torch.cat([at, torch.ones_like(at[:, :1])], -1) @ world_from_pixel(target.camera).T
-            direction = torch.nn.functional.normalize(direction, dim=-1)
-            origin = target.camera.center_world
-            hits = trace_rays(origin.expand_as(direction), direction, self.surface.tracer)
-            hit = hits.hit.nonzero().squeeze(1)
-            face = hits.face[hit].long()
-            corners, weights = self.faces[face].long(), corner_weights(hits.barycentric[hit])
-        points = ShadingPoints(
-            position_world=at_corners(self.surface.tracer.mesh.vertices, corners, weights),
-            normal_world=torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1),
-            wo_world=-direction[hit],
-            albedo=at_corners(materials["albedo"], corners, weights),
-            roughness=at_corners(materials["roughness"], corners, weights),
-            metallic=at_corners(materials["metallic"], corners, weights),
-            pixel=chosen[hit].int(),
-        )
-        return points, self.surface.tracer.face_normals[face]
+    def _drawn(self, solid: Tensor) -> Tensor:
+        """Some of the view's pixels, flat."""
+        most = min(self.settings.points_a_step, len(solid))
+        return solid[torch.randint(max(1, len(solid)), (most,), generator=self.state.generator).to(solid.device)]
 
     def _shown(
-        self, points: ShadingPoints, face_normal: Tensor, environment: Tensor, photo: Tensor, target: ViewTarget, draw: int
+        self,
+        seen: SeenPlaces,
+        normals: Tensor,
+        materials: dict[str, Tensor],
+        environment: Tensor,
+        photo: Tensor,
+        target: ViewTarget,
+        draw: int,
     ) -> Tensor:
-        """(point, 3) colour in display space by one set of rays; gradients reach materials, normals and the light."""
+        """(place, 3) colour in display space by one set of rays; gradients reach materials, normals and the light."""
+        points = ShadingPoints(
+            position_world=at_corners(self.surface.tracer.mesh.vertices, seen.corners, seen.weights),
+            normal_world=torch.nn.functional.normalize(at_corners(normals, seen.corners, seen.weights), dim=-1),
+            wo_world=seen.wo,
+            albedo=at_corners(materials["albedo"], seen.corners, seen.weights),
+            roughness=at_corners(materials["roughness"], seen.corners, seen.weights),
+            metallic=at_corners(materials["metallic"], seen.corners, seen.weights),
+            pixel=seen.pixels.int(),
+        )
+        face_normal = self.surface.tracer.face_normals[seen.face]
         turned = in_light(points, target.light_from_world)
         with torch.no_grad():
             table = build_environment_table(Environment(environment.detach()))

@@ -24,7 +24,7 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, rough_light, white_light
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, not_grazing, seen_places, shade_places
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, seen_twice, shade_places, steep_enough
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
@@ -82,7 +82,8 @@ class SurfaceSettings:
     """Of the mean distance of metallic from what the evidence says, times its strength (metal_evidence)."""
     metal_from: float = 0.2
     """Share of the rounds after which evidence is looked at: normals must be right before mirrors can be."""
-    weight_white_light: float = 0.02
+    weight_white_light: float = 0.002
+    """Ten times as much holds each direction's light to grey, whatever the photographs say, and a lamp's colour is missing where metal mirrors it."""
     weight_rough_light: float = 0.002
     pixels_a_step: int = 65_536
     """Of one photograph; of larger ones as many are drawn anew in each step."""
@@ -191,10 +192,12 @@ class _Steps:
         if len(solid) > self.settings.pixels_a_step:
             drawn = torch.randperm(len(solid), generator=self.state.generator)[: self.settings.pixels_a_step]
             solid = solid[drawn.sort().values.to(solid.device)]
-        seen = not_grazing(seen_places(target, solid, self.surface.tracer), normals)
         tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
         light = self.surface.light_of(filter_environment(environment))(target)
-        return seen.pixels, *shade_places(seen, target, tracer, normals, materials, light, self.state.generator)
+        twice = seen_twice(target, solid, self.surface.tracer, self.state.generator)
+        steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
+        first, second = (shade_places(seen[steep], target, tracer, normals, materials, light, self.state.generator) for seen in twice)
+        return twice[0].pixels[steep], first, second
 
 
 def prior_terms(

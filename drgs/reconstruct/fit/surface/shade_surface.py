@@ -7,7 +7,7 @@ display space, differentiable in all but the places.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.maths.brdf import f0_from_base
@@ -17,7 +17,8 @@ from drgs.reconstruct.fit.losses import display_image
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
-from drgs.scene.camera import pixel_rays_world
+from drgs.render.records import Hits
+from drgs.scene.camera import pixel_rays_world, world_from_pixel
 
 SOLID = 0.995
 """Least coverage of a pixel that is compared: others mix in the background."""
@@ -48,20 +49,46 @@ class SeenPlaces:
 
 @torch.no_grad()
 def seen_places(target: ViewTarget, pixels: Int[Tensor, "pixel"], tracer: AbstractTracer) -> SeenPlaces:
-    """Those of `pixels` (flat) that see the mesh."""
+    """Those of `pixels` (flat) that see the mesh, by their middles."""
     origin, directions = pixel_rays_world(target.camera)
     direction = directions.reshape(-1, 3)[pixels]
     hits = trace_rays(origin.expand_as(direction), direction, tracer)
-    hit = hits.hit.nonzero().squeeze(1)
-    face = hits.face[hit].long()
-    return SeenPlaces(pixels[hit], -direction[hit], face, tracer.mesh.faces[face].long(), corner_weights(hits.barycentric[hit]))
+    return _places_of(hits.hit, pixels, direction, hits, tracer)
 
 
 @torch.no_grad()
-def not_grazing(seen: SeenPlaces, normals: Float[Tensor, "vertex 3"]) -> SeenPlaces:
-    """Those that are seen steeply enough to be compared."""
+def seen_twice(
+    target: ViewTarget, pixels: Int[Tensor, "pixel"], tracer: AbstractTracer, generator: torch.Generator
+) -> tuple[SeenPlaces, SeenPlaces]:
+    """Of those of `pixels` (flat) that see the mesh two times, each time by a place of the pixel drawn anew.
+
+    Why: a pixel shows its mean. With one place for both estimates, what differs within a pixel is noise that both share, and crossed_halves
+    takes it for error: what is finer than a pixel would be flattened.
+    """
+    width, rays = target.camera.width, []
+    for _ in range(2):
+        inside = torch.rand(len(pixels), 2, generator=generator).to(target.mask)
+        at = torch.stack([pixels % width, pixels // width], -1) + inside
+        direction = torch.cat([at, torch.ones_like(at[:, :1])], -1) @ world_from_pixel(target.camera).T
+        direction = torch.nn.functional.normalize(direction, dim=-1)
+        rays.append((direction, trace_rays(target.camera.center_world.expand_as(direction), direction, tracer)))
+    both = rays[0][1].hit & rays[1][1].hit
+    first, second = (_places_of(both, pixels, direction, hits, tracer) for direction, hits in rays)
+    return first, second
+
+
+def _places_of(chosen: Tensor, pixels: Tensor, direction: Tensor, hits: Hits, tracer: AbstractTracer) -> SeenPlaces:
+    """The `chosen` (pixel,) rays' places."""
+    at = chosen.nonzero().squeeze(1)
+    face = hits.face[at].long()
+    return SeenPlaces(pixels[at], -direction[at], face, tracer.mesh.faces[face].long(), corner_weights(hits.barycentric[at]))
+
+
+@torch.no_grad()
+def steep_enough(seen: SeenPlaces, normals: Float[Tensor, "vertex 3"]) -> Bool[Tensor, "place"]:
+    """Which are seen steeply enough to be compared."""
     normal = torch.nn.functional.normalize(at_corners(normals, seen.corners, seen.weights), dim=-1)
-    return seen[(normal * seen.wo).sum(-1) > GRAZING]
+    return (normal * seen.wo).sum(-1) > GRAZING
 
 
 def shade_places(
@@ -72,8 +99,8 @@ def shade_places(
     materials: dict[str, Tensor],
     light: MeshLight,
     generator: torch.Generator,
-) -> tuple[Float[Tensor, "place 3"], Float[Tensor, "place 3"]]:
-    """Two independent estimates of the colours in display space, by split sum with one traced mirror ray each: what crossed_halves and
+) -> Float[Tensor, "place 3"]:
+    """An estimate of the colours in display space, by split sum with one traced mirror ray each. Two of them are what crossed_halves and
     crossed_squares compare.
 
     Args:
@@ -88,16 +115,12 @@ def shade_places(
     position = at_corners(tracer.mesh.vertices, corners, weights).detach()
     known = MeshLight(light.tables.detach(), light.open_share, light.light_from_world)
     photo = target.saturation.reshape(-1, 3)[seen.pixels]
-
-    halves = []
-    for _ in range(2):
-        with torch.no_grad():
-            transmittance, met = mirrored_light(
-                tracer, position, tracer.face_normals[seen.face], normal.detach(), roughness.detach(), seen.wo, known, generator
-            )
-        radiance = shade_split_sum(
-            diffuse, torch.zeros_like(albedo), f0, roughness, normal, seen.wo, light.tables, transmittance, met, open_share,
-            light.light_from_world,
-        )  # fmt: skip
-        halves.append(display_image(radiance, torch.ones_like(roughness), photo, target.ceiling))
-    return halves[0], halves[1]
+    with torch.no_grad():
+        transmittance, met = mirrored_light(
+            tracer, position, tracer.face_normals[seen.face], normal.detach(), roughness.detach(), seen.wo, known, generator
+        )
+    radiance = shade_split_sum(
+        diffuse, torch.zeros_like(albedo), f0, roughness, normal, seen.wo, light.tables, transmittance, met, open_share,
+        light.light_from_world,
+    )  # fmt: skip
+    return display_image(radiance, torch.ones_like(roughness), photo, target.ceiling)
