@@ -1,6 +1,6 @@
-"""A capture with everything known, drawn by us: the mesh and cameras of a scene of the benchmark, of other matter, under other light.
+"""A capture with everything known, drawn by us: the mesh and cameras of a scene of the benchmark, of other matter or shape, under other light.
 
-    python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|as_it_is --light FILE.exr --new-light FILE.exr [--spp 64]
+    python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn] --light FILE.exr --new-light FILE.exr [--spp 64]
 
 OUT has the layout of the scenes in shared/bench (photographs, test views with maps, the same under the new light), so that `drgs build` takes it
 and `drgs eval` scores what was built. Our own renderer drew it, so it says nothing of that one; it says what a build makes of matter and light
@@ -15,9 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 from PIL import Image
 
 from benchmarks.measures.bench_scene import Array, open_scene, read_true_mesh, training_cameras
+from benchmarks.measures.embossed_urn import embossed_urn
 from benchmarks.measures.swap_parts import swapped_picture
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
@@ -41,7 +43,26 @@ class Matter:
     metallic: float
 
 
-MATTERS = {"chrome": Matter((0.85, 0.83, 0.8), 0.12, 1.0), "lacquer": Matter((0.03, 0.03, 0.035), 0.15, 0.0), "as_it_is": None}
+MATTERS = {
+    "chrome": Matter((0.85, 0.83, 0.8), 0.12, 1.0),
+    "lacquer": Matter((0.03, 0.03, 0.035), 0.15, 0.0),
+    "gold": Matter((0.9, 0.64, 0.28), 0.25, 1.0),
+    "as_it_is": None,
+}
+
+
+def urn() -> TriangleMesh:
+    """See embossed_urn; white paint."""
+    shape = embossed_urn()
+    count = len(shape.vertices)
+    return TriangleMesh(
+        torch.from_numpy(np.array(shape.vertices, np.float32)),
+        torch.from_numpy(np.array(shape.faces, np.int32)),
+        torch.from_numpy(np.array(shape.vertex_normals, np.float32)),
+        torch.ones(count, 3),
+        torch.ones(count),
+        torch.zeros(count),
+    )
 
 
 def of_matter(mesh: TriangleMesh, matter: Matter | None) -> TriangleMesh:
@@ -70,24 +91,33 @@ def draw(tracer: AbstractTracer, cameras: list[Camera], light: Path, folder: Pat
         Image.fromarray((255 * picture + 0.5).astype(np.uint8)).save(folder / f"{Path(camera.name).name}.png")
 
 
-def draw_scene(scene_folder: Path, out: Path, matter: Matter | None, light: Path, new_light: Path, samples: int) -> None:
+def draw_scene(
+    scene_folder: Path, out: Path, matter: Matter | None, light: Path, new_light: Path, samples: int, shape: TriangleMesh | None = None
+) -> None:
     """Write the capture.
+
+    Args:
+        shape: in place of the scene's mesh, and about as large.
 
     Raises:
         ValueError: the scene has no true mesh, or `out` is there.
     """
     scene = open_scene(scene_folder)
-    if not (scene_folder / "gt_mesh.ply").is_file():
+    if shape is None and not (scene_folder / "gt_mesh.ply").is_file():
         raise ValueError(f"{scene_folder}: has no gt_mesh.ply; expected a scene with its true mesh")
     if out.exists():
         raise ValueError(f"{out} is there already; name a folder that is not")
-    mesh = of_matter(read_true_mesh(scene), matter)
+    mesh = of_matter(shape or read_true_mesh(scene), matter)
     tracer, tests = build_tracer(mesh), list(scene.cameras)
     (out / "env").mkdir(parents=True)
     for path in (light, new_light):
         shutil.copy(path, out / "env" / path.name)
-    for name in ("transforms_train.json", "transforms_test.json", "gt_mesh.ply"):
+    for name in ("transforms_train.json", "transforms_test.json"):
         shutil.copy(scene_folder / name, out)
+    if shape is None:
+        shutil.copy(scene_folder / "gt_mesh.ply", out)
+    else:
+        trimesh.Trimesh(shape.vertices.numpy(), shape.faces.numpy(), process=False).export(out / "gt_mesh.ply")
     np.savez(out / "gt_materials.npz", **{name: getattr(mesh, name).numpy() for name in ("albedo", "roughness", "metallic")})
     facts = {"name": out.name, "train_env": light.stem, "relight": [new_light.stem], "deform": {}}
     (out / "scene.json").write_text(json.dumps(facts))
@@ -103,8 +133,11 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--matter", choices=tuple(MATTERS), default="as_it_is")
+    parser.add_argument("--shape", choices=("urn", "as_it_is"), default="as_it_is")
     parser.add_argument("--light", type=Path, required=True)
     parser.add_argument("--new-light", type=Path, required=True)
     parser.add_argument("--spp", type=int, default=64, help="rays a pixel of a photograph; test pictures have twice as many")
     given = parser.parse_args(arguments)
-    draw_scene(given.scene, given.out, MATTERS[given.matter], given.light, given.new_light, given.spp)
+    draw_scene(
+        given.scene, given.out, MATTERS[given.matter], given.light, given.new_light, given.spp, urn() if given.shape == "urn" else None
+    )

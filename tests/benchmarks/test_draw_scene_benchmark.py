@@ -9,6 +9,7 @@ import trimesh
 from PIL import Image
 
 from benchmarks import draw_scene
+from benchmarks.measures.embossed_urn import BEAD, embossed_urn
 from drgs.evaluate.metrics import score_renders
 from drgs.exchange.exr import encode_environment
 from drgs.reconstruct.capture.load_views import load_views
@@ -48,3 +49,23 @@ def test_the_capture_is_one_that_builds_read_and_scores_are_made_of(tmp_path: Pa
     assert figures["views"]["psnr"] > 90
     with pytest.raises(ValueError, match="is there already"):
         draw_scene.main([str(scene), str(tmp_path / "out"), *chosen])
+
+
+def test_the_urn_is_closed_looks_outward_and_carries_its_relief():
+    urn = embossed_urn(around=144, up=120)
+    assert urn.is_watertight and urn.volume > 0.8
+    assert np.linalg.norm(urn.vertices, axis=1).max() < 1
+    middle = urn.vertices[np.abs(urn.vertices[:, 2] + 0.15) < 0.005]  # a row of beads
+    radii = np.linalg.norm(middle[:, :2], axis=1)
+    assert 0.5 * BEAD < radii.max() - radii.min() < 1.5 * BEAD
+
+
+def test_a_shape_takes_the_place_of_the_scenes_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    scene = small_scene(tmp_path / "scene")
+    (scene / "gt_mesh.ply").unlink()
+    monkeypatch.setattr(draw_scene, "embossed_urn", lambda: embossed_urn(around=48, up=40))
+    chosen = ["--matter", "gold", "--shape", "urn", "--light", str(scene / "lamp.exr"), "--new-light", str(scene / "sky.exr"), "--spp", "2"]
+    draw_scene.main([str(scene), str(tmp_path / "out"), *chosen])
+    assert trimesh.load(tmp_path / "out" / "gt_mesh.ply").bounds[:, 2] == pytest.approx([-0.75, 0.75], abs=0.01)
+    with np.load(tmp_path / "out" / "test" / "r_000_aov.npz") as stored:
+        assert stored["aov"][..., :3].max(axis=(0, 1)) == pytest.approx([0.9, 0.64, 0.28], abs=1e-3)

@@ -50,6 +50,7 @@ COPIED_IN_RENDER = {0.03: "MIN_ROUGHNESS", 1e-4: "MIN_TRANSMITTANCE"}
 OTHERS = {
     ("benchmarks/_plot.py", 0.04): "the margin of a plot's axes",
     ("benchmarks/abuse.py", 0.99): "a percentile",
+    ("benchmarks/measures/embossed_urn.py", 0.04): "half the width of a band of beads",
     ("benchmarks/service.py", 0.99): "a percentile",
     ("benchmarks/trials/uploads.py", 1e30): "a place far away",
     ("drgs/deform/mpm/conditions.py", 1e30): "the end of conditions that never end [s]",
