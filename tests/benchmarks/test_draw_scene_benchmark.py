@@ -52,7 +52,7 @@ def test_the_capture_is_one_that_builds_read_and_scores_are_made_of(tmp_path: Pa
 
 
 def test_the_urn_is_closed_looks_outward_and_carries_its_relief():
-    urn = embossed_urn(around=144, up=120)
+    urn = embossed_urn(around=144, up=121)
     assert urn.is_watertight and urn.volume > 0.8
     assert np.linalg.norm(urn.vertices, axis=1).max() < 1
     middle = urn.vertices[np.abs(urn.vertices[:, 2] + 0.15) < 0.005]  # a row of beads

@@ -296,8 +296,8 @@ class _Trials:
             """Nearest vertices, two estimates of the colours and the photograph's colours of a view's pixels."""
             target, places = self._targets[index], seen[index][steep_enough(seen[index], normals)]
             tracer = surface.tracer.with_materials(mesh_from_surface_fit(state, self._faces))
-            halves = [shade_places(places, target, tracer, normals, materials, light_of(target), state.generator) for _ in range(2)]
-            return places.nearest, *halves, target.saturation.reshape(-1, 3)[places.pixels]
+            first, second = (shade_places(places, target, tracer, normals, materials, light_of(target), state.generator) for _ in range(2))
+            return places.nearest, first, second, target.saturation.reshape(-1, 3)[places.pixels]
 
         def step(iteration: int) -> StepLoss:
             index = drawn_view(iteration, len(self._targets), self._seed)
