@@ -72,6 +72,9 @@ class SurfaceSettings:
     fall_from: float = 0.5
     """Share of the steps after which rates fall, by a cosine to a twentieth; 1: they do not."""
     moves: MoveSettings = field(default_factory=MoveSettings)
+    to_surface_end: float = 0.1
+    """Of all passes: the share by which normals return to the surface's own after the last one (MoveSettings.to_surface after the others). Relief
+    that is finer than faces is in the normals alone."""
     weight_bend: float = 0.05
     weight_bend_end: float = 0.0015
     """Of the mean difference of normals along edges, at the start and at the end."""
