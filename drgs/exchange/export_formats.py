@@ -13,7 +13,7 @@ ExportFormat = Literal["ply", "ply3", "spz", "glb", "mesh", "usdz", "usd", "env"
 DownloadFormat = Literal[ExportFormat, "zip"]
 """What the service gives out: these, and the asset itself."""
 SplatFormat = Literal["sog", "compressed"]
-"""What the command alone writes, by another program (drgs/convert/transform_splats.py)."""
+"""What splat-transform writes: for the command where Node is (drgs/convert/transform_splats.py), for the viewer in the browser."""
 CommandFormat = Literal[ExportFormat, SplatFormat]
 """What `drgs export` writes."""
 DEFAULT_FACES = 30_000
@@ -86,7 +86,7 @@ SPLAT_KINDS: dict[SplatFormat, FileKind] = {
         ".compressed.ply", "Gaussians (compressed PLY)", "The Gaussians in a quarter of the bytes, for SuperSplat and PlayCanvas"
     ),
 }
-"""By splat-transform, where it is installed."""
+"""By splat-transform: the service has none of these."""
 VARIANT_FORMATS: tuple[ExportFormat, ...] = ("glb", "mesh")
 """They hold other materials of the same mesh."""
 TEXTURED_FORMATS: tuple[ExportFormat, ...] = tuple(name for name in EXPORT_FORMATS if FILE_KINDS[name].textured)

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from drgs.exchange import export_formats
-from drgs.exchange.export_formats import FILE_KINDS
+from drgs.exchange.export_formats import FILE_KINDS, SPLAT_KINDS
 from drgs.maths import constants
 from drgs.scene.edits import Edit
 from drgs_server.api import rest_records
@@ -236,6 +236,12 @@ def constants_text() -> str:
     )
     for name, kind in FILE_KINDS.items():
         fields = {"format": name, "suffix": kind.suffix, "title": kind.title, "description": kind.description, "textured": kind.textured}
+        text += "  { " + ", ".join(f"{key}: {json.dumps(value)}" for key, value in fields.items()) + " },\n"
+    text += f"];\n\nexport type SplatFormat = {_union(json.dumps(name) for name in SPLAT_KINDS)};\n\n"
+    text += _comment("What the browser writes of the Gaussians by itself.", "")
+    text += "export const SPLAT_KINDS: { format: SplatFormat; suffix: string; title: string; description: string }[] = [\n"
+    for splat_format, kind in SPLAT_KINDS.items():
+        fields = {"format": splat_format, "suffix": kind.suffix, "title": kind.title, "description": kind.description}
         text += "  { " + ", ".join(f"{key}: {json.dumps(value)}" for key, value in fields.items()) + " },\n"
     return text + "];\n"
 

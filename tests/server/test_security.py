@@ -117,7 +117,8 @@ def test_answers_tell_browsers_to_be_careful(service: Service) -> None:
         headers = service.client.get(path).headers
         assert headers["x-content-type-options"] == "nosniff"
         assert "frame-ancestors 'none'" in headers["content-security-policy"]
-        assert "unsafe-eval" not in headers["content-security-policy"]
+        policy = dict(part.split(" ", 1) for part in headers["content-security-policy"].split("; "))
+        assert policy["script-src"] == "'self' 'wasm-unsafe-eval'" and policy["default-src"] == "'self'"
         assert "access-control-allow-origin" not in headers
 
 

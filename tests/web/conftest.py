@@ -1,7 +1,9 @@
 """A real server with an empty data directory, and a real browser on it."""
 
 import base64
+import importlib.util
 import io
+import shutil
 import subprocess
 import sys
 import time
@@ -149,6 +151,25 @@ def patient_page(browser: Browser, **options: Any) -> Page:
 def built() -> None:
     """The viewer is that of the sources."""
     subprocess.run([sys.executable, ROOT / "web" / "build.py"], check=True)
+
+
+@pytest.fixture(scope="module")
+def run_node() -> Callable[..., str]:
+    """Runs a script of web/ with arguments in the Node that builds the viewer; what it printed."""
+    spec = importlib.util.spec_from_file_location("build_viewer", ROOT / "web" / "build.py")
+    assert spec is not None and spec.loader is not None
+    build_viewer = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build_viewer)
+    _, environment = build_viewer.install()
+    node = shutil.which("node", path=environment["PATH"])
+    assert node is not None
+
+    def run(script: str, *arguments: object) -> str:
+        # One thread: with compilers beside it, Node now and then waits for itself for ever when it ends (nodejs/node issue 54918).
+        command = [node, "--single-threaded", ROOT / "web" / script, *map(str, arguments)]
+        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=PATIENCE_SECONDS).stdout
+
+    return run
 
 
 @pytest.fixture(scope="session")

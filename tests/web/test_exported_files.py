@@ -3,9 +3,7 @@
 Each check is also run on files with one thing wrong in them, which must not pass.
 """
 
-import importlib.util
 import json
-import shutil
 import struct
 import subprocess
 import sys
@@ -36,25 +34,6 @@ ERROR, WARNING, INFORMATION = 0, 1, 2
 """The validator's severities; a hint is 3."""
 TURN_DEGREES, ENLARGED = (20.0, 30.0, 40.0), 2.0
 """Splats are read, turned around x, then y, then z, made larger and written: only who knows what every column means can."""
-
-
-@pytest.fixture(scope="module")
-def run_node() -> Callable[..., str]:
-    """Runs a script of web/ with arguments in the Node that builds the viewer; what it printed."""
-    spec = importlib.util.spec_from_file_location("build_viewer", ROOT / "web" / "build.py")
-    assert spec is not None and spec.loader is not None
-    build_viewer = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(build_viewer)
-    _, environment = build_viewer.install()
-    node = shutil.which("node", path=environment["PATH"])
-    assert node is not None
-
-    def run(script: str, *arguments: object) -> str:
-        # One thread: with compilers beside it, Node now and then waits for itself for ever when it ends (nodejs/node issue 54918).
-        command = [node, "--single-threaded", ROOT / "web" / script, *map(str, arguments)]
-        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=PATIENCE_SECONDS).stdout
-
-    return run
 
 
 def findings(run_node: Callable[..., str], folder: Path, **files: bytes) -> dict[str, list[dict]]:

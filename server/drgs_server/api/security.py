@@ -22,8 +22,9 @@ SAID_ONCE = ("host", "origin", "authorization")
 """Headers by which it is decided who may ask: of two, another program on the way might believe the other."""
 
 # blob: three.js reads a GLB's textures from blobs. unsafe-inline for styles only: component libraries set style attributes.
+# wasm-unsafe-eval lets WebAssembly of our own files be compiled (the pictures in a SOG), and no script that is not a file of ours.
 CONTENT_SECURITY_POLICY = (
-    "default-src 'self'; img-src 'self' blob: data:; connect-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
+    "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; img-src 'self' blob: data:; connect-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
     "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 )
 _HOST = re.compile(r"(?P<name>[^:\[\]\s]+|\[[0-9A-Fa-f:.]+\])(?::(?P<port>[0-9]{1,5}))?")

@@ -31,3 +31,11 @@ export const FILE_KINDS: { format: DownloadFormat; suffix: string; title: string
   { format: "env", suffix: ".exr", title: "Light (EXR)", description: "The environment: with edits the chosen one, turned and dimmed; else the one recovered with the object", textured: false },
   { format: "zip", suffix: ".zip", title: "Asset (ZIP)", description: "Everything, to open here or with `drgs render`", textured: false },
 ];
+
+export type SplatFormat = "sog" | "compressed";
+
+/** What the browser writes of the Gaussians by itself. */
+export const SPLAT_KINDS: { format: SplatFormat; suffix: string; title: string; description: string }[] = [
+  { format: "sog", suffix: ".sog", title: "Gaussians (SOG)", description: "The Gaussians in a ninth of the bytes, for SuperSplat and PlayCanvas; takes minutes without a GPU" },
+  { format: "compressed", suffix: ".compressed.ply", title: "Gaussians (compressed PLY)", description: "The Gaussians in a quarter of the bytes, for SuperSplat and PlayCanvas" },
+];

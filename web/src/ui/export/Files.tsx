@@ -1,7 +1,7 @@
 /** The object as files for other programs, with or without what was done to it here. */
 
 import { signal } from '@preact/signals';
-import { DEFAULT_FACES, FEWEST_FACES, FILE_KINDS, MOST_FACES, type DownloadFormat } from '../../session/constants.gen';
+import { DEFAULT_FACES, FEWEST_FACES, FILE_KINDS, MOST_FACES } from '../../session/constants.gen';
 import * as api from '../../session/api';
 import { log } from '../../session/edit_log';
 import { refreshAssets } from '../../session/library';
@@ -10,34 +10,56 @@ import { session } from '../../session/session';
 import { download } from '../download';
 import { NumberField, Section, Switch } from '../fields';
 import { Icon } from '../icons';
+import { makeFile, SAVED_KINDS, servedFormat, type SavedFormat, type SavedKind } from './make_file';
 
 const withEdits = signal(true);
 /** The most that textured meshes have. */
 const mostFaces = signal(DEFAULT_FACES);
-/** The file that the server is writing; null while there is none. */
-const writing = signal<{ format: DownloadFormat; leaving: AbortController } | null>(null);
+/** The file that is being written; null while there is none. */
+const writing = signal<{ format: SavedFormat; leaving: AbortController } | null>(null);
+/** How much of it the browser has done, 0..1; null while the server writes. */
+const share = signal<number | null>(null);
 
-const textured = new Set(FILE_KINDS.filter((kind) => kind.textured).map((kind) => kind.format));
+const textured = new Set<SavedFormat>(FILE_KINDS.filter((kind) => kind.textured).map((kind) => kind.format));
 
-/** Bytes of the files written so far, by address; after further edits a file may take some more or less. */
-const sizes = signal<Record<string, number>>({});
+/** Bytes of the files written so far, by format and address; after further edits a file may take some more or less. Null: the object has nothing that it holds. */
+const sizes = signal<Record<string, number | null>>({});
 
 export function Files() {
   const open = session.value!;
   const edited = log.value.edits.length > 0;
-  const address = (format: DownloadFormat) => {
+  const address = (format: SavedFormat) => {
     const faces = textured.has(format) && mostFaces.value !== DEFAULT_FACES ? mostFaces.value : null;
-    return edited && withEdits.value ? api.sessionExport(open.id, format, faces) : api.assetExport(open.asset, format, faces);
+    const served = servedFormat(format);
+    return edited && withEdits.value ? api.sessionExport(open.id, served, faces) : api.assetExport(open.asset, served, faces);
   };
-  const save = async (format: DownloadFormat) => {
+  const place = (format: SavedFormat) => `${format} ${address(format)}`;
+  const make = async (kind: SavedKind, leaving: AbortController) => {
+    const key = place(kind.format);
+    writing.value = { format: kind.format, leaving };
+    share.value = null;
+    const file = await makeFile(kind, address(kind.format), (done) => (share.value = done), leaving.signal).finally(() => (writing.value = null));
+    sizes.value = { ...sizes.value, [key]: file.content.size };
+    return file;
+  };
+  const save = async (kind: SavedKind) => {
     if (writing.value) return;
+    const file = await attempt(make(kind, new AbortController()));
+    if (file) download(file.content, file.name);
+  };
+  const compare = async () => {
     const leaving = new AbortController();
-    writing.value = { format, leaving };
-    const file = await attempt(api.exportedFile(address(format), leaving.signal));
-    writing.value = null;
-    if (!file) return;
-    sizes.value = { ...sizes.value, [address(format)]: file.content.size };
-    download(file.content, file.name);
+    // What takes longest comes last: by then the others are there to look at.
+    for (const kind of [...SAVED_KINDS].sort((a, b) => Number(a.format === 'sog') - Number(b.format === 'sog'))) {
+      const key = place(kind.format);
+      if (sizes.value[key] !== undefined) continue;
+      const absent = (error: unknown) => {
+        if (!(error instanceof api.ApiError && error.status === 422)) throw error;
+        sizes.value = { ...sizes.value, [key]: null };
+        return true;
+      };
+      if (!(await attempt(make(kind, leaving).catch(absent)))) return;
+    }
   };
   return (
     <Section title="Files">
@@ -54,32 +76,37 @@ export function Files() {
         onEnter={(count) => (mostFaces.value = Math.round(count))}
       />
       <ul class="files">
-        {FILE_KINDS.map(({ format, title, description }) => (
+        {SAVED_KINDS.map((kind) => (
           <li>
             <a
               class="button"
-              href={address(format)}
+              href={address(kind.format)}
               download
-              title={description}
+              title={kind.description}
               aria-disabled={writing.value !== null}
               onClick={(event) => {
                 event.preventDefault();
-                void save(format);
+                void save(kind);
               }}
             >
-              <Icon name="download" /> {title}
-              {writing.value?.format === format ? <span class="dim">is being written…</span> : <span class="dim">{sizeInWords(sizes.value[address(format)])}</span>}
+              <Icon name="download" /> {kind.title}
+              <span class="dim">{writing.value?.format === kind.format ? progress() : sizeInWords(sizes.value[place(kind.format)])}</span>
             </a>
-            {writing.value?.format === format && (
-              <button class="ghost" aria-label={`Cancel ${title}`} onClick={() => writing.value?.leaving.abort()}>
+            {writing.value?.format === kind.format && (
+              <button class="ghost" aria-label={`Cancel ${kind.title}`} onClick={() => writing.value?.leaving.abort()}>
                 Cancel
               </button>
             )}
           </li>
         ))}
       </ul>
+      <div class="buttons">
+        <button title="Writes each of these files once, for its size alone; the SOG of a large object takes minutes" disabled={writing.value !== null} onClick={() => void compare()}>
+          Compare sizes
+        </button>
+      </div>
       <p class="visually-hidden" role="status">
-        {writing.value ? 'The server is writing the file…' : ''}
+        {writing.value ? `The ${share.value === null ? 'server' : 'browser'} is writing the file…` : ''}
       </p>
       {edited && (
         <>
@@ -100,7 +127,10 @@ async function saveVersion(): Promise<void> {
   notify(`Saved as version ${saved.version}: it is in the list of assets.`, 'info');
 }
 
-function sizeInWords(bytes: number | undefined): string {
+const progress = () => (share.value ? `${Math.round(100 * share.value)} %` : 'writing…');
+
+function sizeInWords(bytes: number | null | undefined): string {
   if (bytes === undefined) return '';
+  if (bytes === null) return 'none';
   return bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 }
