@@ -57,3 +57,46 @@ def test_each_page_of_the_inspector_begins_at_its_top(ball: Viewer) -> None:
         ball.open_tab(name)
         expect(ball.page.get_by_role("tabpanel", name=name)).to_be_visible()
         assert ball.page.get_by_role("tabpanel").evaluate("panel => panel.scrollTop") == 0, f"{name}, where {first} is on top"
+
+
+PHONE, LAPTOP = {"width": 390, "height": 844}, {"width": 1280, "height": 800}
+
+
+def test_on_a_phone_the_panels_leave_the_page_to_an_asset_that_was_opened(page: Viewer, ball_asset: str) -> None:
+    """The fixture's page is that of no other test, so what it keeps of open panels is nobody's."""
+    shown = page.page
+    library, inspector = shown.get_by_role("complementary", name="Library"), shown.get_by_role("complementary", name="Inspector")
+    to_library, to_inspector = (shown.get_by_role("button", name=name, exact=True) for name in ("Library", "Inspector"))
+    shown.set_viewport_size(PHONE)  # type: ignore[arg-type]
+    first = library.get_by_role("button", name="ball").first
+    first.click()
+    expect(shown.get_by_role("heading", name="ball", exact=True)).to_be_visible()
+    expect(library).to_have_count(0)
+    expect(inspector).to_have_count(0)
+    page.settle()
+
+    to_library.click()
+    expect(library).to_be_visible()
+    expect(inspector).to_have_count(0)
+    first.click()  # it is open already: the way back to it
+    expect(library).to_have_count(0)
+
+    to_library.click()
+    to_inspector.click()
+    expect(inspector).to_be_visible()
+    expect(library).to_have_count(0)
+    expect(to_inspector).to_have_attribute("aria-pressed", "true")
+    to_library.click()
+    expect(library).to_be_visible()
+    expect(to_inspector).to_have_attribute("aria-pressed", "false")
+    to_library.click()
+    to_inspector.click()
+    expect(inspector).to_have_count(0)
+
+
+def test_on_a_larger_screen_panels_stay_beside_an_asset_that_was_opened(page: Viewer, ball_asset: str) -> None:
+    page.page.set_viewport_size(LAPTOP)  # type: ignore[arg-type]
+    page.page.get_by_role("complementary", name="Library").get_by_role("button", name="ball").first.click()
+    expect(page.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
+    expect(page.page.get_by_role("complementary", name="Library")).to_be_visible()
+    expect(page.page.get_by_role("complementary", name="Inspector")).to_be_visible()

@@ -19,7 +19,7 @@ import { Hud } from './Hud';
 import { download } from './download';
 import { Icon } from './icons';
 import { Inspector } from './inspector/Inspector';
-import { helpOpen, inspectorOpen, libraryOpen, theme } from './layout';
+import { helpOpen, inspectorShown, libraryOpen, theme, toggleInspector } from './layout';
 import { CaptureDialog } from './library/CaptureDialog';
 import { Library, takeFiles } from './library/Library';
 import { LightsDialog } from './LightsDialog';
@@ -66,7 +66,7 @@ export function App() {
       local: () => (localPicture.value = !localPicture.value),
       theme: () => (theme.value = theme.value === 'dark' ? 'light' : 'dark'),
       library: () => (libraryOpen.value = !libraryOpen.value),
-      inspector: () => (inspectorOpen.value = !inspectorOpen.value),
+      inspector: toggleInspector,
       ...Object.fromEntries(CHANNELS.map(({ value }, i) => [`channel${i + 1}`, () => changeSettings({ channel: value })])),
       wireframe: () => session.value && (wireframe.value = !wireframe.value),
       photographs: () => session.value && showPhotographs(viewNumber.value === null),
@@ -137,7 +137,7 @@ function TopBar({ onFrame }: { onFrame(): void }) {
         <Icon name="help" />
       </button>
       {open && (
-        <button class="ghost" aria-pressed={inspectorOpen.value} title={titleFor('inspector')} aria-label="Inspector" onClick={() => (inspectorOpen.value = !inspectorOpen.value)}>
+        <button class="ghost" aria-pressed={inspectorShown.value} title={titleFor('inspector')} aria-label="Inspector" onClick={toggleInspector}>
           <Icon name="inspector" />
         </button>
       )}

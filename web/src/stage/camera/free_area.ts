@@ -15,6 +15,6 @@ export function freeEdges(width: number, height: number): { left: number; right:
     left: narrow ? 0 : (edge('.library', 'right') ?? 0),
     right: narrow ? width : (edge('.inspector', 'left') ?? width),
     top: edge('.topbar', 'bottom') ?? 0,
-    bottom: (narrow ? edge('.panel', 'top') : (edge('.view-bar', 'top') ?? edge('.hud', 'top'))) ?? height,
+    bottom: (narrow ? edge('.panel', 'top') : undefined) ?? edge('.view-bar', 'top') ?? edge('.hud', 'top') ?? height,
   };
 }

@@ -3,7 +3,7 @@
 import type { ComponentType } from 'preact';
 import { session } from '../../session/session';
 import { ExportPanel } from '../export/ExportPanel';
-import { inspectorOpen, tab, type Tab } from '../layout';
+import { inspectorShown, tab, type Tab } from '../layout';
 import { ShapePanel } from '../shape/ShapePanel';
 import { History } from './History';
 import { LightPanel } from './LightPanel';
@@ -24,7 +24,7 @@ const PAGES: Page[] = [
 ];
 
 export function Inspector() {
-  if (!session.value || !inspectorOpen.value) return null;
+  if (!session.value || !inspectorShown.value) return null;
   const chosen = PAGES.find((page) => page.id === tab.value) ?? PAGES[0]!;
   const onKey = (event: KeyboardEvent) => {
     const step = event.key === 'ArrowRight' ? 1 : event.key === 'ArrowLeft' ? -1 : 0;

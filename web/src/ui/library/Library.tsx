@@ -13,7 +13,7 @@ import { openAsset, session } from '../../session/session';
 import type { UploadProgress } from '../../session/uploads';
 import { Bar, Section } from '../fields';
 import { Icon } from '../icons';
-import { libraryOpen } from '../layout';
+import { foldPanels, libraryOpen } from '../layout';
 import { build, BuildChoices } from './BuildChoices';
 import { Captures } from './Captures';
 import { Jobs } from './Jobs';
@@ -108,7 +108,7 @@ function Assets() {
         <ul class="assets">
           {list.map((asset) => (
             <li key={asset.id}>
-              <button class="asset" aria-current={asset.id === session.value?.asset ? 'true' : undefined} onClick={() => void openAsset(asset.id)}>
+              <button class="asset" aria-current={asset.id === session.value?.asset ? 'true' : undefined} onClick={() => void openAsset(asset.id).then(foldPanels)}>
                 {asset.has_thumbnail ? <img src={api.assetThumb(asset)} alt="" loading="lazy" /> : <span class="no-thumb" aria-hidden="true"><Icon name="frame" /></span>}
                 <span class="asset-text">
                   <strong>{asset.name}</strong>
