@@ -1,6 +1,6 @@
-"""The figures: what the tables' numbers look like. Each is one JPEG of a scene, and a cell that says what is on it.
+"""The figures: what the tables' numbers look like. Each is one JPEG of a scene, and a cell that says what is on it; the strip has a film beside it.
 
-In: a scene's evidence, and the pictures that the tables' cells left. Out: OUT/images/paper/SCENE_FIGURE.jpg. All are on white, cut to the object,
+In: a scene's evidence, and the pictures that the tables' cells left. Out: OUT/images/paper/SCENE_FIGURE.jpg and .mp4. All are on white, cut to the object,
 of the first camera that has a deformed truth.
 """
 
@@ -17,6 +17,7 @@ from torch import Tensor
 from benchmarks.measures.bench_scene import has_true_maps, read_light, read_rgba, read_true_maps
 from benchmarks.measures.peak_memory import measured
 from benchmarks.paper.cells import NotMade
+from benchmarks.paper.films import shares, write_film
 from benchmarks.paper.laws import laws, rgba_of
 from benchmarks.paper.sheets import Array, halved, object_window, sheet
 from benchmarks.paper.tables import SceneEvidence
@@ -47,8 +48,8 @@ PARTICLES_SHARE = 1 / 12
 """Of the budget: how many particles the falling object has."""
 AMOUNTS = {"rate": 0.0, "curvature": 0.0, "factor": 1.0}
 """Of maps, and their value at rest."""
-STRIP = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""How much of a deformation each picture of the strip has."""
+STRIP = (0, 8, 12, 16, 24)
+"""Which pictures of the film the strip has: at rest, with a quarter of the deformation, a half, three quarters, and all of it."""
 AROUND_MAPS = 0.85
 """Grey, so that metal, which is 1, is seen."""
 DIFFERENCE_GAIN = 4.0
@@ -146,17 +147,23 @@ def material_maps(evidence: SceneEvidence, variants: list[AbstractVariant], path
 
 
 def strip(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
-    """drgs2026, Fig. 12: a continuous deformation, ours."""
+    """drgs2026, Fig. 12: a continuous deformation, ours, as a strip and as a film. Its end is beside the truth, where there is one under this light."""
     (name, analytic), *_ = evidence.deformations.items()
     amount = amount_of(analytic)
     assert amount is not None
     still = AMOUNTS[amount]
-    drawn = []
-    for part in STRIP:
-        value = still + part * (analytic[amount] - still)
-        drawn.append((f"{amount} {value:.2f}", picture_of(evidence, [{"op": "deform", "map": analytic | {amount: value}}])))
-    sheet([drawn], path)
-    return {"caption": f"{name}, growing"}
+    values = [still + part * (analytic[amount] - still) for part in shares()]
+    frames = [rgba_of(frame_of(evidence, [{"op": "deform", "map": analytic | {amount: value}}])) for value in values]
+    pictures = [on_white(rgba) for rgba in frames]
+    window = object_window([rgba[..., 3] for rgba in frames])
+    write_film([picture[window] for picture in pictures], path.with_suffix(FILM))
+    sheet([[(f"{amount} {values[place]:.2f}", halved(pictures[place])) for place in STRIP]], path)
+    told: dict = {"caption": f"{name}, growing"}
+    truths = [folder for folder, new in evidence.truths() if folder.parent.name == name and not new]
+    if truths:
+        truth = on_white(read_rgba(evidence.scene.folder / truths[0] / f"{camera_of(evidence).name}.png"))
+        told["figures"] = {"psnr_of_its_end": psnr(pictures[-1], truth)}
+    return told
 
 
 def matter(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
@@ -228,6 +235,8 @@ FIGURES: dict[str, tuple[Figure, bool]] = {
 }
 """By name, and whether the figure needs the scene's true maps."""
 COMPARISONS = ("comparison", "comparison_relit")
+FILM, FILMED = ".mp4", ("strip",)
+"""Figures with a film beside their picture, and its suffix."""
 
 
 def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant], wanted: list[str]) -> dict[str, dict]:
@@ -244,13 +253,16 @@ def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant], wante
             continue
         file = f"images/paper/{evidence.scene.name}_{name}.jpg"
         path = evidence.cells.folder / file
+        film = {"film": str(Path(file).with_suffix(FILM))} if name in FILMED else {}
 
-        def make(figure: Figure = figure, path: Path = path, file: str = file) -> dict:
+        def make(figure: Figure = figure, path: Path = path, files: dict = {"picture": file} | film) -> dict:
             with torch.no_grad():
                 told, cost = measured(lambda: figure(evidence, variants, path))
-            return told | {"picture": file, "cost": asdict(cost)}
+            return told | files | {"cost": asdict(cost)}
 
         asked = evidence.asked | ({"ways": [variant.name for variant in variants]} if name in COMPARISONS else {})
         with suppress(NotMade):
-            found[name] = evidence.cells.cell(f"{evidence.scene.name}-figure-{name}", asked, make, [path])
+            found[name] = evidence.cells.cell(
+                f"{evidence.scene.name}-figure-{name}", asked, make, [path, *(path.with_suffix(FILM) for _ in film)]
+            )
     return found

@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -10,6 +12,8 @@ from PIL import Image
 from benchmarks.__main__ import main
 from benchmarks.paper.cells import CellFolder
 from benchmarks.paper.command import repeated
+from benchmarks.paper.figures import STRIP
+from benchmarks.paper.films import FPS, WAY_THERE, shares, write_film
 from benchmarks.paper.pages import honesty
 from benchmarks.paper.variants import VARIANTS
 from drgs.exchange.exr import encode_environment
@@ -75,7 +79,11 @@ def test_every_table_and_figure_is_there_and_nothing_is_made_twice(scene: Path, 
     assert document["deformed"]["mani_gs"]["figures"]["stretch/noon"]["psnr"] == pytest.approx(baked, abs=1.5)
     assert set(document["figures"]) == set(QUICK_FIGURES)
     assert all(Image.open(out / cell["picture"]).size[0] > 50 for cell in document["figures"].values())
+    film = document["figures"]["strip"]["film"]
+    assert len(frames_of(out / film)) == 2 * (WAY_THERE - 1)
+    assert document["figures"]["strip"]["figures"]["psnr_of_its_end"] > 15, "the map does nothing, and the sphere is painted by one colour"
     page = (out / "paper.md").read_text()
+    assert f"[Film: there and back]({film})" in page and f'src="{film}" controls' in (out / "index.html").read_text()
     assert all(title in page for title in ("## Static views", "## Deformed, new light", "## Time and memory", "## Who is better"))
     assert str(tmp_path) not in page, "no address of this machine"
     assert "<table>" in (out / "index.html").read_text()
@@ -96,6 +104,23 @@ def test_every_table_and_figure_is_there_and_nothing_is_made_twice(scene: Path, 
     main([*command, "--finished"])
     finished = json.loads(capsys.readouterr().out)["ball"]
     assert set(finished["static"]) == set(WAYS) and set(finished["deformed"]) == {"mani_gs", "ours_particles"}
+
+
+def frames_of(film: Path) -> list[np.ndarray]:
+    with av.open(str(film)) as container:
+        assert container.streams.video[0].average_rate == FPS
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_a_film_goes_there_and_back_slowly_at_both_ends(tmp_path: Path):
+    grey = np.array(shares())
+    assert grey[0] == 0 and grey[-1] == 1 and np.allclose(grey[list(STRIP)], [0, 0.25, 0.5, 0.75, 1])
+    steps = np.diff(grey)
+    assert steps.min() > 0 and steps[0] == pytest.approx(steps[-1]) and steps[WAY_THERE // 2] > 5 * steps[0]
+    write_film([np.full((33, 40, 3), 0.2 + 0.6 * share) for share in shares()], tmp_path / "new" / "a.mp4")
+    shown = [frame.mean() / 255 for frame in frames_of(tmp_path / "new" / "a.mp4")]
+    assert np.allclose(shown, 0.2 + 0.6 * np.concatenate([grey, grey[-2:0:-1]]), atol=0.02)
+    assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["a.mp4"]
 
 
 def test_a_cell_that_a_kill_cut_short_is_made_again_and_one_of_other_settings_too(tmp_path: Path):

@@ -1,0 +1,37 @@
+"""A deformation as a film: there, and back by the same pictures, so that it can be shown over and over without a jump.
+
+In: pictures of the way there. Out: an MP4 (H.264).
+"""
+
+import math
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from benchmarks.paper.sheets import Array
+from drgs_worker.jobs.write_video import write_video
+
+FPS = 24
+WAY_THERE = 25
+"""Pictures of the way there, with the first and the last: forth and back take two seconds."""
+
+
+def shares() -> list[float]:
+    """How much of the deformation each picture of the way there has, 0..1: slowly from rest, and slowly to the end."""
+    return [0.5 - 0.5 * math.cos(math.pi * place / (WAY_THERE - 1)) for place in range(WAY_THERE)]
+
+
+def write_film(pictures: list[Array], path: Path) -> None:
+    """
+    Args:
+        pictures: (height, width, 3) sRGB 0..1, all of one size: the way there. An odd last row or column is left out.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        files = []
+        for place, picture in enumerate(pictures):
+            files.append(Path(folder) / f"{place:04d}.png")
+            Image.fromarray((picture.clip(0, 1) * 255).round().astype(np.uint8)).save(files[-1])
+        write_video([*files, *files[-2:0:-1]], path, FPS)
