@@ -68,6 +68,25 @@ def splats(server: RunningServer, browser: Browser, tmp_path_factory: pytest.Tem
         yield viewer
 
 
+@pytest.fixture(scope="module")
+def given(splats: Viewer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The 3DGS PLY of the twisted ball, which the others are made of."""
+    return saved(splats.page, FILE_KINDS["ply3"].title, tmp_path_factory.mktemp("given"))
+
+
+def serve(page: Page, files: dict[str, bytes]) -> None:
+    """Give these files by format, instead of having the server write them, which takes a process each; no HTML, and thousands of bytes of the rest."""
+
+    def answer(route: Route) -> None:
+        format = re.findall(r"format=(\w+)", route.request.url)[0]
+        if format == "html":
+            route.fulfill(status=422, json={"detail": "No page can be made of it."})
+        else:
+            route.fulfill(body=files.get(format, b"x" * 1000 * (1 + list(FILE_KINDS).index(format))))  # type: ignore[arg-type]
+
+    page.route("**/export?*", answer)
+
+
 def saved(page: Page, title: str, folder: Path) -> Path:
     """The file that the button of this title gives, under the name that the page gives it."""
     with page.expect_download() as download:
@@ -104,10 +123,10 @@ BOUNDS = {
 
 @pytest.mark.parametrize("format", SPLAT_KINDS)
 def test_the_browser_writes_what_splat_transform_reads_as_the_ply_of_the_edited_object(
-    splats: Viewer, run_node: Callable[..., str], tmp_path: Path, format: str
+    splats: Viewer, given: Path, run_node: Callable[..., str], tmp_path: Path, format: str
 ) -> None:
     kind = SPLAT_KINDS[format]  # type: ignore[index]
-    given = columns(saved(splats.page, FILE_KINDS["ply3"].title, tmp_path))
+    expected = columns(given)
     made = saved(splats.page, kind.title, tmp_path)
     assert made.name == f"splats{kind.suffix}"
     expect(splats.page.get_by_role("link", name=f"{kind.title} {math.ceil(made.stat().st_size / 1e3)} kB")).to_be_visible()
@@ -115,61 +134,61 @@ def test_the_browser_writes_what_splat_transform_reads_as_the_ply_of_the_edited_
     found = columns(tmp_path / "back.ply")
     as_captured = splat_ball().gaussians
     assert as_captured is not None
-    assert len(found["centers"]) == len(given["centers"]) == SPLATS
-    assert np.abs(given["centers"] - as_captured.centers.numpy()).max() > 0.1, "twisted"
-    nearest = np.linalg.norm(found["centers"][None] - given["centers"][:, None], axis=-1).argmin(1)
+    assert len(found["centers"]) == len(expected["centers"]) == SPLATS
+    assert np.abs(expected["centers"] - as_captured.centers.numpy()).max() > 0.1, "twisted"
+    nearest = np.linalg.norm(found["centers"][None] - expected["centers"][:, None], axis=-1).argmin(1)
     assert len(set(nearest)) == SPLATS, "they are in another order"
-    off = {name: np.abs(found[name][nearest] - values).max() for name, values in given.items()}
+    off = {name: np.abs(found[name][nearest] - values).max() for name, values in expected.items()}
     print(format, {name: f"{value:.5f}" for name, value in off.items()})
     assert all(off[name] < bound for name, bound in BOUNDS[format].items()), off
 
 
-def test_what_compresses_is_loaded_when_it_is_first_asked_for(splats: Viewer, tmp_path: Path) -> None:
+def test_what_compresses_is_loaded_when_it_is_first_asked_for_and_a_file_is_not_made_twice(
+    splats: Viewer, given: Path, tmp_path: Path
+) -> None:
     loaded: list[str] = []
     page = splats.page
     page.on("request", lambda request: loaded.append(request.url))
     page.reload()
     splats.open_tab("Export")
+    expect(page.get_by_role("switch", name="With this session’s edits")).to_be_visible()
+    serve(page, {"ply3": given.read_bytes()})
     assert not [url for url in loaded if re.search(r"worker|\.wasm", url)]
-    saved(page, SPLAT_KINDS["compressed"].title, tmp_path)
+    first = saved(page, SPLAT_KINDS["compressed"].title, tmp_path).read_bytes()
     assert [url for url in loaded if "/assets/worker" in url]
-
-
-def test_sizes_are_shown_beside_each_other(splats: Viewer) -> None:
-    page = splats.page
-
-    def answer(route: Route) -> None:
-        format = re.findall(r"format=(\w+)", route.request.url)[0]
-        if format == "ply3":
-            route.continue_()
-        elif format == "html":
-            route.fulfill(status=422, json={"detail": "No page can be made of it."})
-        else:
-            route.fulfill(body=b"x" * 1000 * (1 + list(FILE_KINDS).index(format)))  # type: ignore[arg-type]
-
-    page.route("**/export?*", answer)
-    page.get_by_role("button", name="Compare sizes").click()
-    expect(page.get_by_role("link", name=re.compile(r"Gaussians \(SOG\) \d+ kB"))).to_be_visible()
-    expect(page.get_by_role("link", name=re.compile(r"Gaussians \(compressed PLY\) \d+ kB"))).to_be_visible()
-    for place, (format, kind) in enumerate(FILE_KINDS.items()):
-        size = "none" if format == "html" else r"\d+ kB" if format == "ply3" else f"{1 + place} kB"
-        expect(page.get_by_role("link", name=re.compile(f"{re.escape(kind.title)} {size}"))).to_be_visible()
-    expect(page.get_by_role("button", name="Compare sizes")).to_be_enabled()
+    loaded.clear()
+    assert saved(page, SPLAT_KINDS["compressed"].title, tmp_path).read_bytes() == first and loaded == []
     page.unroute("**/export?*")
-    splats.complaints[:] = [text for text in splats.complaints if "422" not in text]  # the browser's own line
 
 
 @pytest.mark.parametrize("missing", ["assets/worker", ".wasm"])
-def test_a_file_that_cannot_be_compressed_says_so_in_one_sentence(splats: Viewer, missing: str) -> None:
+def test_a_file_that_cannot_be_compressed_says_so_in_one_sentence(splats: Viewer, given: Path, missing: str) -> None:
     page = splats.page
+    serve(page, {"ply3": given.read_bytes()})
     page.route(re.compile(re.escape(missing)), lambda route: route.abort())
     page.get_by_role("link", name=SPLAT_KINDS["sog"].title).click()
     notices = page.get_by_role("log").get_by_text("`drgs export` writes it where Node is installed.")
     expect(notices).to_have_count(1)
     page.get_by_role("log").get_by_role("button", name="Dismiss").click()
     page.unroute(re.compile(re.escape(missing)))
+    page.unroute("**/export?*")
     splats.complaints.clear()  # the browser's own lines about what is missing
     expect(page.get_by_role("button", name="Compare sizes")).to_be_enabled()
+
+
+def test_sizes_are_shown_beside_each_other(splats: Viewer, given: Path) -> None:
+    page = splats.page
+    serve(page, {"ply3": given.read_bytes()})
+    page.get_by_role("button", name="Compare sizes").click()
+    expect(page.get_by_role("link", name=re.compile(r"Gaussians \(SOG\) \d+ kB"))).to_be_visible()
+    expect(page.get_by_role("link", name=re.compile(r"Gaussians \(compressed PLY\) \d+ kB"))).to_be_visible()
+    for place, (format, kind) in enumerate(FILE_KINDS.items()):
+        size = "none" if format == "html" else f"{math.ceil(given.stat().st_size / 1e3)} kB" if format == "ply3" else f"{1 + place} kB"
+        expect(page.get_by_role("link", name=re.compile(f"{re.escape(kind.title)} {size}"))).to_be_visible()
+    expect(page.get_by_title("No page can be made of it.")).to_be_visible()
+    expect(page.get_by_role("button", name="Compare sizes")).to_be_enabled()
+    page.unroute("**/export?*")
+    splats.complaints[:] = [text for text in splats.complaints if "422" not in text]  # the browser's own line
 
 
 def test_nothing_was_against_the_policy_and_no_error_logged(splats: Viewer) -> None:

@@ -10,7 +10,7 @@ import { session } from '../../session/session';
 import { download } from '../download';
 import { NumberField, Section, Switch } from '../fields';
 import { Icon } from '../icons';
-import { makeFile, SAVED_KINDS, servedFormat, type SavedFormat, type SavedKind } from './make_file';
+import { makeFile, SAVED_KINDS, servedFormat, type MadeFile, type SavedFormat, type SavedKind } from './make_file';
 
 const withEdits = signal(true);
 /** The most that textured meshes have. */
@@ -22,8 +22,11 @@ const share = signal<number | null>(null);
 
 const textured = new Set<SavedFormat>(FILE_KINDS.filter((kind) => kind.textured).map((kind) => kind.format));
 
-/** Bytes of the files written so far, by format and address; after further edits a file may take some more or less. Null: the object has nothing that it holds. */
-const sizes = signal<Record<string, number | null>>({});
+/** Bytes of the files written so far, by format and address; after further edits a file may take some more or less. Where there is none, the server's sentence why. */
+const sizes = signal<Record<string, number | string>>({});
+
+/** What the browser made last of each format, for it can take minutes; `of`: what it was made of. */
+const kept = new Map<SavedFormat, { of: string; file: MadeFile }>();
 
 export function Files() {
   const open = session.value!;
@@ -36,10 +39,14 @@ export function Files() {
   const place = (format: SavedFormat) => `${format} ${address(format)}`;
   const make = async (kind: SavedKind, leaving: AbortController) => {
     const key = place(kind.format);
+    const of = `${key} ${log.value.revision}`;
+    const before = kept.get(kind.format);
+    if (before?.of === of) return before.file;
     writing.value = { format: kind.format, leaving };
     share.value = null;
     const file = await makeFile(kind, address(kind.format), (done) => (share.value = done), leaving.signal).finally(() => (writing.value = null));
     sizes.value = { ...sizes.value, [key]: file.content.size };
+    if (servedFormat(kind.format) !== kind.format) kept.set(kind.format, { of, file });
     return file;
   };
   const save = async (kind: SavedKind) => {
@@ -55,7 +62,7 @@ export function Files() {
       if (sizes.value[key] !== undefined) continue;
       const absent = (error: unknown) => {
         if (!(error instanceof api.ApiError && error.status === 422)) throw error;
-        sizes.value = { ...sizes.value, [key]: null };
+        sizes.value = { ...sizes.value, [key]: error.message };
         return true;
       };
       if (!(await attempt(make(kind, leaving).catch(absent)))) return;
@@ -82,7 +89,7 @@ export function Files() {
               class="button"
               href={address(kind.format)}
               download
-              title={kind.description}
+              title={reasonFor(sizes.value[place(kind.format)]) ?? kind.description}
               aria-disabled={writing.value !== null}
               onClick={(event) => {
                 event.preventDefault();
@@ -129,8 +136,10 @@ async function saveVersion(): Promise<void> {
 
 const progress = () => (share.value ? `${Math.round(100 * share.value)} %` : 'writing…');
 
-function sizeInWords(bytes: number | null | undefined): string {
+const reasonFor = (size: number | string | undefined) => (typeof size === 'string' ? size : null);
+
+function sizeInWords(bytes: number | string | undefined): string {
   if (bytes === undefined) return '';
-  if (bytes === null) return 'none';
+  if (typeof bytes === 'string') return 'none';
   return bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 }

@@ -6,6 +6,11 @@ import { transformSplats } from './splats/transform_splats';
 
 export type SavedKind = (typeof FILE_KINDS)[number] | (typeof SPLAT_KINDS)[number];
 export type SavedFormat = DownloadFormat | SplatFormat;
+export interface MadeFile {
+  content: Blob;
+  /** To save it under. */
+  name: string;
+}
 
 /** In the order in which they are offered: splats of the browser's behind those of the server's. */
 export const SAVED_KINDS: SavedKind[] = FILE_KINDS.flatMap((kind) => (kind.format === 'spz' ? [kind, ...SPLAT_KINDS] : [kind]));
@@ -16,7 +21,7 @@ export const servedFormat = (format: SavedFormat): DownloadFormat => (format ===
 /** `address`: of what the server writes. `onShare`: 0..1 of what the browser does then.
  *
  * Fails with a sentence; with an AbortError where `leaving` says so. */
-export async function makeFile({ format, suffix }: SavedKind, address: string, onShare: (share: number) => void, leaving: AbortSignal): Promise<{ content: Blob; name: string }> {
+export async function makeFile({ format, suffix }: SavedKind, address: string, onShare: (share: number) => void, leaving: AbortSignal): Promise<MadeFile> {
   const served = await api.exportedFile(address, leaving);
   if (format !== 'sog' && format !== 'compressed') return served;
   onShare(0);
