@@ -2,32 +2,129 @@
 
 An int passes for a float. Three things are left to others: words (Literal), which mypy checks and doors refuse by a sentence that tests want to
 see; Warp's structs, which are no types at run time; and Warp's kernels, whose source it reads, which a wrapper would hide.
+
+jaxtyping's own decorator makes both checks of a function when it is defined, those within functions at every call of these, and looks at what a
+function is given before it and behind it: a fifth of a build's time. Here checks are made at the first call, once for all functions of one
+source, and whatever comes and goes is looked at once.
 """
 
 import ast
+import dataclasses
+import functools
+import inspect
 from collections.abc import Callable
 from typing import Any
 
 from beartype import BeartypeConf, beartype
-from jaxtyping import _import_hook, install_import_hook
+from jaxtyping import TypeCheckError, _import_hook, install_import_hook
+from jaxtyping._decorator import _destring_annotation, _make_fn_with_signature
+from jaxtyping._storage import pop_shape_memo, push_shape_memo
 
-_checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
-
-
-def check(function: Callable) -> Callable:
-    """The function with every call checked against its annotations."""
-    hints = getattr(function, "__annotations__", {})
-    if any(map(_is_left_out, hints.values())):
-        function.__annotations__ = {name: Any if _is_left_out(hint) else hint for name, hint in hints.items()}
-    return _checked(function)
+_refuse_wrong_types = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeCheckError))
 
 
-def _is_left_out(hint: object) -> bool:
-    return "Literal[" in repr(hint) or type(hint).__module__.startswith("warp.")
+@dataclasses.dataclass(frozen=True)
+class Checks:
+    """What a call goes through, in one memory of what each letter of a shape stands for."""
+
+    arguments: Callable[..., None]
+    """Is called as the function is."""
+    result: Callable[[Any], None] | None
+    """Is given what the function returned; None where that is not annotated."""
+    signature: inspect.Signature | None
+    """Where shapes name arguments ("{count} 3"), whose values are needed then."""
+
+
+_checks: dict[tuple, Checks] = {}
+"""By source and annotations: a function that is defined within another one is a new one each time."""
+
+
+def checked(thing: Any) -> Any:
+    """The function with every call checked against its annotations; of a record, the making of one. Decorates what the import hook finds."""
+    if isinstance(thing, type):
+        if dataclasses.is_dataclass(thing) and not hasattr(thing.__init__, "is_checked"):
+            thing.__init__ = checked(thing.__init__)  # type: ignore[misc]
+        return thing
+    if isinstance(thing, staticmethod | classmethod):
+        return type(thing)(checked(thing.__func__))
+    if isinstance(thing, property):
+        return property(*(accessor and checked(accessor) for accessor in (thing.fget, thing.fset, thing.fdel)))
+    return _checked_function(thing)
+
+
+def _checked_function(function: Callable) -> Callable:
+    checks: Checks | None = None
+
+    @functools.wraps(function)
+    def checking(*arguments: Any, **named: Any) -> Any:
+        __tracebackhide__ = True
+        nonlocal checks
+        if checks is None:
+            checks = _checks_of(function)
+        push_shape_memo(_bound(checks.signature, arguments, named) if checks.signature else {})
+        try:
+            checks.arguments(*arguments, **named)
+            result = function(*arguments, **named)
+            if checks.result is not None:
+                checks.result(result)
+            return result
+        finally:
+            pop_shape_memo()
+
+    checking.is_checked = True  # type: ignore[attr-defined]
+    return checking
+
+
+def _bound(signature: inspect.Signature, arguments: tuple, named: dict[str, Any]) -> dict[str, Any]:
+    bound = signature.bind(*arguments, **named)
+    bound.apply_defaults()
+    return bound.arguments
+
+
+def _checks_of(function: Callable) -> Checks:
+    key = (function.__code__, function.__module__, function.__qualname__, *function.__annotations__.items())
+    if key not in _checks:
+        _checks[key] = _make_checks(function)
+    return _checks[key]
+
+
+def _make_checks(function: Callable) -> Checks:
+    signature = inspect.signature(function)
+    hints = {name: _checked_hint(parameter.annotation, function) for name, parameter in signature.parameters.items()}
+    returned = _checked_hint(signature.return_annotation, function)
+    taken = signature.replace(
+        parameters=[parameter.replace(annotation=hints[name]) for name, parameter in signature.parameters.items()], return_annotation=Any
+    )
+    given = inspect.Signature(
+        [inspect.Parameter("returned", inspect.Parameter.POSITIONAL_ONLY, annotation=returned)], return_annotation=Any
+    )
+    return Checks(
+        _refused_as(function, taken),
+        None if signature.return_annotation is inspect.Signature.empty else _refused_as(function, given),
+        taken if any("{" in repr(hint) for hint in (*hints.values(), returned)) else None,
+    )
+
+
+def _refused_as(function: Callable, signature: inspect.Signature) -> Callable[..., None]:
+    """A function that does nothing but refuse what is not as the signature says, under the other one's name."""
+    name = function.__name__ if function.__name__.isidentifier() else "function"
+    return _refuse_wrong_types(_make_fn_with_signature(name, function.__qualname__, function.__module__, signature, output=False))
+
+
+def _checked_hint(hint: Any, function: Callable) -> Any:
+    if hint is inspect.Signature.empty or "Literal[" in repr(hint) or type(hint).__module__.startswith("warp."):
+        return Any
+    return _destring_annotation(hint, function.__globals__)
 
 
 def check_imports_of(modules: list[str]) -> None:
     """Check what functions and records of these modules, and of those below them, are given and return; call it before they are imported."""
     told = _import_hook._is_no_type_check  # jaxtyping asks this of every decorator
     _import_hook._is_no_type_check = lambda decorator: told(decorator) or ast.unparse(decorator).startswith("wp.")
-    install_import_hook(modules, "tests.shape_checks.check")
+    _import_hook.Typechecker.get_ast = _decorator
+    install_import_hook(modules, "tests.shape_checks.checked")
+
+
+def _decorator(checker: _import_hook.Typechecker) -> ast.expr:
+    """In place of jaxtyping's own decorator."""
+    return ast.parse(f"jaxtyping._import_hook.Typechecker.lookup['{checker.get_hash()}']", mode="eval").body
