@@ -1,7 +1,7 @@
-"""`python -m drgs_worker.jobs.file_tool`: read or write one untrusted file in a process of its own, with bounded memory.
+"""The file tool: read or write one untrusted file in a process of its own, with bounded memory.
 
-The server calls it (`run_file_tool`), so that a decoder that crashes or swallows memory takes no server down.
-Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full. Commands:
+The server calls it (`run_file_tool`), so that a decoder that crashes or swallows memory takes no server down; begin_tool.py begins it, and
+`python -m drgs_worker.jobs.file_tool` by hand. Exit code 2 and one sentence on stderr for wrong input; 3 where the disk is full. Commands:
     asset SOURCE OUT            zipped asset or mesh (.zip .glb .ply .obj) -> asset folder
     environment SOURCE OUT      EXR or Radiance HDR -> EXR
     look CAPTURE OUT NAME       folder of a capture, which sentences call NAME -> folder with look.json and, where it has pictures, sheet.jpg (drgs/evaluate/look_at_capture.py)
@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.maths.constants import MIDDLE_GREY
+from drgs_worker.jobs.begin_tool import READ_BYTES, RunningTool, begin_tool
 from drgs_worker.jobs.start_view import FOV_Y_DEGREES, start_view
 from drgs_worker.store import disk_trouble
 
@@ -106,29 +107,37 @@ async def run_file_tool(*arguments: str) -> None:
         FileToolError: with the tool's own sentence, or one that says that it crashed or took too long.
         OSError: the disk is full.
     """
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-P",
-        "-m",
-        "drgs_worker.jobs.file_tool",
-        *arguments,
-        stdout=asyncio.subprocess.DEVNULL,
-        stderr=asyncio.subprocess.PIPE,
-    )
     try:
-        _, errors = await asyncio.wait_for(process.communicate(), TIMEOUT_SECONDS)
+        code, errors = await asyncio.wait_for(_run(*arguments), TIMEOUT_SECONDS)
     except TimeoutError as error:
         raise FileToolError(f"The file took more than {TIMEOUT_SECONDS} s to read; it is too large or damaged.") from error
-    finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
-    if process.returncode == FULL_EXIT_CODE:
+    if code == FULL_EXIT_CODE:
         raise OSError(errno.ENOSPC, disk_trouble.SENTENCE)
-    if process.returncode == 2:
-        raise FileToolError(errors.decode(errors="replace").strip().splitlines()[-1][:1000])
-    if process.returncode != 0:
+    if code == 2:
+        raise FileToolError(errors.strip().splitlines()[-1][:1000])
+    if code != 0:
         raise FileToolError("The file could not be read; it is damaged, or too large for this machine's memory.")
+
+
+async def _run(*arguments: str) -> tuple[int, str]:
+    """Exit code and what was said; whoever is cancelled meanwhile leaves no tool behind that writes."""
+    loop = asyncio.get_running_loop()
+    tool = begin_tool(*arguments)
+    try:
+        await _hear(loop, tool)
+    except asyncio.CancelledError:
+        tool.stop()
+        await _hear(loop, tool)
+        raise
+    finally:
+        tool.close()
+    return tool.result()
+
+
+async def _hear(loop: asyncio.AbstractEventLoop, tool: RunningTool) -> None:
+    tool.channel.setblocking(False)
+    while said := await loop.sock_recv(tool.channel, READ_BYTES):
+        tool.hear(said)
 
 
 def make_asset(source: Path, out: Path) -> None:

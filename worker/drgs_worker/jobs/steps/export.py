@@ -2,17 +2,18 @@
 
 import json
 import os
-import subprocess
-import sys
 
 from drgs.exchange.export_formats import FILE_KINDS, TEXTURED_FORMATS, VARIANT_FORMATS
 from drgs.reconstruct.progress import Progress
 from drgs.scene.edits import plain_edit
+from drgs_worker.jobs.begin_tool import begin_tool
 from drgs_worker.jobs.progress import JobStopped
 from drgs_worker.jobs.requests import ExportRequest
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
 
 POLL_SECONDS = 0.2
+END_SECONDS = 10.0
+"""For a tool that is told to stop; the kernel ends it."""
 
 
 class ExportRun(AbstractJobRun):
@@ -32,40 +33,23 @@ class ExportRun(AbstractJobRun):
         source = job.fetch_asset(self._asked.asset)
         faces = self._asked.faces if format in TEXTURED_FORMATS else None
         variants = self._variants() if format in VARIANT_FORMATS else ()
-        process = subprocess.Popen(
-            [
-                sys.executable,
-                "-P",
-                "-m",
-                "drgs_worker.jobs.file_tool",
-                "export",
-                str(source),
-                str(draft),
-                format,
-                str(faces or 0),
-                *variants,
-            ],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        tool = begin_tool("export", str(source), str(draft), format, str(faces or 0), *variants)
         try:
-            while process.poll() is None:
+            while not tool.wait(POLL_SECONDS):
                 if job.should_stop():
+                    tool.stop()
+                    tool.wait(END_SECONDS)
                     raise JobStopped
-                try:
-                    process.wait(POLL_SECONDS)
-                except subprocess.TimeoutExpired:
-                    continue
+        except BaseException:
+            draft.unlink(missing_ok=True)
+            raise
         finally:
-            if process.poll() is None:
-                process.kill()
-            _, errors = process.communicate()
-            if process.returncode != 0:
-                draft.unlink(missing_ok=True)
-        if process.returncode != 0:
+            tool.close()
+        code, errors = tool.result()
+        if code != 0:
+            draft.unlink(missing_ok=True)
             lines = errors.strip().splitlines()
-            raise ValueError(lines[-1][:1000] if process.returncode == 2 and lines else f"writing {format} failed: {errors[-500:]}")
+            raise ValueError(lines[-1][:1000] if code == 2 and lines else f"writing {format} failed: {errors[-500:]}")
         os.replace(draft, out)
         done = self.steps.index(step) + 1
         job.progress(Progress("export", done, len(self.steps), done / len(self.steps), message=out.name))
