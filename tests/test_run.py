@@ -49,9 +49,9 @@ case "$*" in *"$FAILING"*) echo "a fault of $FAILING"; exit 3 ;; esac
 """
 
 
-@posix
-@pytest.mark.parametrize("failing", ["nothing", "-m mypy", "--numprocesses"])
-def test_a_fault_of_lint_or_of_a_test_is_shown_and_fails_the_run(tmp_path: Path, failing: str):
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """The script where its Python does nothing but write down what it is called with, and what $FAILING names fails."""
     (tmp_path / ".venv" / "bin").mkdir(parents=True)
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "test_speed.py").write_text("@pytest.mark.alone")
@@ -63,13 +63,33 @@ def test_a_fault_of_lint_or_of_a_test_is_shown_and_fails_the_run(tmp_path: Path,
     python.chmod(0o755)
     installed = subprocess.run(["cksum"], input=(ROOT / "run").read_bytes(), capture_output=True, check=True).stdout
     (tmp_path / ".venv" / ".installed-dev").write_bytes(installed)
-    environment = os.environ | {"FAILING": failing}
-    result = subprocess.run([str(tmp_path / "run"), "test"], env=environment, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
-    called = (tmp_path / "calls").read_text()
+    return tmp_path
+
+
+def run_tests_in(project: Path, failing: str, *arguments: str) -> tuple[subprocess.CompletedProcess[str], str]:
+    """What the script ends with, and what Python was called with."""
+    command, environment = [str(project / "run"), "test", *arguments], os.environ | {"FAILING": failing}
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
+    return result, (project / "calls").read_text()
+
+
+@posix
+@pytest.mark.parametrize("failing", ["nothing", "-m mypy", "--numprocesses"])
+def test_a_fault_of_lint_or_of_a_test_is_shown_and_fails_the_run(project: Path, failing: str):
+    result, called = run_tests_in(project, failing)
     assert "-m ruff check" in called and "--numprocesses" in called
     assert (result.returncode == 0) == (failing == "nothing"), result.stderr
     assert failing == "nothing" or f"a fault of {failing}" in result.stdout
     assert ("-m pytest -m alone tests/test_speed.py" in called) == (failing == "nothing"), "time is measured when all the rest is well"
+
+
+@posix
+@pytest.mark.parametrize("failing", ["nothing", "--check", "--numprocesses"])
+def test_a_fault_of_the_viewer_or_of_a_quick_test_is_shown_and_fails_the_run(project: Path, failing: str):
+    result, called = run_tests_in(project, failing, "--fast", "-k", "some")
+    assert "web/build.py --check" in called and re.search("--numprocesses .* -k some", called) and "mypy" not in called
+    assert (result.returncode == 0) == (failing == "nothing"), result.stderr
+    assert failing == "nothing" or f"a fault of {failing}" in result.stdout
 
 
 def test_every_dependency_has_a_tested_version():
