@@ -6,7 +6,7 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -54,10 +54,20 @@ def syntax(name: str) -> ast.Module:
     return ast.parse((ROOT / name).read_text(), name)
 
 
+@cache
+def nodes(name: str) -> list[ast.AST]:
+    """All of a file's tree, which to walk takes longer than to look through."""
+    return list(ast.walk(syntax(name)))
+
+
 def imports(tree: ast.AST) -> set[str]:
     """Dotted names that the code imports, wherever in it."""
+    return imports_among(ast.walk(tree))
+
+
+def imports_among(among: Iterable[ast.AST]) -> set[str]:
     found: set[str] = set()
-    for node in ast.walk(tree):
+    for node in among:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -67,7 +77,7 @@ def imports(tree: ast.AST) -> set[str]:
 
 @cache
 def imports_of(name: str) -> set[str]:
-    return imports(syntax(name))
+    return imports_among(nodes(name))
 
 
 def is_type_checking(node: ast.AST) -> bool:
@@ -109,7 +119,7 @@ def imported_modules(module: str) -> set[str]:
     """
     found: set[str] = set()
     package = module if MODULES[module].endswith("__init__.py") else module.rpartition(".")[0]
-    for node in ast.walk(syntax(MODULES[module])):
+    for node in nodes(MODULES[module]):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -271,7 +281,7 @@ def test_pickle_is_met_only_by_the_restricted_reader():
 
 @pytest.mark.parametrize("name", PRODUCT)
 def test_nothing_is_loaded_that_may_run_code(name: str):
-    for node in ast.walk(syntax(name)):
+    for node in nodes(name):
         if not isinstance(node, ast.Call):
             continue
         # Only of what may be one of them: to write all out again takes longer than to read the tree.
@@ -370,7 +380,7 @@ MANY_LINES, MANY_ARGUMENTS = 80, 12
 def large_functions(name: str) -> Iterator[str]:
     """Functions beyond the limits that do not say why, in a comment or docstring of theirs: "Long because …", "Many arguments because …"."""
     lines = (ROOT / name).read_text().splitlines()
-    for node in ast.walk(syntax(name)):
+    for node in nodes(name):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
         first = min(node.lineno, *(decorator.lineno for decorator in node.decorator_list)) if node.decorator_list else node.lineno

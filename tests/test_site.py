@@ -51,11 +51,15 @@ def test_pages_lead_on_to_the_next(site: Path):
     assert re.search(r'rel="prev".*?rel="next"', page, re.DOTALL) and "md-footer__link--next" in page
 
 
-def test_the_api_has_every_public_name(site: Path):
+def test_the_api_has_every_public_name():
     import drgs
 
     described = set(re.findall(r"^::: [\w.]*?(\w+)$", (ROOT / "docs" / "api" / "library.md").read_text(), re.MULTILINE))
     assert described | {"__version__", "Client"} == set(drgs.__all__)
+
+
+@pytest.mark.slow
+def test_the_client_is_described_with_what_it_does(site: Path):
     assert "drgs_server.client.Client.open_session" in (site / "api" / "client.html").read_text()
 
 

@@ -47,6 +47,7 @@ COPIED = {
 """Numbers, wherever they stand in the sources, and the constant that each would be a copy of."""
 COPIED_IN_RENDER = {0.03: "MIN_ROUGHNESS", 1e-4: "MIN_TRANSMITTANCE"}
 """Elsewhere these are common numbers."""
+SOUGHT = COPIED.keys() | COPIED_IN_RENDER.keys()
 OTHERS = {
     ("benchmarks/_plot.py", 0.04): "the margin of a plot's axes",
     ("benchmarks/abuse.py", 0.99): "a percentile",
@@ -83,9 +84,11 @@ NAMES = {name for name, value in vars(constants).items() if isinstance(value, fl
 
 
 def numbers(name: str) -> Iterator[float]:
-    """Of a source file's code, not of its comments and texts."""
+    """Of a source file's code, not of its comments and texts; of a Python file without a number that is sought, none."""
     text = (ROOT / name).read_text()
     if name.endswith(".py"):
+        if not SOUGHT & {float(number) for number in NUMBER.findall(text.replace("_", ""))}:
+            return  # nor in comments and texts; to take these out takes long
         tokens = tokenize.generate_tokens(io.StringIO(text).readline)
         found = [token.string for token in tokens if token.type == tokenize.NUMBER]
     else:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -36,12 +37,12 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def context(tmp_path: Path, photographs: Path) -> Callable[..., JobContext]:
+def context(tmp_path: Path) -> Callable[..., JobContext]:
     directory = open_data_directory(tmp_path / "data")
     engine = open_database(directory)
     directory.job(JOB).mkdir()
 
-    def make(said: list, should_stop: Callable[[], bool] = lambda: False, dataset: Path = photographs) -> JobContext:
+    def make(dataset: Path, said: list, should_stop: Callable[[], bool] = lambda: False) -> JobContext:
         parameters = {"kind": "pose", "seed": 0}
         return JobContext(JOB, "Egg", parameters, dataset, directory, engine, None, "cpu", said.append, should_stop)  # type: ignore[arg-type]
 
@@ -49,7 +50,9 @@ def context(tmp_path: Path, photographs: Path) -> Callable[..., JobContext]:
 
 
 @pytest.mark.slow
-def test_photographs_become_a_capture_that_builds_read(context: Callable[..., JobContext], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photographs_become_a_capture_that_builds_read(
+    context: Callable[..., JobContext], photographs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = posed_dataset.pose_photographs
 
     def quick(photos: Path, out: Path, settings: PoseSettings, *rest: object):  # type: ignore[no-untyped-def]
@@ -58,19 +61,19 @@ def test_photographs_become_a_capture_that_builds_read(context: Callable[..., Jo
     monkeypatch.setattr(posed_dataset, "pose_photographs", quick)
     said: list = []
     # Stopped as soon as features are looked for; a worker that goes on does so in an execution of its own.
-    stopped = PoseRun(context(said, lambda: any(told.stage == "features" for told in said)))
+    stopped = PoseRun(context(photographs, said, lambda: any(told.stage == "features" for told in said)))
     with pytest.raises(JobStopped):
         stopped.run("pose")
     fractions = [told.fraction for told in said if isinstance(told, Progress)]
     assert 0 < max(fractions) < 1
-    run = PoseRun(context(said))
+    run = PoseRun(context(photographs, said))
     run.run("pose")
     report = said[-1]
     assert isinstance(report, CaptureReport) and report.summary.startswith("14 of 15 pictures found their place")
     assert report.findings[0].sentence.startswith("broken was left out: ")
     for _ in range(2):  # once more after a crash that came before the step was recorded
         run.run("register")
-    made = context([])
+    made = context(photographs, [])
     place = made.directory.uploads / JOB
     with Session(made.engine) as session:
         (row,) = session.scalars(select(CaptureRow)).all()
@@ -80,13 +83,12 @@ def test_photographs_become_a_capture_that_builds_read(context: Callable[..., Jo
     assert not (made.folder / "posed").exists()
 
 
-def test_what_is_no_folder_of_photographs_is_refused_with_a_sentence(
-    context: Callable[..., JobContext], tmp_path: Path, photographs: Path
-) -> None:
+def test_what_is_no_folder_of_photographs_is_refused_with_a_sentence(context: Callable[..., JobContext], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is gone; it was removed"):
-        PoseRun(context([], dataset=tmp_path / "none")).run("pose")
+        PoseRun(context(tmp_path / "none", [])).run("pose")
     posed = tmp_path / "posed"
-    shutil.copytree(photographs, posed)
+    posed.mkdir()
+    Image.new("RGB", (8, 8)).save(posed / "a.jpg")
     (posed / "transforms.json").write_text(json.dumps({}))
     with pytest.raises(ValueError, match="part of a posed capture"):
-        PoseRun(context([], dataset=posed)).run("pose")
+        PoseRun(context(posed, [])).run("pose")

@@ -58,6 +58,7 @@ def test_things_that_stand_apart_are_kept_and_what_floats_outside_the_hull_is_no
     assert all(int((own < 0.03).sum()) > 100 for own in off[:2])
 
 
+@pytest.mark.slow
 def test_without_a_hull_the_largest_is_the_object(fused: dict[str, TriangleMesh]) -> None:
     mesh = fused["no hull"]
     assert parts(mesh) == 1

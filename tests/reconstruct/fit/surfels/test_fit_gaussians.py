@@ -140,6 +140,7 @@ def test_a_resumed_fit_ends_with_the_numbers_of_one_that_never_stopped(
     assert_same_parameters(resumed, short_fit)
 
 
+@pytest.mark.slow
 def test_a_finished_fit_is_left_alone(views: Views, points: InitialPoints, short_fit: FitState):
     before = {name: value.detach().clone() for name, value in short_fit.parameters.items()}
     assert run(views, short_fit, points, SHORT) == []
