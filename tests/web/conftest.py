@@ -3,6 +3,7 @@
 import base64
 import importlib.util
 import io
+import os
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,8 @@ expect.set_options(timeout=1000 * PATIENCE_SECONDS)
 
 PLAIN_COMPOSITING = ("--disable-gpu-compositing", "--disable-gpu-rasterization")
 """Panels and pictures are put together without software GL, which takes as much of a core for it as for what it draws on canvases."""
+PLAIN_EDGES = () if os.environ.get("DRGS_SCREENSHOTS") else ("--webgl-antialiasing-mode=none",)
+"""Canvases are drawn once a pixel instead of four times, but in pictures that are kept to be looked at."""
 FEW_SAMPLES = "64"
 """A pixel, as the page offers them: a quarter of what it asks for by itself."""
 
@@ -207,7 +210,9 @@ class _Browsing:
         if self._running is None or not self._running.is_connected():
             self.end()
             playwright = self._open.enter_context(sync_playwright())
-            self._running = playwright.chromium.launch(executable_path=chromium_path(), args=[*CHROMIUM_ARGUMENTS, *PLAIN_COMPOSITING])
+            self._running = playwright.chromium.launch(
+                executable_path=chromium_path(), args=[*CHROMIUM_ARGUMENTS, *PLAIN_COMPOSITING, *PLAIN_EDGES]
+            )
             self._open.callback(self._running.close)
         return self._running
 
