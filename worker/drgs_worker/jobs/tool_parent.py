@@ -21,7 +21,7 @@ import traceback
 
 from drgs_worker.jobs import file_tool
 
-IDLE_SECONDS = 60.0
+IDLE_SECONDS = 300.0
 """Without a tool, after which this process makes room for others: it holds 240 MB that are its own."""
 FORKS = sys.platform == "linux"
 """Elsewhere what libraries of the system have begun does not outlive a fork, and each tool loads what it needs."""
