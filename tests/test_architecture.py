@@ -238,7 +238,7 @@ def loaded_with(module: str) -> set[str]:
     ],
 )
 def test_a_process_for_one_file_loads_what_it_needs_and_no_more(module: str, late: set[str]):
-    # Each look, upload and export is a process: what it imports, its caller waits for.
+    # Each look, upload and export is a process: what it imports its caller waits for, where it is not forked off one that has loaded all.
     assert loaded_with(module) & late == set()
 
 

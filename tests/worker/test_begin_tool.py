@@ -1,11 +1,14 @@
 """File tools as processes: what they say and end with, and that none outlives who asked for it."""
 
+import fcntl
 import os
+import resource
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,8 @@ from drgs_worker.jobs import tool_parent
 from drgs_worker.jobs.begin_tool import RunningTool, begin_tool
 from tests.patience import PATIENCE_SECONDS
 
+FEW_FILES = 1024
+"""Numbers of files from here on are too large for select."""
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
@@ -94,6 +99,22 @@ time.sleep(600)
     wait_until(lambda: not parent.is_running() and not tool.is_running(), "the end of both")
 
 
+def test_a_tool_that_ended_with_its_parent_has_failed_with_what_it_said() -> None:
+    here, there = socket.socketpair()
+    there.sendall(b"half a sent")
+    there.close()
+    assert ended(RunningTool(here)) == (1, "half a sent")
+
+
+@contextmanager
+def more_files(count: int) -> Iterator[None]:
+    """This process may have so many files open."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, count), hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
 @pytest.fixture
 def parent_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[socket.socket], int]]:
     """The parent's loop in this process, which keeps its signals."""
@@ -109,7 +130,8 @@ def parent_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[socket.so
 
 def test_a_parent_that_nobody_asks_ends_and_its_socket_takes_no_more(parent_here: Callable[[socket.socket], int]) -> None:
     here, there = socket.socketpair()
-    with here:
-        assert parent_here(there) == 0
+    with here, there, more_files(2 * FEW_FILES):
+        assert parent_here(socket.socket(fileno=fcntl.fcntl(there, fcntl.F_DUPFD, FEW_FILES))) == 0
+        there.close()
         with pytest.raises(BrokenPipeError):
             here.send(b"+")

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -51,12 +52,15 @@ class RunningTool:
 
     def result(self) -> tuple[int, str]:
         """Of a tool that has ended: its exit code, less than 0 where a signal ended it, and what it wrote to stderr."""
-        errors, _, code = self._said.rpartition(b"\0")
-        return int(code or 1), errors.decode(errors="replace")  # no code: its parent is gone
+        errors, ended, code = self._said.rpartition(b"\0")
+        if not ended:  # with its parent
+            errors, code = code, b"1"
+        return int(code), errors.decode(errors="replace")
 
     def stop(self) -> None:
         """End it; it is over when `channel` is."""
-        self.channel.shutdown(socket.SHUT_WR)
+        with suppress(OSError):  # it has ended by itself
+            self.channel.shutdown(socket.SHUT_WR)
 
     def close(self) -> None:
         self.channel.close()

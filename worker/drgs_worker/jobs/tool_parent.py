@@ -28,7 +28,9 @@ FORKS = sys.platform == "linux"
 
 
 def main(arguments: list[str]) -> int:
-    asking = socket.socket(fileno=int(arguments[0]))
+    given = int(arguments[0])
+    asking = socket.socket(fileno=os.dup(given))  # the lowest number that is free: of a busy server it was one too large for select
+    os.close(given)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; who asks decides
     woken, wake = socket.socketpair()
     woken.setblocking(False)
