@@ -18,6 +18,7 @@ from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings, fit_surface
 from drgs.reconstruct.fit.surface.moving_surface import mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.try_depths import TrialSettings, try_depths
+from drgs.reconstruct.fit.surface.try_sheets import SheetSettings, try_sheets
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
@@ -43,6 +44,10 @@ class PassSettings:
     trials: TrialSettings = field(default_factory=TrialSettings)
     try_after: tuple[int, ...] = ()
     """Passes, counted from 1, after which the surface is tried at other depths."""
+    sheets: SheetSettings = field(default_factory=SheetSettings)
+    sheets_after: tuple[int, ...] = ()
+    """Passes, counted from 1, after which narrow hollows are tried without what may fill them. Not those of try_after: stopped in the second of two trials, a
+    build would repeat the first."""
     carve_after: tuple[int, ...] = (3,)
     """Passes, counted from 1, after which hollows are looked for: once, two fifths of the way. Each time right places sink as well, by chance; earlier,
     normals and materials are not what carving asks, and later too few passes are left to smooth what was carved (figures in docs/decisions/0003)."""
@@ -121,15 +126,42 @@ def move_to_tried_depths(
     fit.doing = ""
     if found is None:
         return False
-    step = found.parameters["vertices"] - before["vertices"]
-    # What moved is at home where it is now.
-    moved = (found.depth.abs() > settings.trials.still * radius)[:, None]
-    found.parameters["homeward"] = torch.where(moved, torch.zeros_like(step), before["homeward"] - step)
-    found.parameters["to_texture"] = before["to_texture"] - step
-    with torch.no_grad():
-        for name, value in found.parameters.items():
-            parameters[name].copy_(value)
+    _settle_where_tried(fit, before, found.parameters, found.depth.abs() > settings.trials.still * radius)
     return True
+
+
+def empty_tried_hollows(
+    fit: SurfaceFit,
+    views: Views,
+    settings: PassSettings,
+    radius: float,
+    report: Callable[[FitReport], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> bool:
+    """Take out what trials say fills narrow hollows; False: should_stop() said so, and nothing moved."""
+    before = {name: value.detach().clone() for name, value in fit.state.parameters.items()}
+    seed = settings.surface.seed + 7919 * (fit.index + 1)
+    fit.doing = "trying narrow hollows"
+    try:
+        found = try_sheets(views, before, fit.faces, settings.sheets, settings.mesh, radius, seed, report, should_stop)
+    except NothingEnclosed as error:
+        fit.remark = f"after pass {fit.index + 1} no hollows were tried, for {error}"
+        return True
+    finally:
+        fit.doing = ""
+    if found is None:
+        return False
+    _settle_where_tried(fit, before, found.parameters, found.moved)
+    return True
+
+
+@torch.no_grad()
+def _settle_where_tried(fit: SurfaceFit, before: dict[str, Tensor], found: dict[str, Tensor], moved: Tensor) -> None:
+    """The fit goes on with what was found; what moved, (vertex,), is at home where it is now."""
+    step = found["vertices"] - before["vertices"]
+    homeward = torch.where(moved[:, None], torch.zeros_like(step), before["homeward"] - step)
+    for name, value in (found | {"homeward": homeward, "to_texture": before["to_texture"] - step}).items():
+        fit.state.parameters[name].copy_(value)
 
 
 def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> None:
@@ -189,8 +221,10 @@ def fit_surface_in_passes(
     Args:
         fit: start_surface on the mesh as it was extracted, or what an earlier call left. report: is told of the steps of all passes.
     """
-    steps, trial_steps = settings.surface.iterations, settings.trials.iterations
-    total = settings.passes * steps + len(settings.try_after) * trial_steps
+    steps = settings.surface.iterations
+    between = [(after, settings.trials.iterations) for after in settings.try_after]
+    between += [(after, settings.sheets.iterations) for after in settings.sheets_after]
+    total = settings.passes * steps + sum(more for _, more in between)
 
     def tell(done: int, r: FitReport) -> None:
         if report is not None:
@@ -198,13 +232,17 @@ def fit_surface_in_passes(
 
     while True:
         number = fit.index + 1
-        done = fit.index * steps + sum(after < number for after in settings.try_after) * trial_steps
+        done = fit.index * steps + sum(more for after, more in between if after < number)
         fit_surface(views, fit.mesh, fit.state, settings_of_pass(settings, fit.index), partial(tell, done), should_stop)
         if fit.state.iteration < steps:
             return False
         if number >= settings.passes:
             return True
         if number in settings.try_after and not move_to_tried_depths(
+            fit, views, settings, radius, partial(tell, done + steps), should_stop
+        ):
+            return False
+        if number in settings.sheets_after and not empty_tried_hollows(
             fit, views, settings, radius, partial(tell, done + steps), should_stop
         ):
             return False

@@ -134,7 +134,7 @@ def try_depths(
     Args:
         parameters: of a surface's fit. radius: of the object's bounding sphere [world units]. report: is told of the steps of all trials.
     """
-    trials = _Trials(views, faces, settings, seed, report, should_stop)
+    trials = Trials(views, faces, settings, seed, report, should_stop)
     edges, count = trials.edges, len(parameters["vertices"])
     around = averaging_matrix(edges, count)
     start, end = parameters["vertices"][edges.vertices].unbind(1)
@@ -154,10 +154,7 @@ def try_depths(
     def tried(depth: Tensor, only: Tensor | None = None) -> tuple[dict[str, Tensor], Tensor]:
         """The surface settled there, and the ratio of its errors to those here."""
         moved = trials.settled(_sunk(first.parameters, depth, inward, faces), here, only)
-        there, before = smoothed(moved.errors), smoothed(here.errors)
-        known = torch.minimum(there[:, 1], before[:, 1]) > FEWEST
-        error, base = ((sums[:, 0] / sums[:, 1].clamp(min=1e-9)).clamp(min=0) + NOISE for sums in (there, before))
-        return moved.parameters, torch.where(known, error / base, torch.full_like(error, math.nan))
+        return moved.parameters, error_ratio(smoothed(moved.errors), smoothed(here.errors))
 
     def reached(share: float, where: Tensor) -> Tensor:
         return smoothed(where * torch.minimum(torch.full_like(most, share * radius), most))
@@ -184,6 +181,17 @@ def try_depths(
         weight = share.view(count, *[1] * (result[name].ndim - 1))
         result[name] = weight * after[name] + (1 - weight) * result[name]
     return None if trials.stopped else TriedDepths(result, depth, ratios, loose)
+
+
+def error_ratio(there: Float[Tensor, "vertex 2"], before: Float[Tensor, "vertex 2"]) -> Float[Tensor, "vertex"]:
+    """Mean error of one trial over that of another; nan where either compares next to nothing.
+
+    Args:
+        there, before: sums of squared errors, and numbers of pixels, averaged around.
+    """
+    known = torch.minimum(there[:, 1], before[:, 1]) > FEWEST
+    error, base = ((sums[:, 0] / sums[:, 1].clamp(min=1e-9)).clamp(min=0) + NOISE for sums in (there, before))
+    return torch.where(known, error / base, torch.full_like(error, math.nan))
 
 
 def preferred_depth(
@@ -236,7 +244,7 @@ def _sunk(parameters: dict[str, Tensor], depth: Tensor, inward: Tensor, faces: T
 
 
 @dataclass(frozen=True, eq=False)
-class _Settled:
+class Settled:
     """A surface after some steps of normals and materials where it stands."""
 
     parameters: dict[str, Tensor]
@@ -245,9 +253,11 @@ class _Settled:
     """Sum of the squared errors of the pixels at each vertex, and their number."""
     nearest: list[Tensor]
     """Of each photograph: (pixel,) the vertex that it sees; -1 for none."""
+    squares: list[Tensor]
+    """Of each photograph: (pixel,) the squared error; nan where it is not compared."""
 
 
-class _Trials:
+class Trials:
     """Final. The photographs, the same pixels of each in all trials."""
 
     def __init__(
@@ -273,7 +283,7 @@ class _Trials:
             for chosen, all_pixels in ((self._solid, solid), (self._bare, bare)):
                 chosen.append(all_pixels[(torch.rand(len(all_pixels), generator=generator) < share).to(faces.device)])
 
-    def settled(self, parameters: dict[str, Tensor], beside: _Settled | None = None, only: Tensor | None = None) -> _Settled:
+    def settled(self, parameters: dict[str, Tensor], beside: Settled | None = None, only: Tensor | None = None) -> Settled:
         """The surface with normals and materials that explain the photographs from where it is.
 
         Args:
@@ -292,12 +302,12 @@ class _Trials:
             materials = {name: torch.sigmoid(values[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
             return torch.nn.functional.normalize(values["normals"], dim=-1), materials
 
-        def shown(index: int, normals: Tensor, materials: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-            """Nearest vertices, two estimates of the colours and the photograph's colours of a view's pixels."""
+        def shown(index: int, normals: Tensor, materials: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+            """Pixels, their nearest vertices, two estimates of the colours and the photograph's colours of a view's pixels."""
             target, places = self._targets[index], seen[index][steep_enough(seen[index], normals)]
             tracer = surface.tracer.with_materials(mesh_from_surface_fit(state, self._faces))
             first, second = (shade_places(places, target, tracer, normals, materials, light_of(target), state.generator) for _ in range(2))
-            return places.nearest, first, second, target.saturation.reshape(-1, 3)[places.pixels]
+            return places.pixels, places.nearest, first, second, target.saturation.reshape(-1, 3)[places.pixels]
 
         def step(iteration: int) -> StepLoss:
             index = drawn_view(iteration, len(self._targets), self._seed)
@@ -305,7 +315,7 @@ class _Trials:
             terms = prior_terms(
                 self.edges, environment, normals, materials, values["metal"], settings.weight_bend, settings.weight_smooth, 0.0, 0.0, 0.0
             )
-            _, first, second, photo = shown(index, normals, materials)
+            _, _, first, second, photo = shown(index, normals, materials)
             squared_error = None
             if len(photo):
                 terms["shaded"] = crossed_halves(first, second, photo)
@@ -319,23 +329,26 @@ class _Trials:
 
         run_fit(FitLoop(state, settings.steps, len(self._targets), step, rates), self._tell, self._stops)
         self._done += settings.steps
-        errors = torch.zeros(len(values["vertices"]), 2, device=self._faces.device)
+        errors, squares = torch.zeros(len(values["vertices"]), 2, device=self._faces.device), []
         with torch.no_grad():
             normals, materials = current()
             for index, target in enumerate(self._targets):
                 if self.stopped:
                     break
-                vertex, first, second, photo = shown(index, normals, materials)
+                pixels, vertex, first, second, photo = shown(index, normals, materials)
                 # A square would count the noise of mirrored rays, which hollows have and what fills them has not.
                 error = crossed_squares(first, second, photo)
                 errors.index_add_(0, vertex, torch.stack([error, torch.ones_like(error)], 1))
+                of_all = torch.full((target.mask.numel(),), math.nan, device=errors.device)
+                of_all[pixels] = error
+                squares.append(of_all[self._solid[index]])
                 foreign = seen_places(target, self._bare[index], surface.tracer).nearest
                 wrong = torch.tensor([FOREIGN_ERROR, 1.0], device=errors.device)
                 errors.index_add_(0, foreign, wrong.expand(len(foreign), 2))
-        return _Settled({name: value.detach() for name, value in values.items()}, surface.tracer, errors, nearest)
+        return Settled({name: value.detach() for name, value in values.items()}, surface.tracer, errors, nearest, squares)
 
-    def _seen(self, tracer: AbstractTracer, beside: _Settled | None, only: Tensor | None) -> tuple[list[SeenPlaces], list[Tensor]]:
-        """Of each photograph, the places that are compared, and `_Settled.nearest`."""
+    def _seen(self, tracer: AbstractTracer, beside: Settled | None, only: Tensor | None) -> tuple[list[SeenPlaces], list[Tensor]]:
+        """Of each photograph, the places that are compared, and `Settled.nearest`."""
         every, nearest = [], []
         for index, (target, solid) in enumerate(zip(self._targets, self._solid, strict=True)):
             seen = seen_places(target, solid, tracer)
