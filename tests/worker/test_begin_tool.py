@@ -69,6 +69,29 @@ def test_tools_say_what_is_wrong_and_leave_what_is_right_and_all_have_one_parent
     assert ended(begin_tool("asset", str(tmp_path / "four.obj"), str(tmp_path / "again"))) == (0, ""), "another parent was started"
 
 
+def large_mesh() -> str:
+    """So large that torch shares out its loops among threads."""
+    side = 200
+    corners = [f"v {x / side} {y / side} 0" for y in range(side) for x in range(side)]
+    lower = [y * side + x + 1 for y in range(side - 1) for x in range(side - 1)]
+    faces = [f"f {a} {a + 1} {a + side}\nf {a + 1} {a + side + 1} {a + side}" for a in lower]
+    return "\n".join(corners + faces)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not tool_parent.FORKS, reason="tools are started one by one here")
+def test_the_parent_has_no_threads_and_its_children_as_many_as_they_like(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_parent", None)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    (tmp_path / "large.obj").write_text(large_mesh())
+    for name in ("first", "second"):
+        assert ended(begin_tool("asset", str(tmp_path / "large.obj"), str(tmp_path / name))) == (0, "")
+        assert module._parent is not None
+        assert psutil.Process(module._parent.process.pid).num_threads() == 1
+    module._parent.asking.close()
+    assert module._parent.process.wait(PATIENCE_SECONDS) == 0
+
+
 @pytest.mark.slow
 def test_a_tool_that_is_stopped_or_forgotten_is_over_while_others_go_on(waiting: Path, tmp_path: Path) -> None:
     stopped, forgotten = (begin_tool("environment", str(waiting), str(tmp_path / "out")) for _ in range(2))

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Final
 
 READ_BYTES: Final = 1 << 16
-WITHOUT_THREADS: Final = {"CUDA_VISIBLE_DEVICES": "", "OPENBLAS_NUM_THREADS": "1"}
-"""A process that forks should have neither opened a GPU nor begun threads. Tools compute on the CPU; torch begins threads when it computes."""
+WITHOUT_THREADS: Final = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""A process that forks should have neither opened a GPU nor begun threads: its children have none of them, and wait for ever for what they would do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,8 @@ def begin_tool(*arguments: str) -> RunningTool:
     global _parent
     here, there = socket.socketpair()
     with there:
-        here.sendall(json.dumps({"arguments": arguments, "file_limits": resource.getrlimit(resource.RLIMIT_FSIZE)}).encode() + b"\n")
+        asked = {"arguments": arguments, "file_limits": resource.getrlimit(resource.RLIMIT_FSIZE), "threads": _threads()}
+        here.sendall(json.dumps(asked).encode() + b"\n")
         with _lock:
             if _parent is None or not _is_given(_parent, there):
                 if _parent is not None:
@@ -80,6 +81,12 @@ def begin_tool(*arguments: str) -> RunningTool:
                 _parent = _start()
                 _is_given(_parent, there)
     return RunningTool(here)
+
+
+def _threads() -> int:
+    """How many a process like this one computes with."""
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    return int(given) if given.isdecimal() and int(given) > 0 else os.cpu_count() or 1
 
 
 def _is_given(parent: _Parent, channel: socket.socket) -> bool:

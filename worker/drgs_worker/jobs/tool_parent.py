@@ -4,7 +4,7 @@ It loads what they need, which takes about three seconds of a core, and forks fo
 and runs no threads: what a hostile file does to a child leaves the next child as this process was. begin_tool.py starts it and talks to it.
 
 Through SOCKET, the number of an inherited socket, come the channels of tools, a socket each with a byte to carry it. In a channel lies a line of
-JSON, {"arguments" (of file_tool.main), "file_limits" (RLIMIT_FSIZE of who asks)}. Back come what the tool writes to stderr, a zero and its exit
+JSON, {"arguments" (of file_tool.main), "file_limits" (RLIMIT_FSIZE of who asks), "threads" (to compute with)}. Back come what the tool writes to stderr, a zero and its exit
 code, then the end. Whoever ends his side of a channel ends its tool; who ends SOCKET's other side, by dying too, ends all tools and this process.
 """
 
@@ -37,10 +37,12 @@ def main(arguments: list[str]) -> int:
     wake.setblocking(False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+    forks = FORKS
     if FORKS:
         _load_what_tools_need()
         gc.collect()
         gc.freeze()  # children would copy each page that their garbage collector counts on
+        forks = len(os.listdir("/proc/self/task")) == 1  # locks of other threads would stay locked in children
     tools: dict[int, socket.socket] = {}
     is_open = True
     while is_open or tools:
@@ -53,7 +55,7 @@ def main(arguments: list[str]) -> int:
             is_open = bool(channels)
             for channel in (socket.socket(fileno=descriptor) for descriptor in channels):
                 asked = json.loads(channel.makefile("rb").readline())
-                process = _fork_tool(asked, channel, [asking, woken, wake, *tools.values()]) if FORKS else _start_tool(asked, channel)
+                process = _fork_tool(asked, channel, [asking, woken, wake, *tools.values()]) if forks else _start_tool(asked, channel)
                 tools[process] = channel
         if woken in ready:
             woken.recv(1 << 12)
@@ -80,7 +82,8 @@ def _load_what_tools_need() -> None:
 def _start_tool(asked: dict, channel: socket.socket) -> int:
     command = [sys.executable, "-P", "-m", "drgs_worker.jobs.file_tool", *asked["arguments"]]
     said = (os.POSIX_SPAWN_DUP2, channel.fileno(), sys.stderr.fileno())
-    return os.posix_spawn(command[0], command, os.environ, file_actions=[said])
+    threads = {"OMP_NUM_THREADS": str(asked["threads"])}
+    return os.posix_spawn(command[0], command, {**os.environ, **threads}, file_actions=[said])
 
 
 def _fork_tool(asked: dict, channel: socket.socket, others: list[socket.socket]) -> int:
@@ -97,6 +100,9 @@ def _fork_tool(asked: dict, channel: socket.socket, others: list[socket.socket])
         os.dup2(channel.fileno(), sys.stderr.fileno())
         channel.close()
         resource.setrlimit(resource.RLIMIT_FSIZE, tuple(asked["file_limits"]))
+        import torch  # loaded already
+
+        torch.set_num_threads(asked["threads"])
         code = file_tool.main(asked["arguments"])
     except BaseException:  # a fault of the tool's: told, and no reason for a child to go on as a parent
         traceback.print_exc()
