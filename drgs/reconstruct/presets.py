@@ -74,9 +74,7 @@ PRESETS = {
         1024,
         FitSettings(iterations=1400, half_size_share=0.25, most_pixels=320_000, densify=DensifySettings(budget=40_000)),
         FULL_MESH,
-        PassSettings(
-            10, mesh=replace(PASS_MESH, resolution=320, face_limit=200_000), carve_after=(), try_after=(2, 4, 6, 8), sheets_after=(7,)
-        ),
+        PassSettings(10, mesh=replace(PASS_MESH, resolution=320, face_limit=200_000), carve_after=(), try_after=(2, 4, 6, 8)),
         MeshMaterialSettings(iterations=1200, rounds=3, points_a_step=4096),
         DetailSettings(most_faces=400_000),
         HollowSettings(),

@@ -46,7 +46,8 @@ class PassSettings:
     """Passes, counted from 1, after which the surface is tried at other depths."""
     sheets: SheetSettings = field(default_factory=SheetSettings)
     sheets_after: tuple[int, ...] = ()
-    """Passes, counted from 1, after which narrow hollows are tried without what may fill them. Not those of try_after: stopped in the second of two trials, a
+    """Passes, counted from 1, after which narrow hollows are tried without what may fill them. No preset does so
+    before whole builds say that it pays (docs/decisions/0003). Not those of try_after: stopped in the second of two trials, a
     build would repeat the first."""
     carve_after: tuple[int, ...] = (3,)
     """Passes, counted from 1, after which hollows are looked for: once, two fifths of the way. Each time right places sink as well, by chance; earlier,
