@@ -5,6 +5,7 @@ import os
 import socket
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import httpx
@@ -16,6 +17,7 @@ from test_rest import is_problem, left_on_disk, zipped
 from test_service import ServeProcess, capture, running
 
 from drgs_server import client_upload
+from drgs_server.api import incoming
 from drgs_server.client import Client, ServerError
 from drgs_server.settings import Limits
 from drgs_worker.store.database import CaptureRow, now
@@ -191,6 +193,26 @@ def test_what_came_before_the_connection_was_cut_is_kept(tmp_path: Path) -> None
             assert rest.status_code == 204 and rest.headers["Upload-Offset"] == "4000000", (rest.text, offset)
         upload = address.rpartition("/")[2]
         assert (server.service.context.directory.incoming / upload).read_bytes() == data
+
+
+def test_where_an_upload_is_waits_for_what_is_being_written(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    address = begin(service, 6)
+    half_written, go_on = threading.Event(), threading.Event()
+
+    def write_in_two(path: Path, at: int, part: bytes) -> None:
+        path.write_bytes(part[:3])
+        half_written.set()
+        assert go_on.wait(PATIENCE_SECONDS)
+        path.write_bytes(part)
+
+    monkeypatch.setattr(incoming, "_write", write_in_two)
+    with ThreadPoolExecutor(2) as pool:
+        sent = pool.submit(send, service, address, 0, b"abcdef")
+        assert half_written.wait(PATIENCE_SECONDS)
+        asked = pool.submit(offset_of, service, address)
+        assert not wait([asked], timeout=0.2).done
+        go_on.set()
+        assert sent.result().status_code == 204 and asked.result() == 6
 
 
 @pytest.mark.slow

@@ -73,7 +73,8 @@ def _filename(metadata: str) -> str:
 @router.head("/{upload_id}", dependencies=_tus, response_class=Response)
 async def read_offset(upload_id: str, context: Context) -> Response:
     """`Upload-Offset`: how much has come, and so where the next part begins."""
-    found = await run_in_threadpool(context.incoming.read, upload_id)
+    async with context.incoming.alone(upload_id):  # a file that is being written to has lengths in between
+        found = await run_in_threadpool(context.incoming.read, upload_id)
     where = {"Upload-Offset": str(found.offset), "Upload-Length": str(found.length)}
     return Response(headers=_SAID | where | {"Cache-Control": "no-store"})
 
