@@ -27,21 +27,20 @@ from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
 from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
 from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
-from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings, albedo_detail, divisions
+from drgs.reconstruct.fit.evidence.albedo_detail import RINGS, albedo_detail
 from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.surface.surface_passes import SurfaceFit
 from drgs.reconstruct.fit.surfels.fit_gaussians import drawn_object, gaussians_from_state
 from drgs.reconstruct.fit.surfels.fit_materials import gaussians_from_materials
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import gaussians_from_mesh_fit
-from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
+from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
-from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
-from drgs.reconstruct.geometry.divide_faces import DividedFaces, divided_binding, divided_faces
+from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians, points_from_binding
+from drgs.reconstruct.geometry.divide_faces import divided_binding
 from drgs.reconstruct.geometry.extract_mesh import mesh_report
 from drgs.reconstruct.geometry.face_surfels import radiating_surfels, surfels_on_faces_of
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -73,7 +72,6 @@ from drgs.render.intersect.horizon import find_horizons, stored_horizons
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import mesh_extent
 from drgs.scene.asset import Asset, save_asset
-from drgs.scene.binding import Binding
 from drgs.scene.certainty import Certainty
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
@@ -298,9 +296,10 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
     if built.settings.binding == "mesh":
         with timed("bind"):
             bind_settings = replace(built.preset.mesh_surfels, seed=seed)
-            on_faces = surfels_on_faces_of(surface.mesh)
+            under = surface.undivided_mesh
+            on_faces = surfels_on_faces_of(under)
             light = surface.state.parameters
-            bound = bind_stage(place.of(binding="mesh"), views, on_faces, surface.mesh, light, built.radius, bind_settings)
+            bound = bind_stage(place.of(binding="mesh"), views, on_faces, under, light, built.radius, bind_settings)
         yield "bind", None
 
     with timed("materials"):
@@ -315,10 +314,13 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         # Meshing anew rounds the box's edges, a little to either side.
         vertices = decoupled.state.parameters["vertices"]
         vertices.data = whole_or_within(built.settings.box, vertices.data)
-        fitted, environment = decoupled.mesh, Environment(environment_table(decoupled.state.parameters).detach())
-        # Faces moved once more with the materials; surfels stay where they are on them.
-        surfels, binding = surfels_on_faces_of(fitted) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=fitted))
-        mesh, binding, certainty = _detailed(views, decoupled, binding, built.preset.detail)
+        mesh, certainty = _detailed(views, decoupled)
+        under, environment = decoupled.undivided_mesh, Environment(environment_table(decoupled.state.parameters).detach())
+        # Faces moved once more with the materials; surfels stay where they are on them: one on each face of before the division.
+        surfels, binding = surfels_on_faces_of(under) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=under))
+        for times in range(decoupled.divided):
+            binding = divided_binding(binding, len(under.faces) * 4**times)
+        surfels = replace(surfels, centers=points_from_binding(binding, mesh.vertices, mesh.faces))
         surfels = radiating_surfels(surfels, binding, mesh, environment)
         asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh", certainty=certainty)
     return asset, surface_preview(decoupled, views.cameras)
@@ -360,34 +362,15 @@ def _horizons(mesh: TriangleMesh) -> UInt8[Tensor, "face 8"]:
 
 
 @torch.no_grad()
-def _detailed(views: Views, fit: SurfaceFit, binding: Binding, settings: DetailSettings) -> tuple[TriangleMesh, Binding, Certainty]:
-    """The fitted mesh with faces as small as the photographs' pixels and the albedo that they show; where surfels are on it; how certain it is."""
+def _detailed(views: Views, fit: SurfaceFit) -> tuple[TriangleMesh, Certainty]:
+    """The fitted mesh with the albedo that photographs show at each of its vertices; how certain it is."""
     mesh, parameters = fit.mesh, fit.state.parameters
     tracer, targets = build_tracer(mesh), view_targets(views, 1.0, mesh.vertices.device)
     sky = None if views.light_from_world is None else seen_sky(tracer)
     light_of = light_of_views(filter_environment(environment_table(parameters)), parameters["open_share"], mesh.albedo, sky)
     certainty = vertex_certainty(tracer, targets, light_of, parameters["metal"])
-    times = divisions(mesh, views.cameras, settings)
-    for _ in range(times):
-        divided = divided_faces(mesh.faces, len(mesh.vertices))
-        binding = divided_binding(binding, len(mesh.faces))
-        fields = {name: divided.carried(value) for name, value in vars(mesh).items() if name != "faces"}
-        mesh = TriangleMesh(**fields | {"faces": divided.faces, "normals": torch.nn.functional.normalize(fields["normals"], dim=-1)})
-        light_of = _carried_light(light_of, divided)
-        certainty = Certainty(**{name: divided.carried(value.float()).half() for name, value in vars(certainty).items()})
-    edges, rings = mesh_edges(mesh.faces), settings.rings * 4**times
-    albedo = albedo_detail(build_tracer(mesh), targets, light_of, edges, rings)
-    return replace(mesh, albedo=albedo), binding, certainty
-
-
-def _carried_light(light_of: LightOf, divided: DividedFaces) -> LightOf:
-    """The light around the mesh with divided faces."""
-
-    def carried(target: ViewTarget) -> MeshLight:
-        light = light_of(target)
-        return replace(light, open_share=divided.carried(light.open_share))
-
-    return carried
+    albedo = albedo_detail(tracer, targets, light_of, mesh_edges(mesh.faces), RINGS * 4**fit.divided)
+    return replace(mesh, albedo=albedo), certainty
 
 
 def _check(settings: BuildSettings) -> None:

@@ -9,13 +9,13 @@ from typing import Literal
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.densify import DensifySettings
-from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
 from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings
+from drgs.reconstruct.geometry.divide_faces import DivisionSettings
 from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, FULL_MESH, MeshSettings
 from drgs.render.records import SampleCounts
 
@@ -31,13 +31,12 @@ class Preset:
     mesh: MeshSettings
     surface: PassSettings = field(default_factory=PassSettings)
     materials: MeshMaterialSettings = field(default_factory=MeshMaterialSettings)
-    detail: DetailSettings = field(default_factory=DetailSettings)
     hollows: HollowSettings = field(default_factory=HollowSettings)
     mesh_surfels: MeshFitSettings = field(default_factory=MeshFitSettings)
     """For binding mesh: its fine-tuning."""
     materials_on: Literal["mesh", "surfels"] = "mesh"
-    """surfels: the mesh stays as it was extracted, and materials are fitted on surfels, as in the paper; then `surface`, `materials` and
-    `detail` are idle."""
+    """surfels: the mesh stays as it was extracted, and materials are fitted on surfels, as in the paper; then `surface` and `materials`
+    are idle."""
     surfel_materials: MaterialSettings = field(default_factory=MaterialSettings)
     """Of materials_on surfels. Bound to the mesh, that one has as many faces at most as surfels are allowed (fit.densify.budget)."""
 
@@ -49,10 +48,13 @@ PRESETS = {
         FitSettings(iterations=400, half_size_share=0.6, densify=DensifySettings(budget=12_000)),
         replace(FAST_MESH, resolution=160, face_limit=30_000),
         PassSettings(
-            3, SurfaceSettings(rounds=1, steps_a_round=50), replace(PASS_MESH, resolution=120, face_limit=30_000), carve_after=(1,)
+            3,
+            SurfaceSettings(rounds=1, steps_a_round=50),
+            replace(PASS_MESH, resolution=120, face_limit=30_000),
+            carve_after=(1,),
+            division=DivisionSettings(most_faces=0),
         ),
         MeshMaterialSettings(iterations=80, points_a_step=1024),
-        DetailSettings(most_faces=0),
         HollowSettings(RadianceGridSettings(levels=())),
         MeshFitSettings(iterations=150),
         surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
@@ -64,7 +66,6 @@ PRESETS = {
         FAST_MESH,
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carve_after=(2,)),
         MeshMaterialSettings(iterations=180),
-        DetailSettings(),
         HollowSettings(),
         MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
@@ -74,9 +75,14 @@ PRESETS = {
         1024,
         FitSettings(iterations=1400, half_size_share=0.25, most_pixels=320_000, densify=DensifySettings(budget=40_000)),
         FULL_MESH,
-        PassSettings(10, mesh=replace(PASS_MESH, resolution=320, face_limit=200_000), carve_after=(), try_after=(2, 4, 6, 8)),
+        PassSettings(
+            10,
+            mesh=replace(PASS_MESH, resolution=320, face_limit=200_000),
+            carve_after=(),
+            try_after=(2, 4, 6, 8),
+            division=DivisionSettings(most_faces=400_000),
+        ),
         MeshMaterialSettings(iterations=1200, rounds=3, points_a_step=4096),
-        DetailSettings(most_faces=400_000),
         HollowSettings(),
         MeshFitSettings(iterations=500),
         surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),

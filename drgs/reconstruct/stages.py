@@ -210,13 +210,14 @@ def surface_stage(
     kept = _kept(place, path, mesh.vertices.device)
     if kept is not None:
         restore_fit(kept, fit.state)
-        fit.faces, fit.index = kept["faces"], int(kept["pass"])
+        fit.faces, fit.index, fit.divided = kept["faces"], int(kept["pass"]), int(kept["divided"])
 
     def save() -> None:
-        write_tensors(path, fit_tensors(fit.state) | {"faces": fit.faces, "pass": torch.tensor(fit.index)}, place.identity)
+        numbers = {"pass": torch.tensor(fit.index), "divided": torch.tensor(fit.divided)}
+        write_tensors(path, fit_tensors(fit.state) | {"faces": fit.faces} | numbers, place.identity)
 
     def report(r: FitReport) -> None:
-        message = "; ".join(filter(None, (f"pass {fit.index + 1} of {settings.passes}, {len(fit.faces)} faces", fit.doing, fit.remark)))
+        message = "; ".join(filter(None, (f"{_pass_of(fit, settings)}, {len(fit.faces)} faces", fit.doing, fit.remark)))
         place.reporter.report("surface", r.iteration / r.iterations, message, r, lambda: surface_preview(fit, views.cameras), save)
 
     done = fit_surface_in_passes(views, fit, settings, radius, report, place.should_stop)
@@ -226,10 +227,14 @@ def surface_stage(
     return fit
 
 
+def _pass_of(fit: SurfaceFit, settings: PassSettings) -> str:
+    return f"pass {fit.index + 1} of {settings.passes}" if fit.index < settings.passes else "relief"
+
+
 def mesh_materials_stage(place: Workplace, views: Views, surface: SurfaceFit, radius: float, settings: MeshMaterialSettings) -> SurfaceFit:
     """fit_mesh_materials on the surface as it was fitted."""
     state = start_mesh_materials(surface.state, settings, radius)
-    fit = SurfaceFit(state, surface.faces, surface.index)
+    fit = SurfaceFit(state, surface.faces, surface.index, surface.divided)
     _checkpointed_fit(
         place,
         FitStage(

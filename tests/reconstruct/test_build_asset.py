@@ -19,7 +19,6 @@ from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, Progress, 
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.densify import DensifySettings
-from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings
@@ -29,6 +28,7 @@ from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
 from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings
 from drgs.reconstruct.geometry.bind_gaussians import points_from_binding
+from drgs.reconstruct.geometry.divide_faces import DivisionSettings
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen
 from drgs.reconstruct.presets import PRESETS, Preset
@@ -51,9 +51,10 @@ TINY = Preset(
         2,
         SurfaceSettings(rounds=1, steps_a_round=3, moves=MoveSettings(solves=1, share_rays=4)),
         replace(PASS_MESH, resolution=32, face_limit=500),
+        division=DivisionSettings(most_faces=2000),
+        relief_steps=2,
     ),
     materials=MeshMaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
-    detail=DetailSettings(most_faces=2000),
     hollows=HollowSettings(RadianceGridSettings(levels=((12, 4),), rays_a_step=64)),
     mesh_surfels=MeshFitSettings(iterations=6),
     surfel_materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
@@ -192,8 +193,9 @@ def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
     assert fractions == sorted(fractions) and fractions[0] == 0.0 and fractions[-1] == pytest.approx(1.0)
     stages = list(dict.fromkeys(p.stage for p in build.progress))
     assert stages == ["read", "fit", "mesh", "surface", "materials", "pack"]
-    last_pass = [p for p in build.progress if p.stage == "surface"][-1]
-    assert (last_pass.iteration, last_pass.iterations) == (6, 6) and last_pass.message.startswith("pass 2 of 2")
+    passes = {p.iteration: p for p in build.progress if p.stage == "surface"}
+    assert max(passes) == passes[8].iterations == 8
+    assert passes[6].message.startswith("pass 2 of 2") and passes[8].message.startswith("relief")
     last_fit = [p for p in build.progress if p.stage == "fit"][-1]
     assert (last_fit.iteration, last_fit.iterations) == (20, 20) and last_fit.psnr > 5
 

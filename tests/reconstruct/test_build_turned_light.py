@@ -11,7 +11,6 @@ from PIL import Image
 from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
-from drgs.reconstruct.fit.surface.surface_passes import PassSettings
 from drgs.reconstruct.presets import PRESETS
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
@@ -26,7 +25,7 @@ FEW_RAYS = WITHOUT_HOLLOWS.surface.surface.moves
 LONGER = replace(
     WITHOUT_HOLLOWS,
     fit=replace(WITHOUT_HOLLOWS.fit, iterations=40),
-    surface=PassSettings(1, SurfaceSettings(rounds=1, steps_a_round=20, moves=FEW_RAYS), WITHOUT_HOLLOWS.surface.mesh),
+    surface=replace(WITHOUT_HOLLOWS.surface, passes=1, surface=SurfaceSettings(rounds=1, steps_a_round=20, moves=FEW_RAYS)),
     materials=MeshMaterialSettings(iterations=20, moves=FEW_RAYS, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
 )
 

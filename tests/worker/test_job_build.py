@@ -10,13 +10,13 @@ import pytest
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.densify import DensifySettings
-from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings
 from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings
+from drgs.reconstruct.geometry.divide_faces import DivisionSettings
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.presets import PRESETS, Preset
 from drgs.reconstruct.progress import STAGE_SHARES, Progress
@@ -39,9 +39,10 @@ TINY = Preset(
         2,
         SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(solves=1, share_rays=4)),
         replace(PASS_MESH, resolution=32, face_limit=500),
+        division=DivisionSettings(most_faces=2000),
+        relief_steps=2,
     ),
     materials=MeshMaterialSettings(iterations=4, points_a_step=64, samples=SampleCounts(4, 2, 2)),
-    detail=DetailSettings(most_faces=2000),
     hollows=HollowSettings(RadianceGridSettings(levels=((12, 4),), rays_a_step=64)),
     mesh_surfels=MeshFitSettings(iterations=3),
 )

@@ -1,4 +1,7 @@
-"""Each face of a mesh becomes four, by the middles of its edges: the same surface, with room for finer values at its vertices."""
+"""Each face of a mesh becomes four, by the middles of its edges: the same surface, with room for finer values at its vertices.
+
+In: faces, what their vertices carry, what is bound to them. Out: the same on the divided faces, and how often photographs want them divided.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -7,6 +10,18 @@ from jaxtyping import Int
 from torch import Tensor
 
 from drgs.scene.binding import Binding
+from drgs.scene.camera import Camera
+from drgs.scene.mesh import TriangleMesh
+
+
+@dataclass(frozen=True)
+class DivisionSettings:
+    """How fine."""
+
+    edge_pixels: float = 1.5
+    """Faces are divided while their mean edge is longer [pixels of the photographs] ..."""
+    most_faces: int = 250_000
+    """... and there are no more than this afterwards."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +48,24 @@ def divided_faces(faces: Int[Tensor, "face 3"], vertices: int) -> DividedFaces:
     a, b, c = corners.unbind(1)
     parts = [(a, first, third), (b, second, first), (c, third, second), (first, second, third)]
     return DividedFaces(torch.cat([torch.stack(part, 1) for part in parts]).to(faces), between)
+
+
+def undivided_faces(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "coarse 3"]:
+    """Those that divided_faces made these of."""
+    count = len(faces) // 4
+    return torch.stack([faces[:count, 0], faces[count : 2 * count, 0], faces[2 * count : 3 * count, 0]], 1)
+
+
+def divisions(mesh: TriangleMesh, cameras: tuple[Camera, ...], settings: DivisionSettings) -> int:
+    """How often each face is to be divided into four."""
+    corners = mesh.vertices[mesh.faces.long()]
+    edge = float((corners - corners.roll(1, 1)).norm(dim=-1).mean())
+    middle = mesh.vertices.mean(0)
+    pixel = torch.stack([(camera.center_world.to(middle) - middle).norm() / camera.intrinsics[0, 0].to(middle) for camera in cameras])
+    times, faces = 0, len(mesh.faces)
+    while edge / 2**times > settings.edge_pixels * float(pixel.median()) and 4 * faces <= settings.most_faces:
+        times, faces = times + 1, 4 * faces
+    return times
 
 
 def divided_binding(binding: Binding, faces: int) -> Binding:

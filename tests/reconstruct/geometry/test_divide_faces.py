@@ -4,8 +4,9 @@ import torch
 import trimesh
 
 from drgs.reconstruct.geometry.bind_gaussians import points_from_binding
-from drgs.reconstruct.geometry.divide_faces import divided_binding, divided_faces
+from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_binding, divided_faces, divisions, undivided_faces
 from drgs.scene.binding import Binding
+from tests.render.closed_form_scenes import front_camera, sphere_mesh
 
 
 def test_the_divided_mesh_is_the_same_closed_surface() -> None:
@@ -18,6 +19,7 @@ def test_the_divided_mesh_is_the_same_closed_surface() -> None:
     torch.testing.assert_close(torch.tensor([new.area, new.volume]), torch.tensor([ball.area, ball.volume]))
     normals, old = torch.tensor(new.face_normals), torch.tensor(ball.face_normals)
     torch.testing.assert_close(normals, old.repeat(4, 1), atol=1e-5, rtol=0)  # each child in its parent's plane
+    assert torch.equal(undivided_faces(divided.faces), faces)
 
 
 def test_what_is_bound_stays_where_it_is() -> None:
@@ -38,3 +40,14 @@ def test_what_is_bound_stays_where_it_is() -> None:
     before = points_from_binding(binding, vertices, faces)
     after = points_from_binding(moved, divided.carried(vertices), divided.faces)
     torch.testing.assert_close(after, before, atol=1e-6, rtol=0)
+
+
+def test_faces_are_divided_until_they_are_as_small_as_pixels_or_too_many() -> None:
+    mesh = sphere_mesh(subdivisions=3)  # 1280 faces, edges of 0.15
+    camera = front_camera()
+    pixel = float(camera.center_world.norm() / camera.intrinsics[0, 0])
+    edge = 0.15 / pixel
+    assert divisions(mesh, (camera,), DivisionSettings(edge_pixels=2 * edge)) == 0
+    assert divisions(mesh, (camera,), DivisionSettings(edge_pixels=edge / 3)) == 2
+    assert divisions(mesh, (camera,), DivisionSettings(edge_pixels=edge / 3, most_faces=4 * 1280)) == 1
+    assert divisions(mesh, (camera,), DivisionSettings(edge_pixels=edge / 3, most_faces=0)) == 0

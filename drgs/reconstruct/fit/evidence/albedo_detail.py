@@ -7,15 +7,13 @@ all photographs that show the vertex has a closed form,
     a = (sum w A (photo - B) + HOLD W a0) / (sum w A^2 + HOLD W)        w = (cos / (photo + DARK))^2
 
 with a0 of stage 2 and W the median of sum w A^2. What of a / a0 varies slowly is divided out: it is split sum's error against traced light, or
-light that was not the same in all photographs, and stage 2 knows better. Faces are divided first, until edges are about as long as pixels are wide.
+light that was not the same in all photographs, and stage 2 knows better. Faces were divided before, until edges are about as long as pixels are wide.
 
 Where the surface lies in the wrong place, each photograph shows something else there, and its mean is no paint. So the same is solved from the
 photographs of one side and of the other alone: what both say counts, what they contradict does not.
 
 In: the mesh through its tracer, photographs, light. Out: albedo. Source: linear least squares; reliability of a mean by its halves (docs/sources.md: spearman1910); ours.
 """
-
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -31,8 +29,6 @@ from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.tracer import AbstractTracer
-from drgs.scene.camera import Camera
-from drgs.scene.mesh import TriangleMesh
 
 LEAST, MOST = 0.005, 0.995
 """Albedo, as logits_of_shares keeps it."""
@@ -44,30 +40,8 @@ SIDES = 4
 """Of a vertex's normal, about a frame of its own, from which photographs show it."""
 HALVES = (((0, 1), (2, 3)), ((0, 2), (1, 3)))
 """Sides whose photographs are compared."""
-
-
-@dataclass(frozen=True)
-class DetailSettings:
-    """How fine."""
-
-    edge_pixels: float = 1.5
-    """Faces are divided while their mean edge is longer [pixels of the photographs] ..."""
-    most_faces: int = 250_000
-    """... and there are no more than this afterwards."""
-    rings: int = 5
-    """Neighbourhoods of undivided faces over which slow changes are told from fast ones, and fast ones are compared."""
-
-
-def divisions(mesh: TriangleMesh, cameras: tuple[Camera, ...], settings: DetailSettings) -> int:
-    """How often each face is to be divided into four."""
-    corners = mesh.vertices[mesh.faces.long()]
-    edge = float((corners - corners.roll(1, 1)).norm(dim=-1).mean())
-    middle = mesh.vertices.mean(0)
-    pixel = torch.stack([(camera.center_world.to(middle) - middle).norm() / camera.intrinsics[0, 0].to(middle) for camera in cameras])
-    times, faces = 0, len(mesh.faces)
-    while edge / 2**times > settings.edge_pixels * float(pixel.median()) and 4 * faces <= settings.most_faces:
-        times, faces = times + 1, 4 * faces
-    return times
+RINGS = 5
+"""Neighbourhoods of undivided faces over which slow changes are told from fast ones, and fast ones are compared."""
 
 
 @torch.no_grad()

@@ -72,6 +72,8 @@ class SurfaceSettings:
     fall_from: float = 0.5
     """Share of the steps after which rates fall, by a cosine to a twentieth; 1: they do not."""
     moves: MoveSettings = field(default_factory=MoveSettings)
+    still: bool = False
+    """The surface stays where it is, and so do its metal and the light that arrives at it."""
     to_surface_end: float = 0.1
     """Of all passes: the share by which normals return to the surface's own after the last one (MoveSettings.to_surface after the others). Relief
     that is finer than faces is in the normals alone."""
@@ -153,7 +155,7 @@ class _Steps:
         self.surface = MovingSurface(views, faces, state)
 
     def end_round(self, done: int) -> None:
-        if done % self.settings.steps_a_round == 0:
+        if not self.settings.still and done % self.settings.steps_a_round == 0:
             self.move_surface()
 
     def move_surface(self) -> None:
@@ -163,7 +165,7 @@ class _Steps:
             self.surface.look_for_metal(self.targets, self.settings.moves)
 
     def step(self, iteration: int) -> StepLoss:
-        if iteration == 0:
+        if iteration == 0 and not self.settings.still:
             self.surface.look_for_texture(self.settings.moves)
             self.move_surface()
         target = self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]

@@ -2,7 +2,8 @@
 
 Between two passes the surface is sampled and meshed anew (remesh), and what its vertices carried is interpolated. Without it triangles fold
 where a hollow deepens, and a fold is a dent that no later solve removes: still_life, fast, 7 passes instead of 6 rounds, 28.1 -> 29.2 dB,
-mean distance of the mesh 1.53 -> 1.15 % of the radius (docs/decisions/0003-fitting.md).
+mean distance of the mesh 1.53 -> 1.15 % of the radius (docs/decisions/0003-fitting.md). After the last one faces are divided as finely as
+photographs show, and their normals and materials get some more steps.
 """
 
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from drgs.reconstruct.fit.surface.try_depths import TrialSettings, try_depths
 from drgs.reconstruct.fit.surface.try_sheets import SheetSettings, try_sheets
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
+from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces, divisions, undivided_faces
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.remesh import NothingEnclosed, remesh
@@ -49,6 +51,10 @@ class PassSettings:
     """Passes, counted from 1, after which narrow hollows are tried without what may fill them. No preset does so
     before whole builds say that it pays (docs/decisions/0003). Not those of try_after: stopped in the second of two trials, a
     build would repeat the first."""
+    division: DivisionSettings = field(default_factory=DivisionSettings)
+    """How fine faces are divided after the last pass."""
+    relief_steps: int = 70
+    """On divided faces: of normals, materials and light, while the surface stays where it is."""
     carve_after: tuple[int, ...] = (3,)
     """Passes, counted from 1, after which hollows are looked for: once, two fifths of the way. Each time right places sink as well, by chance; earlier,
     normals and materials are not what carving asks, and later too few passes are left to smooth what was carved (figures in docs/decisions/0003)."""
@@ -64,6 +70,8 @@ class SurfaceFit:
     """Of the state's vertices."""
     index: int = 0
     """Of the pass under way."""
+    divided: int = 0
+    """How often each face was divided, after the passes; the index is then their number."""
     doing: str = ""
     """What is under way besides the pass, in words."""
     remark: str = ""
@@ -73,6 +81,15 @@ class SurfaceFit:
     def mesh(self) -> TriangleMesh:
         """As it is now."""
         return mesh_from_surface_fit(self.state, self.faces)
+
+    @property
+    def undivided_mesh(self) -> TriangleMesh:
+        """The same with faces as the passes had them: its vertices come first in `mesh`."""
+        mesh, faces = self.mesh, self.faces
+        for _ in range(self.divided):
+            faces = undivided_faces(faces)
+        count = int(faces.max()) + 1 if self.divided else len(mesh.vertices)
+        return TriangleMesh(**{name: value[:count] for name, value in vars(mesh).items() if name != "faces"}, faces=faces)
 
 
 def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
@@ -93,6 +110,20 @@ def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
         fall_from=given.fall_from if last else 1.0,
         moves=replace(given.moves, to_surface=given.to_surface_end) if last else given.moves,
         seed=given.seed + index,
+    )
+
+
+def settings_of_relief(settings: PassSettings) -> SurfaceSettings:
+    """Of the steps on divided faces: they go on where the last pass ended."""
+    last = settings_of_pass(settings, settings.passes - 1)
+    return replace(
+        last,
+        rounds=1,
+        steps_a_round=settings.relief_steps,
+        weight_bend=last.weight_bend_end,
+        weight_smooth=last.weight_smooth_end,
+        still=True,
+        seed=last.seed + 1,
     )
 
 
@@ -182,14 +213,25 @@ def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> N
         else:
             values[name] = new.vertices if name == "vertices" else new.carried(value.detach())
     fit.faces = new.faces
-    _start_pass(fit, values, settings, radius)
+    _start_pass(fit, values, settings_of_pass(settings, fit.index + 1), radius)
 
 
-def _start_pass(fit: SurfaceFit, values: dict[str, Tensor], settings: PassSettings, radius: float) -> None:
-    """The pass after the one under way, from `values` of the fit's vertices."""
+def start_relief(fit: SurfaceFit, times: int, settings: PassSettings, radius: float) -> None:
+    """Divide each face `times` times into four and start the steps on them: relief and paint that are finer than the faces of the passes are in the
+    photographs, and the surface's shape need not be solved for them."""
+    values = {name: value.detach() for name, value in fit.state.parameters.items()}
+    for _ in range(times):
+        divided = divided_faces(fit.faces, len(values["vertices"]))
+        values = {name: value if name.startswith("environment_") else divided.carried(value) for name, value in values.items()}
+        fit.faces = divided.faces
+    fit.divided = times
+    _start_pass(fit, {name: value.clone() for name, value in values.items()}, settings_of_relief(settings), radius)
+
+
+def _start_pass(fit: SurfaceFit, values: dict[str, Tensor], own: SurfaceSettings, radius: float) -> None:
+    """The pass after the one under way with its `own` settings, from `values` of the fit's vertices."""
     values = leaves(values, frozen=NOT_FITTED)
     fit.index += 1
-    own = settings_of_pass(settings, fit.index)
     fit.state = FitState(values, make_optimizer(values, own.rates, radius), torch.Generator().manual_seed(own.seed + 2))
 
 
@@ -206,7 +248,7 @@ def carve_and_start_next_pass(fit: SurfaceFit, targets: list[ViewTarget], settin
         start_next_pass(fit, settings, radius)
     except NothingEnclosed as error:
         fit.remark = f"after pass {fit.index + 1} the mesh before was kept, for {error}"
-        _start_pass(fit, before, settings, radius)
+        _start_pass(fit, before, settings_of_pass(settings, fit.index + 1), radius)
 
 
 def fit_surface_in_passes(
@@ -217,7 +259,7 @@ def fit_surface_in_passes(
     report: Callable[[FitReport], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> bool:
-    """Run (or go on with) all passes; False: should_stop(), asked before each step, said so.
+    """Run (or go on with) all passes, and the relief after them; False: should_stop(), asked before each step, said so.
 
     Args:
         fit: start_surface on the mesh as it was extracted, or what an earlier call left. report: is told of the steps of all passes.
@@ -225,20 +267,24 @@ def fit_surface_in_passes(
     steps = settings.surface.iterations
     between = [(after, settings.trials.iterations) for after in settings.try_after]
     between += [(after, settings.sheets.iterations) for after in settings.sheets_after]
-    total = settings.passes * steps + sum(more for _, more in between)
+    total = settings.passes * steps + sum(more for _, more in between) + settings.relief_steps * (settings.division.most_faces > 0)
 
     def tell(done: int, r: FitReport) -> None:
         if report is not None:
             report(replace(r, iteration=done + r.iteration, iterations=total))
 
-    while True:
+    while fit.index < settings.passes:
         number = fit.index + 1
         done = fit.index * steps + sum(more for after, more in between if after < number)
         fit_surface(views, fit.mesh, fit.state, settings_of_pass(settings, fit.index), partial(tell, done), should_stop)
         if fit.state.iteration < steps:
             return False
-        if number >= settings.passes:
-            return True
+        if number == settings.passes:
+            times = divisions(fit.mesh, views.cameras, settings.division) if settings.relief_steps else 0
+            if not times:
+                return True
+            start_relief(fit, times, settings, radius)
+            break
         if number in settings.try_after and not move_to_tried_depths(
             fit, views, settings, radius, partial(tell, done + steps), should_stop
         ):
@@ -251,3 +297,6 @@ def fit_surface_in_passes(
         carves = number in settings.carve_after and views.light_from_world is None
         targets = view_targets(views, 1.0, fit.faces.device) if carves else []
         carve_and_start_next_pass(fit, targets, settings, radius)
+    relief = settings_of_relief(settings)
+    fit_surface(views, fit.mesh, fit.state, relief, partial(tell, total - relief.iterations), should_stop)
+    return fit.state.iteration >= relief.iterations

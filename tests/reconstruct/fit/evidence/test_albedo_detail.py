@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from drgs.reconstruct.fit.evidence.albedo_detail import DetailSettings, albedo_detail, divisions
+from drgs.reconstruct.fit.evidence.albedo_detail import albedo_detail
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.geometry.average_around import averaging_matrix
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -60,15 +60,3 @@ def test_what_no_photograph_shows_keeps_its_albedo() -> None:
     tables = filter_environment(light())
     found = albedo_detail(build_tracer(blurred), [], open_light(mesh, tables), mesh_edges(mesh.faces), RINGS)
     assert torch.equal(found, blurred.albedo)
-
-
-def test_faces_are_divided_until_they_are_as_small_as_pixels_or_too_many() -> None:
-    mesh = sphere_mesh(subdivisions=3)  # 1280 faces, edges of 0.15
-    tables = filter_environment(light())
-    cameras = tuple(target.camera for target in pictures(mesh, tables))
-    pixel = float((cameras[0].center_world.norm()) / cameras[0].intrinsics[0, 0])
-    edge = 0.15 / pixel
-    assert divisions(mesh, cameras, DetailSettings(edge_pixels=2 * edge)) == 0
-    assert divisions(mesh, cameras, DetailSettings(edge_pixels=edge / 3)) == 2
-    assert divisions(mesh, cameras, DetailSettings(edge_pixels=edge / 3, most_faces=4 * 1280)) == 1
-    assert divisions(mesh, cameras, DetailSettings(edge_pixels=edge / 3, most_faces=0)) == 0

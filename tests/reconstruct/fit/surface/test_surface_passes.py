@@ -1,5 +1,6 @@
 """Passes of the surface's fit: weights go on from pass to pass, and a sphere finds its size over two of them."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -18,6 +19,7 @@ from drgs.reconstruct.fit.surface.surface_passes import (
 )
 from drgs.reconstruct.fit.surface.try_depths import TriedDepths
 from drgs.reconstruct.fit.surface.try_sheets import TriedSheets
+from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.remesh import NothingEnclosed
 from drgs.scene.views import Views
@@ -49,6 +51,7 @@ def test_a_sphere_that_is_too_small_is_as_large_as_its_photographs_after_two_pas
         2,
         SurfaceSettings(rounds=1, steps_a_round=6, moves=MoveSettings(share_rays=4)),
         MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
+        relief_steps=0,
     )
     surfels = surfel_sphere(600, radius=SHRUNK * SPHERE_RADIUS, center=tuple(CENTER.tolist()))
     start = placed_sphere(SHRUNK)
@@ -63,6 +66,38 @@ def test_a_sphere_that_is_too_small_is_as_large_as_its_photographs_after_two_pas
 
 
 @pytest.mark.slow
+def test_relief_is_fitted_on_divided_faces_while_the_surface_stays_and_goes_on_where_it_was_stopped(tmp_path):
+    settings = PassSettings(
+        1,
+        SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)),
+        division=DivisionSettings(edge_pixels=1.0, most_faces=5120),
+        relief_steps=4,
+    )
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    start, views = placed_sphere(), painted_views(tmp_path)
+
+    def begun() -> SurfaceFit:
+        return SurfaceFit(start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS), start.faces)
+
+    fit, at_once, told = begun(), begun(), []
+    assert fit_surface_in_passes(views, fit, replace(settings, relief_steps=0), SPHERE_RADIUS)
+    assert (fit.index, fit.divided) == (0, 0) and torch.equal(fit.faces, start.faces)
+    coarse = fit.mesh
+    assert not fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, should_stop=lambda: (fit.divided, fit.state.iteration) == (1, 1))
+    assert (fit.index, fit.divided, fit.state.iteration) == (1, 1, 1)
+    assert fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, lambda r: told.append((r.iteration, r.iterations)))
+    assert told == [(4, 6), (5, 6), (6, 6)]
+    divided = divided_faces(start.faces, len(start.vertices))
+    assert torch.equal(fit.faces, divided.faces) and torch.equal(fit.mesh.vertices, divided.carried(coarse.vertices))
+    under = fit.undivided_mesh
+    assert torch.equal(under.faces, start.faces) and torch.equal(under.vertices, coarse.vertices)
+    between = divided.carried(fit.state.parameters["normals"][: len(start.vertices)].detach())
+    assert float((fit.state.parameters["normals"].detach() - between)[len(start.vertices) :].abs().max()) > 1e-3
+    assert fit_surface_in_passes(views, at_once, settings, SPHERE_RADIUS)
+    assert torch.equal(at_once.mesh.normals, fit.mesh.normals) and torch.equal(at_once.mesh.albedo, fit.mesh.albedo)
+
+
+@pytest.mark.slow
 def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tmp_path, monkeypatch: pytest.MonkeyPatch):
     settings = PassSettings(
         2,
@@ -70,6 +105,7 @@ def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tm
         MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
         carve_after=(),
         try_after=(1,),
+        relief_steps=0,
     )
     asked: list[int] = []
     homes: list[torch.Tensor] = []
