@@ -52,6 +52,8 @@ OTHERS = {
     ("benchmarks/_plot.py", 0.04): "the margin of a plot's axes",
     ("benchmarks/abuse.py", 0.99): "a percentile",
     ("benchmarks/measures/embossed_urn.py", 0.04): "half the width of a band of beads",
+    ("benchmarks/paper/character/body.py", 0.04): "radii of a character's parts",
+    ("benchmarks/paper/character/skeleton.py", 0.04): "places of a character's joints",
     ("benchmarks/service.py", 0.99): "a percentile",
     ("benchmarks/trials/uploads.py", 1e30): "a place far away",
     ("drgs/deform/mpm/conditions.py", 1e30): "the end of conditions that never end [s]",
