@@ -1,10 +1,11 @@
 """drgs2026's evidence as one command: its comparisons, on scenes with truth, beside drivers built as the others build theirs.
 
-    python -m benchmarks paper OUT --scenes DIR ... [--assets 'ASSETS/{scene}'] [--only WORD ...] [--quick] [--json]
+    python -m benchmarks paper OUT --scenes DIR|character ... [--assets 'ASSETS/{scene}'] [--only WORD ...] [--quick] [--json]
 
 For each scene: an asset (built, or that of --assets), every way bound to it (variants/), test views at rest, deformed views under the light of the
 photographs and under a new one, time and memory, and figures. OUT gets index.html, paper.md and their pictures in images/paper; cells/ has what is finished,
-one file a cell, so that a killed run goes on. --only takes ways ({ways}), parts ({parts})
+one file a cell, so that a killed run goes on. The scene `character` is ours: made, rigged and photographed on the spot (benchmarks/paper/character),
+and danced by its skeleton (figure dance). --only takes ways ({ways}), parts ({parts})
 and single figures ({figures}). --quick: drafts, few Gaussians, few rays, every second test view.
 """
 
@@ -12,12 +13,13 @@ import argparse
 import json
 import sys
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from benchmarks.measures.bench_scene import open_scene
 from benchmarks.measures.build_process import built_asset, cli_command
 from benchmarks.paper.cells import CellFolder, NotMade
+from benchmarks.paper.character.photograph import NAME, CaptureSettings, photograph
 from benchmarks.paper.figures import FIGURES, figure_cells
 from benchmarks.paper.harmonics import BakeSettings
 from benchmarks.paper.pages import write_pages
@@ -41,7 +43,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--assets", help="finished assets, {scene} in place of the scene's name; by default they are built")
     parser.add_argument("--only", nargs="+", metavar="WORD", default=[], choices=[*VARIANTS, *PARTS, *FIGURES])
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--preset", choices=list(PRESETS), help="of builds; by default full, draft with --quick")
+    parser.add_argument("--preset", choices=list(PRESETS), help="of builds; by default full (fast of the character), draft with --quick")
     parser.add_argument("--spp", type=int, help="rays a pixel of ways that trace them")
     parser.add_argument("--budget", type=int, help="Gaussians of ways that put them on faces of their own")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of builds")
@@ -57,10 +59,11 @@ def main(arguments: list[str]) -> None:
         scene = open_scene(folder)
         return SceneEvidence(scene, asset_of(given, folder, scene.name), cells, settings)
 
+    folders = [scene_folder(folder, cells) for folder in given.scenes]
     # Each scene's evidence anew for each part: what one has read is not another's memory.
-    document = {open_scene(folder).name: scene_tables(evidence(folder), variants, parts) for folder in given.scenes}
+    document = {open_scene(folder).name: scene_tables(evidence(folder), variants, parts) for folder in folders}
     wanted = [name for name in FIGURES if name in parts or "figures" in parts]
-    for folder, tables in zip(given.scenes, document.values(), strict=True):
+    for folder, tables in zip(folders, document.values(), strict=True):
         tables["figures"] = figure_cells(evidence(folder), variants, wanted)
     write_pages(given.out, document, variants)
     print(f"Wrote {given.out / 'index.html'} and {given.out / 'paper.md'}", file=sys.stderr)
@@ -82,6 +85,27 @@ def settings_of(given: argparse.Namespace) -> EvidenceSettings:
     return settings
 
 
+def scene_folder(given: Path, cells: CellFolder) -> Path:
+    """The folder itself; for the character's name, where no folder has it, OUT/scenes/character, which is made.
+
+    Raises:
+        ValueError: it is not made yet, and nothing is to be made.
+    """
+    if given != Path(NAME) or given.is_dir():
+        return given
+    folder, settings = cells.folder / "scenes" / NAME, CaptureSettings()
+
+    def make() -> dict:
+        photograph(folder, settings)
+        return {}
+
+    try:
+        cells.cell(f"{NAME}-capture", asdict(settings), make, [folder / "scene.json"])
+    except NotMade as error:
+        raise ValueError(f"{folder} is not there yet; expected a finished capture of the character, or no --finished") from error
+    return folder
+
+
 def asset_of(given: argparse.Namespace, folder: Path, name: str) -> Path:
     """The scene's asset, built where none is given.
 
@@ -96,7 +120,8 @@ def asset_of(given: argparse.Namespace, folder: Path, name: str) -> Path:
     work = given.out / "assets" / name
     if given.finished and not (work / "asset" / "asset.json").is_file():
         raise ValueError(f"{work} holds no finished asset of {name}; expected one, or --assets, or no --finished")
-    preset = given.preset or ("draft" if given.quick else "full")
+    # Of the character its motion is asked, which gains nothing from forty minutes.
+    preset = given.preset or ("draft" if given.quick else "fast" if name == NAME else "full")
     built_asset(cli_command(folder, work / "asset", preset, 0, given.device), work, {"preset": preset, "seed": 0})
     return work / "asset"
 

@@ -1,4 +1,4 @@
-"""The figures: what the tables' numbers look like. Each is one JPEG of a scene, and a cell that says what is on it; the strip has a film beside it.
+"""The figures: what the tables' numbers look like. Each is one JPEG of a scene, and a cell that says what is on it; what moves has a film beside it.
 
 In: a scene's evidence, and the pictures that the tables' cells left. Out: OUT/images/paper/SCENE_FIGURE.jpg and .mp4. All are on white, cut to the object,
 of the first camera that has a deformed truth.
@@ -17,6 +17,7 @@ from torch import Tensor
 from benchmarks.measures.bench_scene import has_true_maps, read_light, read_rgba, read_true_maps
 from benchmarks.measures.peak_memory import measured
 from benchmarks.paper.cells import NotMade
+from benchmarks.paper.dances import asked_of_dance, dance, rig_facts
 from benchmarks.paper.films import shares, write_film
 from benchmarks.paper.laws import laws, rgba_of
 from benchmarks.paper.sheets import Array, halved, object_window, sheet
@@ -156,9 +157,9 @@ def strip(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) 
     frames = [rgba_of(frame_of(evidence, [{"op": "deform", "map": analytic | {amount: value}}])) for value in values]
     pictures = [on_white(rgba) for rgba in frames]
     window = object_window([rgba[..., 3] for rgba in frames])
-    write_film([picture[window] for picture in pictures], path.with_suffix(FILM))
+    write_film([picture[window] for picture in pictures], path.with_suffix(".mp4"))
     sheet([[(f"{amount} {values[place]:.2f}", halved(pictures[place])) for place in STRIP]], path)
-    told: dict = {"caption": f"{name}, growing"}
+    told: dict = {"caption": f"{name}, growing", "film_shows": "there and back"}
     truths = [folder for folder, new in evidence.truths() if folder.parent.name == name and not new]
     if truths:
         truth = on_white(read_rgba(evidence.scene.folder / truths[0] / f"{camera_of(evidence).name}.png"))
@@ -232,37 +233,42 @@ FIGURES: dict[str, tuple[Figure, bool]] = {
     "strip": (strip, False),
     "matter": (matter, False),
     "laws": (laws, False),
+    "dance": (dance, False),
 }
 """By name, and whether the figure needs the scene's true maps."""
 COMPARISONS = ("comparison", "comparison_relit")
-FILM, FILMED = ".mp4", ("strip",)
-"""Figures with a film beside their picture, and its suffix."""
+BESIDE = {"strip": {"film": ".mp4"}, "dance": {"film": ".mp4", "curve": ".svg"}}
+"""What figures write beside their picture, and its suffix."""
 
 
 def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant], wanted: list[str]) -> dict[str, dict]:
     """The wanted figures, of those that the scene has truth for, by name: {"caption", "picture", ...}."""
     found = {}
-    for name, (figure, needs_maps) in FIGURES.items():
-        if name not in wanted:
+    for name, (figure, _) in FIGURES.items():
+        if name not in wanted or not has_truth_for(evidence, name):
             continue
-        if (needs_maps and not (has_true_maps(evidence.scene) and evidence.scene.training_light)) or not evidence.truths():
-            continue
-        if name == "strip" and amount_of(next(iter(evidence.deformations.values()))) is None:
-            continue
-        if name in COMPARISONS and not any(new is (name == "comparison_relit") for _, new in evidence.truths()):
-            continue
-        file = f"images/paper/{evidence.scene.name}_{name}.jpg"
-        path = evidence.cells.folder / file
-        film = {"film": str(Path(file).with_suffix(FILM))} if name in FILMED else {}
+        path = evidence.cells.folder / f"images/paper/{evidence.scene.name}_{name}.jpg"
+        files = {"picture": path} | {what: path.with_suffix(suffix) for what, suffix in BESIDE.get(name, {}).items()}
+        named = {what: str(file.relative_to(evidence.cells.folder)) for what, file in files.items()}
 
-        def make(figure: Figure = figure, path: Path = path, files: dict = {"picture": file} | film) -> dict:
+        def make(figure: Figure = figure, path: Path = path, named: dict = named) -> dict:
             with torch.no_grad():
                 told, cost = measured(lambda: figure(evidence, variants, path))
-            return told | files | {"cost": asdict(cost)}
+            return told | named | {"cost": asdict(cost)}
 
         asked = evidence.asked | ({"ways": [variant.name for variant in variants]} if name in COMPARISONS else {})
+        asked = asked_of_dance(evidence) if name == "dance" else asked
         with suppress(NotMade):
-            found[name] = evidence.cells.cell(
-                f"{evidence.scene.name}-figure-{name}", asked, make, [path, *(path.with_suffix(FILM) for _ in film)]
-            )
+            found[name] = evidence.cells.cell(f"{evidence.scene.name}-figure-{name}", asked, make, list(files.values()))
     return found
+
+
+def has_truth_for(evidence: SceneEvidence, name: str) -> bool:
+    """Whether the scene has what a figure is about."""
+    if name == "dance":
+        return rig_facts(evidence) is not None
+    if not evidence.truths() or (FIGURES[name][1] and not (has_true_maps(evidence.scene) and evidence.scene.training_light)):
+        return False
+    if name == "strip":
+        return amount_of(next(iter(evidence.deformations.values()))) is not None
+    return name not in COMPARISONS or any(new is (name == "comparison_relit") for _, new in evidence.truths())

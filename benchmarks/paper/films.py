@@ -1,10 +1,11 @@
-"""A deformation as a film: there, and back by the same pictures, so that it can be shown over and over without a jump.
+"""Pictures as films that can be shown over and over: a deformation there, and back by the same pictures, so that nothing jumps; or a clip as it is.
 
-In: pictures of the way there. Out: an MP4 (H.264).
+In: pictures, of a deformation those of the way there. Out: an MP4 (H.264).
 """
 
 import math
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +24,11 @@ def shares() -> list[float]:
     return [0.5 - 0.5 * math.cos(math.pi * place / (WAY_THERE - 1)) for place in range(WAY_THERE)]
 
 
-def write_film(pictures: list[Array], path: Path) -> None:
+def write_film(pictures: Iterable[Array], path: Path, back: bool = True) -> None:
     """
     Args:
-        pictures: (height, width, 3) sRGB 0..1, all of one size: the way there. An odd last row or column is left out.
+        pictures: (height, width, 3) sRGB 0..1, all of one size. An odd last row or column is left out.
+        back: they are the way there, and the way back follows.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -34,4 +36,4 @@ def write_film(pictures: list[Array], path: Path) -> None:
         for place, picture in enumerate(pictures):
             files.append(Path(folder) / f"{place:04d}.png")
             Image.fromarray((picture.clip(0, 1) * 255).round().astype(np.uint8)).save(files[-1])
-        write_video([*files, *files[-2:0:-1]], path, FPS)
+        write_video([*files, *(files[-2:0:-1] if back else [])], path, FPS)

@@ -1,6 +1,6 @@
 """Pictures side by side, each with its name above: what the figures are made of.
 
-In: pictures on white in 0..1. Out: one JPEG.
+In: pictures on white in 0..1. Out: one JPEG, or one picture of a film.
 """
 
 from pathlib import Path
@@ -18,8 +18,24 @@ MARGIN = 6
 """Around the object [pixels]."""
 
 
-def sheet(rows: list[list[tuple[str, Array]]], path: Path) -> None:
-    """Rows of (name, picture (height, width, 3)); pictures of a row have one height."""
+Rows = list[list[tuple[str, Array]]]
+"""(name, picture (height, width, 3)); pictures of a row have one height."""
+
+
+def sheet(rows: Rows, path: Path) -> None:
+    """Write it whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.part")
+    _page(rows).save(part, "JPEG", quality=QUALITY)
+    part.replace(path)
+
+
+def film_picture(rows: Rows) -> Array:
+    """(height, width, 3), 0..1."""
+    return np.asarray(_page(rows), np.float64) / 255
+
+
+def _page(rows: Rows) -> Image.Image:
     widths = [sum(picture.shape[1] + GAP for _, picture in row) for row in rows]
     heights = [row[0][1].shape[0] + TITLE + GAP for row in rows]
     page = Image.new("RGB", (max(widths), sum(heights)), "white")
@@ -31,10 +47,7 @@ def sheet(rows: list[list[tuple[str, Array]]], path: Path) -> None:
             page.paste(Image.fromarray((picture.clip(0, 1) * 255).round().astype(np.uint8)), (left, top + TITLE))
             left += picture.shape[1] + GAP
         top += height
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.part")
-    page.save(part, "JPEG", quality=QUALITY)
-    part.replace(path)
+    return page
 
 
 def object_window(alphas: list[Array]) -> tuple[slice, slice]:
