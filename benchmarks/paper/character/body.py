@@ -6,7 +6,7 @@ Lewiner et al. 2003 (marching cubes); the smooth minimum is the logarithm of the
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,17 +27,19 @@ class Matter:
     """Linear."""
     roughness: float
     metallic: float = 0.0
+    mottling: float = 0.3
+    """How much lighter and darker it is in places, as a share of its albedo: even paint does not say how deep it lies, and nothing worn is even."""
 
 
 MATTERS = {
-    "skin": Matter((0.58, 0.31, 0.2), 0.5),
-    "eyes": Matter((0.02, 0.015, 0.015), 0.2),
+    "skin": Matter((0.55, 0.29, 0.18), 0.5, mottling=0.2),
+    "eyes": Matter((0.02, 0.015, 0.015), 0.2, mottling=0.0),
     "tunic": Matter((0.05, 0.13, 0.42), 0.75),
     "stripe": Matter((0.75, 0.68, 0.5), 0.75),
     "trousers": Matter((0.42, 0.09, 0.05), 0.8),
     "leather": Matter((0.13, 0.06, 0.03), 0.4),
-    "steel": Matter((0.66, 0.64, 0.61), 0.28, 1.0),
-    "gold": Matter((0.9, 0.64, 0.28), 0.3, 1.0),
+    "steel": Matter((0.66, 0.64, 0.61), 0.28, 1.0, 0.12),
+    "gold": Matter((0.85, 0.6, 0.26), 0.3, 1.0, 0.12),
     "plume": Matter((0.6, 0.04, 0.04), 0.55),
 }
 
@@ -132,6 +134,8 @@ EYES = ((0.058, -0.128, 0.56), 0.026)
 """The left one's middle, and its radius."""
 STRIPES, STRIPE = 0.11, 0.3
 """From a stripe of the tunic to the next [world units], and how much of that it takes."""
+MOTTLES = ((71.0, 23.0, 59.0), (-47.0, 83.0, 31.0), (29.0, -61.0, 89.0))
+"""Waves whose sum is light and dark spots, some seven hundredths apart [1 / world units]."""
 MARGIN = 3
 """Cells of the grid around the parts."""
 RELAXATIONS = 5
@@ -262,6 +266,9 @@ def paint(vertices: Float[ndarray, "vertex 3"], nearest: Int[ndarray, "vertex"],
     x, z = np.abs(vertices[:, 0]), vertices[:, 2]
     # Stripes go around the trunk and around the arms.
     along = np.where(on_arm, x * DOWN_ARM[0] + z * DOWN_ARM[2], z)
+    mottling = np.array([matter.mottling for matter in own])
+    spots = (2 * np.sin(np.stack([x, vertices[:, 1], z], -1) @ np.array(MOTTLES).T).mean(1)).clip(-1, 1)
+    painted = replace(painted, albedo=painted.albedo * (1 + mottling * spots)[:, None])
     from_middle = STRIPES * np.abs((along / STRIPES) % 1 - 0.5)
     painted = painted.covered("stripe", (names == "tunic") * (0.5 + (0.5 * STRIPE * STRIPES - from_middle) / cell).clip(0, 1))
     middle, radius = EYES

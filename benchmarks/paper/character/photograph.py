@@ -21,7 +21,7 @@ from drgs.convert.import_mesh import import_mesh
 NAME = "character"
 FILE = f"{NAME}.glb"
 ENVIRONMENTS = Path(__file__).parents[3] / "examples" / "environments"
-LIGHT, NEW_LIGHT = "studio", "sunset"
+LIGHT, NEW_LIGHT = "sunset", "studio"
 """Of the photographs, and of the dance."""
 DISTANCE = 4.0
 """Of cameras from the origin [world units]."""
