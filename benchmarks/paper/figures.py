@@ -237,7 +237,7 @@ FIGURES: dict[str, tuple[Figure, bool]] = {
 }
 """By name, and whether the figure needs the scene's true maps."""
 COMPARISONS = ("comparison", "comparison_relit")
-BESIDE = {"strip": {"film": ".mp4"}, "dance": {"film": ".mp4", "curve": ".svg"}}
+BESIDE = {"strip": {"film": ".mp4"}, "laws": {"film": ".mp4"}, "dance": {"film": ".mp4", "curve": ".svg"}}
 """What figures write beside their picture, and its suffix."""
 
 

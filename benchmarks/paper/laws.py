@@ -1,10 +1,11 @@
 """One captured object dropped, twisted and torn as jelly, as metal (von Mises plasticity) and as sand, and how far its picture is from its particles.
 
-In: a scene's evidence. Out: a sheet of frames, a row for each matter, and for the fall of sand errors against every particle drawn as a ball of its volume:
+In: a scene's evidence. Out: a sheet of frames, a row for each matter; a film of all clips side by side; and for the fall of sand errors against every particle drawn as a ball of its volume:
 outline and surface by a float64 tracer of balls (drgs/reference/trace_spheres.py), the lit picture by the renderer itself on finer balls.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +15,9 @@ import trimesh
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from benchmarks.paper.sheets import Array, halved, object_window, sheet
+from benchmarks.paper.films import FPS as FILM_FPS
+from benchmarks.paper.films import write_film
+from benchmarks.paper.sheets import Array, film_picture, halved, object_window, sheet
 from benchmarks.paper.tables import SceneEvidence
 from benchmarks.paper.variant import AbstractVariant
 from drgs.deform.clip import ClipFrame
@@ -38,7 +41,10 @@ LAWS: dict[str, dict] = {
 """Matter by the name in the figure; metal's stiffness and yield are those of clay in units of its own weight, so that one sees it yield."""
 MOMENTS = {"drop": (0.15, 0.3, 0.6), "twist": (0.15, 0.3), "tear": (0.2, 0.4)}
 """Of each clip, when a picture is taken [s]."""
-FPS = 20
+FPS = 40
+"""Pictures of a simulated second; films show FILM_FPS of them in one, slower than it happens."""
+HELD = 12
+"""Pictures for which a film stays on the end."""
 SPEED = 1.0
 """At which the object meets the floor [sizes of the object/s]."""
 FOOT, HEAD = 0.25, 0.6
@@ -106,31 +112,67 @@ class Clips:
 
 
 def laws(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
-    """Point by point what drgs2026 shows of one law, of three: a clip of each as frames; sand is held against its particles."""
+    """Point by point what drgs2026 shows of one law, of three: a clip of each as frames and as a film; sand is held against its particles."""
     asset = replace(evidence.subject.asset, gaussians=None, binding=None, horizons=None)
     settings = evidence.settings
     camera = widened(min(evidence.scene.cameras, key=lambda seen: abs(elevation(seen) - ELEVATION)), WIDER, SIDE)
     clips = Clips(asset, camera, max(int(SHARE_OF_BUDGET * settings.budget), 1), settings.samples_per_pixel)
-    rows: list[list[tuple[str, Array]]] = []
-    outlines: list[Array] = []
+    shown: dict[tuple[str, str], list[Array]] = {}
     figures: dict[str, float] = {}
     for name, matter in LAWS.items():
-        row = []
         for action, moments in MOMENTS.items():
             simulation = Simulation(asset, clips.scene(matter, action))
-            for seconds in moments:
-                posed = clips.posed(simulation.at(seconds))
-                seen = clips.picture(posed)
+            shown[name, action] = []
+            for place in range(simulation.frame_count):
+                seen = clips.picture(clips.posed(simulation.at(place / FPS)))
                 rgba = rgba_of(seen)
-                outlines.append(halved(rgba[..., 3:])[..., 0])
-                row.append((f"{name}, {action} {seconds:g} s", halved(on_white(rgba))))
-                if name == "sand" and action == "drop":
+                shown[name, action].append(halved(np.concatenate([on_white(rgba), rgba[..., 3:]], -1)))
+                if name == "sand" and action == "drop" and place in map(picture_at, moments):
                     told = against_balls(clips, simulation, seen)
-                    figures |= {f"{word} at {seconds:g} s": value for word, value in told.items()}
-        rows.append(row)
-    window = object_window(outlines)
-    sheet([[(name, picture[window]) for name, picture in row] for row in rows], path)
-    return {"caption": f"dropped, twisted and torn as three kinds of matter, {clips.particles} particles", "figures": figures}
+                    figures |= {f"{word} at {place / FPS:g} s": value for word, value in told.items()}
+    rows = [
+        [
+            (f"{name}, {action} {seconds:g} s", shown[name, action][picture_at(seconds)])
+            for action, moments in MOMENTS.items()
+            for seconds in moments
+        ]
+        for name in LAWS
+    ]
+    window = object_window([picture[..., 3] for row in rows for _, picture in row])
+    sheet([[(title, picture[window][..., :3]) for title, picture in row] for row in rows], path)
+    write_film(film_pictures(shown), path.with_suffix(".mp4"), back=False)
+    caption = f"dropped, twisted and torn as three kinds of matter, {clips.particles} particles"
+    return {
+        "caption": caption,
+        "figures": figures,
+        "film_shows": f"the clips side by side, {FPS / FILM_FPS:.2g} times slower than they happen",
+    }
+
+
+def picture_at(seconds: float) -> int:
+    """Of a clip."""
+    return round(seconds * FPS)
+
+
+def film_pictures(shown: dict[tuple[str, str], list[Array]]) -> Iterator[Array]:
+    """All clips side by side, a row a matter; what has ended stays on its end.
+
+    Args:
+        shown: by matter and action, (height, width, 4) each: on white, and what is covered.
+    """
+    columns = {
+        action: object_window([picture[..., 3] for (_, own), clip in shown.items() if own == action for picture in clip])
+        for action in MOMENTS
+    }
+    tall = slice(min(rows.start for rows, _ in columns.values()), max(rows.stop for rows, _ in columns.values()))
+    for place in range(max(map(len, shown.values())) + HELD):
+
+        def titled(name: str, action: str, place: int = place) -> tuple[str, Array]:
+            clip = shown[name, action]
+            now = min(place, len(clip) - 1)
+            return f"{name}, {action} {now / FPS:.2f} s", clip[now][tall, columns[action][1], :3]
+
+        yield film_picture([[titled(name, action) for action in MOMENTS] for name in LAWS])
 
 
 def against_balls(clips: Clips, simulation: Simulation, seen: Frame) -> dict[str, float]:

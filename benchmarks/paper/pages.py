@@ -25,7 +25,7 @@ MISSING = """## What is not here yet
 - Deformed truth is of analytic maps (bend, twist), drawn by Mitsuba, and of one character that is our own, drawn by our renderer: photographs and truth of
   its dance are no independent witness of how light is computed, only of what capturing, building and moving lose. The other ways are not danced.
 - What is simulated is shown, and of sand it is said how far its picture is from balls of its particles' volume; no truth of a real fall is there. Wire
-  frames over Fig. 3 and films of what is simulated (strips stand for them) are missing.
+  frames over Fig. 3 are missing.
 - Learnable offset and opacity (Fig. 9) are a table of their own: `python -m benchmarks binding` ([results](../benchmarks/README.md)).
 - The other systems' geometry is ours, which is generous to them, and their barycentrics, scales, offsets and opacities are not learned through pictures, which
   is not. Harmonics are solved by least squares, not by tens of thousands of steps.

@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 import trimesh
 
-from benchmarks.paper.laws import LAWS, MOMENTS, SIDE, Clips, against_balls, balls
+from benchmarks.paper.laws import FPS, HELD, LAWS, MOMENTS, SIDE, Clips, against_balls, balls, film_pictures, picture_at
 from drgs.deform.simulate import Simulation
 from drgs.scene.asset import Asset
 from tests.deform.test_show_grains import looking_down
@@ -27,6 +28,29 @@ def test_balls_have_the_volume_and_the_materials_they_are_given(clips):
     solid = trimesh.Trimesh(made.vertices.double().numpy(), made.faces.numpy(), process=False)
     assert solid.volume == pytest.approx(4 / 3 * math.pi * (0.1**3 + 0.2**3), rel=1e-5)
     assert torch.equal(made.albedo.reshape(2, -1, 3)[1, 0], clips.asset.mesh.albedo[5])
+
+
+def test_a_film_shows_all_clips_at_once_and_stays_on_their_ends():
+    lengths = {action: picture_at(max(moments)) + 1 for action, moments in MOMENTS.items()}
+    assert lengths == {"drop": 0.6 * FPS + 1, "twist": 0.3 * FPS + 1, "tear": 0.4 * FPS + 1}
+
+    def clip(pictures: int) -> list[np.ndarray]:
+        """Grey that grows to black, the object 20 pixels wide on the right of the picture."""
+        shown = np.ones((pictures, 60, 80, 4)) * [1, 1, 1, 0]
+        shown[:, 20:40, 50:70, 3] = 1
+        shown[:, 20:40, 50:70, :3] = np.linspace(1, 0, pictures)[:, None, None, None]
+        return list(shown)
+
+    film = list(film_pictures({(name, action): clip(lengths[action]) for name in LAWS for action in MOMENTS}))
+    assert len(film) == max(lengths.values()) + HELD
+    height, width, _ = film[0].shape
+    assert len({picture.shape for picture in film}) == 1
+    assert width < 3 * 40 and height < 3 * 60, "cut to what is seen"
+    black = [[int(np.all(part[16:] < 0.02, axis=-1).sum()) for part in np.array_split(shown[: height // 3], 3, axis=1)] for shown in film]
+    # Black is what has ended: the twist first, then the tear, then the drop.
+    ended = [[count > 300 for count in counts] for counts in black]
+    assert ended[0] == [False] * 3 and ended[lengths["twist"] - 1] == [False, True, False]
+    assert ended[lengths["tear"] - 1] == [False, True, True] and ended[lengths["drop"] - 1] == ended[-1] == [True] * 3
 
 
 @pytest.mark.slow
