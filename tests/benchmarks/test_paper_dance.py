@@ -1,6 +1,7 @@
 """The character photographed, and the figure of its dance: what is drawn beside what, and what is drawn again after a kill."""
 
 import json
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from benchmarks.paper.character import rigged_glb
 from benchmarks.paper.character.dance import FPS
 from benchmarks.paper.character.photograph import FILE, CaptureSettings, photograph
 from benchmarks.paper.character.rigged_glb import CLIP
-from benchmarks.paper.command import scene_folder
+from benchmarks.paper.command import asset_of, scene_folder
 from benchmarks.paper.figures import figure_cells
 from benchmarks.paper.tables import EvidenceSettings, SceneEvidence
 from drgs.convert.import_mesh import import_mesh
@@ -121,3 +122,19 @@ def test_the_name_of_the_character_is_a_scene_that_is_made_once(tmp_path: Path, 
     assert [scene_folder(Path("character"), cells) for _ in range(2)] == 2 * [tmp_path / "scenes" / "character"]
     assert made == [tmp_path / "scenes" / "character"]
     assert scene_folder(tmp_path / "character", cells) == tmp_path / "character", "a folder of that name is itself"
+
+
+@pytest.mark.parametrize(
+    ("name", "quick", "chosen", "preset"),
+    [
+        ("character", False, None, "fast"), ("bunny", False, None, "full"), ("character", True, None, "draft"), ("character", True, "full", "full"),
+    ],
+)  # fmt: skip
+def test_the_character_is_built_fast_unless_told_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, quick: bool, chosen: str | None, preset: str
+):
+    built = []
+    monkeypatch.setattr("benchmarks.paper.command.built_asset", lambda command, work, what: built.append((work, what)))
+    given = Namespace(assets=None, out=tmp_path, finished=False, quick=quick, preset=chosen, device="cpu")
+    assert asset_of(given, tmp_path, name) == tmp_path / "assets" / name / "asset"
+    assert built == [(tmp_path / "assets" / name, {"preset": preset, "seed": 0})]
