@@ -37,7 +37,13 @@ def smooth_variance(variance: Tensor, coverage: Tensor, step: int) -> Tensor:
 
 
 def filter_level(
-    parts: tuple[Tensor, Tensor], variance: Tensor, gbuffer: GBuffer, footprint: float, step: int
+    parts: tuple[Tensor, Tensor],
+    variance: Tensor,
+    gbuffer: GBuffer,
+    footprint: float,
+    step: int,
+    sigma_luminance: float = SIGMA_LUMINANCE,
+    neighbour_variance: float = NEIGHBOUR_VARIANCE,
 ) -> tuple[tuple[Tensor, ...], Tensor]:
     """One round on demodulated parts (height, width, 3) with variances (height, width, 2); covered pixels only mean something."""
     row = {0: 0.375, 1: 0.25, 2: 0.0625}
@@ -55,10 +61,10 @@ def filter_level(
                 min=1e-12
             )
             shared = row[abs(dx)] * row[abs(dy)] * alike ** float(NORMAL_POWER) * coverage * (coverage > 0)
-            both = smooth + NEIGHBOUR_VARIANCE * shifted(smooth, *at)
+            both = smooth + neighbour_variance * shifted(smooth, *at)
             for k, part in enumerate(parts):
                 other = shifted(part, *at)
-                difference = (luminance(other) - luminance(part)).abs() / (SIGMA_LUMINANCE * both[..., k].sqrt() + 1e-6)
+                difference = (luminance(other) - luminance(part)).abs() / (sigma_luminance * both[..., k].sqrt() + 1e-6)
                 w = shared * torch.exp(-off - difference)
                 sums[k] += w[..., None] * other
                 sum_variance[..., k] += w * w * shifted(variance, *at)[..., k]

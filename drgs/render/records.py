@@ -59,8 +59,9 @@ class RenderSettings:
     skip_error: float = 0.0
     """Share of the cosine-weighted sky that may be taken for open without asking, at faces where the mesh provably blocks no more."""
     keep_light: bool = False
-    """A denoised picture of one pass after a camera's move may read diffuse light that is kept on the mesh (progressive/kept_light), and the
-    next pass begins anew without it. For whoever shows pictures to somebody who moves."""
+    """A denoised picture of one pass after a camera's move is a moving one: a mesh is seen through the middles of pixels, by a quarter of the
+    rays, and diffuse light is read that is kept on it (progressive/kept_light); the next pass begins anew with all rays. For whoever shows
+    pictures to somebody who moves."""
     seed: int = 0
     exposure: float = 0.0
     """[stops]."""
@@ -122,8 +123,10 @@ class RenderPlan:
     skips: tuple[Skip, ...]
     candidates: int = 1
     """Directions that each environment sample chooses among (environment_pool.py)."""
+    moving: bool = False
+    """A first pass by itself is shown while the camera moves (plan.PIXEL_MIDDLES, plan.FEWER_RAYS)."""
     kept_light: bool = False
-    """The first pass may read light that is kept on the mesh."""
+    """It may read light that is kept on the mesh."""
 
 
 # ---- what the camera sees ------------------------------------------------------------------------------------------------

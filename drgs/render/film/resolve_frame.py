@@ -31,7 +31,7 @@ def resolve_frame(state: FrameState) -> Frame:
     clock = time.perf_counter()
     settings, window = state.inputs.settings, state.window
     maps, radiance = mean_gbuffer(state), mean_radiance(state)
-    shown = denoise(radiance, maps, window.camera(state.inputs.camera), settings.denoise)
+    shown = denoise(radiance, maps, window.camera(state.inputs.camera), settings.denoise, state.is_moving)
     denoised = time.perf_counter()
     background = _background(state)
     linear = window.pad(shown.diffuse + shown.specular)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.render.integrate.environment_table import EnvironmentTable
-from drgs.render.integrate.plan import samples_per_pass
+from drgs.render.integrate.plan import moving_counts, samples_per_pass
 from drgs.render.intersect.ray_memory import RayMemory
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.frame_sums import FrameSums
@@ -75,12 +75,21 @@ class FrameState:
     kept_light: KeptLight | None
     """Diffuse light on the mesh that moving pictures read; None until the camera moves."""
     kept_samples: Float[Tensor, "pixel"] | None
-    """Rays behind the kept light that the one pass so far shows, 0 where it shows none; None where it was not asked. Such sums are not gone
-    on with: the next pass begins anew, with this picture as history."""
+    """Rays behind the kept light that the one pass so far shows, 0 where it shows none; None where it was not asked."""
     computed_parts: tuple[Part, ...]
     """For this frame; the others were taken over from the frame before (invalidate.py)."""
     seconds: dict[str, float]
     """Of each step, summed over passes."""
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the one pass so far is a moving picture. Such sums are not gone on with: the next pass begins anew, with this picture as history."""
+        return self.plan.moving and self.passes > 0
+
+    @property
+    def rays_a_pass(self) -> int:
+        """Of each pixel."""
+        return moving_counts(self.plan.counts).total if self.is_moving else samples_per_pass(self.inputs).total
 
     @cached_property
     def window(self) -> Window:
@@ -105,7 +114,7 @@ class FrameState:
     @property
     def samples(self) -> int:
         """Rays a pixel of the tiles that have had most passes."""
-        return self.passes * samples_per_pass(self.inputs).total
+        return self.passes * self.rays_a_pass
 
 
 def with_settings(state: FrameState, **settings: Any) -> FrameState:

@@ -7,7 +7,6 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from drgs.render.integrate.plan import samples_per_pass
 from drgs.render.progressive.frame_state import FrameState, GaussianView
 from drgs.render.progressive.frame_sums import FrameSums, SumArrays, sum_arrays
 from drgs.render.progressive.reproject import blend_history, remember
@@ -135,7 +134,7 @@ def frame_history(state: FrameState) -> History | None:
 
 def _own_samples(state: FrameState) -> Tensor:
     """(rows, columns, 2) behind the diffuse and the specular part of the frame's own mean."""
-    samples = (state.passes_in_window * samples_per_pass(state.inputs).total).float()
+    samples = (state.passes_in_window * state.rays_a_pass).float()
     if state.kept_samples is None:
         return torch.stack([samples, samples], -1)
     kept = state.in_window(state.kept_samples)

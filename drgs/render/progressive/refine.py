@@ -14,7 +14,7 @@ from torch import Tensor
 from drgs.render.integrate.choose_integrator import choose_integrator
 from drgs.render.integrate.environment_pool import ROUNDS_KEPT
 from drgs.render.integrate.integrator import IntegratorSettings
-from drgs.render.integrate.plan import without_kept_light
+from drgs.render.integrate.plan import at_rest, moving_counts
 from drgs.render.intersect.horizon import usable_horizons
 from drgs.render.intersect.ray_memory import RayMemory
 from drgs.render.intersect.trace_rays import over_slices
@@ -45,11 +45,10 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
     Args:
         consume: the given state is not needed any more, and its sums are added to instead of copied.
     """
-    if state.kept_samples is not None:
+    if state.is_moving:
         state = _begin_anew(state)
-    reads = state.plan.kept_light and state.kept_light is not None and state.passes == 0 and passes == 1 and state.plan.counts.total > 0
-    if not reads:
-        state = replace(state, plan=without_kept_light(state.plan))
+    if not (state.plan.moving and state.passes == 0 and passes == 1 and state.plan.counts.total > 0):
+        state = replace(state, plan=at_rest(state.plan))
     if not consume or state.passes == 0:  # sums of no pass share one zero
         state = _with_sums_of_its_own(state)
     while passes > 0 and bool(state.tiles.active.any()):
@@ -69,11 +68,11 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
 
 
 def _begin_anew(state: FrameState) -> FrameState:
-    """A frame whose one pass showed kept light, before its first pass: what it showed is history."""
+    """A frame whose one pass was a moving picture, before its first pass: what it showed is history."""
     inputs, covered = state.inputs, state.tiles.covered
     sums = no_sums(len(state.sums.weight), True, inputs.settings.split_indirect, covered.device)
     tiles = Tiles(covered, torch.zeros_like(state.tiles.passes), covered.clone())
-    plan = without_kept_light(state.plan)
+    plan = at_rest(state.plan)
     return replace(state, plan=plan, sums=sums, tiles=tiles, history=frame_history(state), reprojected=None, kept_samples=None)
 
 
@@ -105,7 +104,7 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
         state = _shade_and_read(state, primary)
     else:
         _shade_and_add(state, primary, index, state.first_rays if whole_first_pass else None)
-    if whole_first_pass and isinstance(state.view, MeshView):
+    if whole_first_pass and isinstance(state.view, MeshView) and not state.plan.moving:
         state = replace(state, view=MeshView(first_primary_points=primary))
     seconds = {"trace_primary": traced - started, "shade": time.perf_counter() - traced}
     return _pay_for_horizons(with_seconds(state, seconds), primary.starts.face, len(primary.points.pixel))
@@ -144,9 +143,10 @@ def _primary_points(state: FrameState, chosen: Tensor, index: int, whole_first_p
     if isinstance(view, GaussianView):
         everywhere = bool((chosen == state.tiles.covered).all())
         return view.primary_points if everywhere else points_in_tiles(view.primary_points, chosen, camera.width, state.inputs.first_pixel)
-    if whole_first_pass and view.first_primary_points is not None:
+    if whole_first_pass and view.first_primary_points is not None and not state.plan.moving:
         return view.first_primary_points
-    return trace_primary_points(state.traced.tracer, camera, state.inputs.settings.seed, index, pixels=_pixels(state, chosen))
+    seed, pixels = state.inputs.settings.seed, _pixels(state, chosen)
+    return trace_primary_points(state.traced.tracer, camera, seed, index, jitter=not state.plan.moving, pixels=pixels)
 
 
 def _pixels(state: FrameState, chosen: Tensor) -> Tensor:
@@ -183,7 +183,8 @@ def _shade_and_read(state: FrameState, primary: PrimaryPoints) -> FrameState:
 
 def _how(state: FrameState) -> IntegratorSettings:
     plan, settings = state.plan, state.inputs.settings
-    return IntegratorSettings(plan.counts, plan.bounces, settings.seed, plan.by_material, settings.split_indirect, plan.candidates)
+    counts = moving_counts(plan.counts) if plan.moving else plan.counts
+    return IntegratorSettings(counts, plan.bounces, settings.seed, plan.by_material, settings.split_indirect, plan.candidates)
 
 
 def _horizon(state: FrameState) -> Tensor | None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from drgs.render.integrate.environment_table import build_environment_table, environment_light
-from drgs.render.integrate.plan import plan_frame, samples_per_pass, scene_facts, without_kept_light
+from drgs.render.integrate.plan import at_rest, plan_frame, samples_per_pass, scene_facts
 from drgs.render.integrate.sample_rays import shading_points
 from drgs.render.intersect.horizon import Horizons
 from drgs.render.intersect.ray_memory import RayMemory
@@ -154,21 +154,33 @@ def _turned_and_bright(scene: PosedScene) -> tuple[float, float]:
     return scene.environment_rotation_degrees, scene.environment_intensity
 
 
+def _is_moving(inputs: FrameInputs, reuse: Reuse) -> bool:
+    """Of a picture that somebody sees while the camera moves."""
+    settings, changed = inputs.settings, reuse.invalidation.changed
+    moved = "camera" in changed and "shape" not in changed
+    shown = settings.keep_light and settings.skip and settings.denoise != "none"
+    is_plain = settings.counts is None and not settings.split_indirect and inputs.band is None
+    return moved and shown and is_plain and inputs.primary == "mesh"
+
+
 def _spend_samples(inputs: FrameInputs, empty_tiles: int, tiles: int, reuse: Reuse) -> RenderPlan:
-    before, reads = reuse.keeps("plan"), _may_read_kept_light(inputs, reuse)
+    before = reuse.keeps("plan")
     if before is not None:
-        return before.plan if reads else without_kept_light(before.plan)
+        return before.plan if reuse.keeps("sums") is not None else at_rest(before.plan)
     scene, settings = inputs.scene, inputs.settings
+    facts = scene_facts(scene, empty_tiles, tiles)
+    if len(scene.mesh.vertices) > MOST_VERTICES:
+        facts = replace(facts, diffuse_share=0.0)  # too many to keep light on
     return plan_frame(
         scene.environment,
         scene.environment_intensity,
         samples_per_pass(inputs),
         settings.bounces,
         settings.skip,
-        scene_facts(scene, empty_tiles, tiles),
+        facts,
         settings.skip_error,
         counts_given=settings.counts is not None,
-        kept_light=reads,
+        moving=_is_moving(inputs, reuse),
     )
 
 
@@ -230,15 +242,6 @@ def _covered_tiles(inputs: FrameInputs, view: GaussianView | MeshView, reuse: Re
 
 
 # ---- what is kept on the mesh --------------------------------------------------------------------------------------------
-
-
-def _may_read_kept_light(inputs: FrameInputs, reuse: Reuse) -> bool:
-    """Of a picture that somebody sees while the camera moves."""
-    settings, changed = inputs.settings, reuse.invalidation.changed
-    moved = "camera" in changed and "shape" not in changed
-    shown = settings.keep_light and settings.skip and settings.denoise != "none"
-    is_plain = settings.counts is None and not settings.split_indirect and inputs.band is None
-    return moved and shown and is_plain and inputs.primary == "mesh" and len(inputs.scene.mesh.vertices) <= MOST_VERTICES
 
 
 def _kept_light(inputs: FrameInputs, plan: RenderPlan, reuse: Reuse) -> KeptLight | None:

@@ -247,8 +247,8 @@ class Picture(AbstractPicture):
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        # A picture of kept light is not finished, however few samples are asked for.
-        return self.state.samples if self.state.kept_samples is None else min(self.state.samples, self.samples_target - 1)
+        # A moving picture is not finished, however few samples are asked for.
+        return min(self.state.samples, self.samples_target - 1) if self.state.is_moving else self.state.samples
 
     @property
     def samples_target(self) -> int:  # type: ignore[override]

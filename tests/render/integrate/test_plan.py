@@ -172,7 +172,7 @@ def test_kept_light_is_asked_where_enough_of_the_surface_is_diffuse(painted: flo
     metallic[: round(painted * len(metallic))] = 0
     facts = scene_facts(PosedScene(None, dataclasses.replace(mesh, metallic=metallic), sunny_sky()))
     assert facts.diffuse_share == pytest.approx(painted, abs=2e-3)
-    plan = plan_frame(constant_sky(), 1.0, SampleCounts(2, 1, 1), 0, True, facts, kept_light=True)
+    plan = plan_frame(constant_sky(), 1.0, SampleCounts(2, 1, 1), 0, True, facts, moving=True)
     assert plan.kept_light == asks
 
 

@@ -125,7 +125,7 @@ def test_rays_go_where_fewest_went_and_stop_at_a_bound() -> None:
     everything = vertices_to_light(kept, wanted, 1 << 20)
     assert bool((rounds[everything] < MOST_ROUNDS).all()) and len(everything) == int((wanted & (rounds < MOST_ROUNDS)).sum())
     assert len(vertices_to_light(kept, wanted, 0)) == 0
-    assert rays_to_keep(32, 100, 0) == 1600 and rays_to_keep(32, 0, 100) == 200 and rays_to_keep(4, 100, 100) == 250
+    assert rays_to_keep(32, 100, 0) == 3200 and rays_to_keep(32, 0, 100) == 200 and rays_to_keep(4, 100, 100) == 450
 
 
 # ---- where it is read ----------------------------------------------------------------------------------------------------
@@ -213,10 +213,10 @@ def test_points_without_their_diffuse_part_shine_as_before() -> None:
     assert not bool(specular.diffuse.any()) and float(whole.diffuse.mean()) > 0.05
 
 
-def test_a_point_that_is_read_pays_three_sixteenths_for_its_gloss() -> None:
-    assert specular_counts(SampleCounts(16, 8, 8)) == SampleCounts(0, 3, 3)
+def test_a_point_that_is_read_pays_three_eighths_for_its_gloss() -> None:
+    assert specular_counts(SampleCounts(8, 4, 4)) == SampleCounts(0, 3, 3)
     assert specular_counts(SampleCounts(2, 1, 1)) == SampleCounts(0, 1, 1)
-    assert specular_counts(SampleCounts(24, 8, 0)) == SampleCounts(0, 6, 0)
+    assert specular_counts(SampleCounts(12, 4, 0)) == SampleCounts(0, 6, 0)
 
 
 # ---- moving pictures -----------------------------------------------------------------------------------------------------

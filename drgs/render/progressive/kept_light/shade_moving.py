@@ -19,13 +19,13 @@ from drgs.render.progressive.kept_light.read_light import READ, LightThere, read
 from drgs.render.records import PrimaryPoints, SampleCounts, ShadedPoints, ShadingPoints
 from drgs.render.visible.points_at import points_at
 
-SPENT_FIRST, LEAST_FIRST = 1 / 2, 2.0
-"""Rays that go to kept light for each point that is not read, as a share of its own; and at least."""
+SPENT_FIRST = 1
+"""Rays that go to kept light for each point that is not read, as a share of its own."""
 SPENT_LATER, LEAST_LATER = 1 / 16, 0.5
-"""The same for each point that is read."""
-SPECULAR = 3 / 16
+"""The same for each point that is read; and at least."""
+SPECULAR = 3 / 8
 """Rays of a point that is read, as a share of one that is not, at least two: its specular part is a fraction of its light (LEAST_DIFFUSE), and
-with these rays the whole is still known no worse than before (docs/performance.md)."""
+with these rays the whole is still known no worse than with all (docs/performance.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def rays_to_keep(rays_a_point: int, traced: int, read: int) -> int:
     Args:
         traced: points that are not read. read: those that are.
     """
-    return int(max(SPENT_FIRST * rays_a_point, LEAST_FIRST) * traced + max(SPENT_LATER * rays_a_point, LEAST_LATER) * read)
+    return int(SPENT_FIRST * rays_a_point * traced + max(SPENT_LATER * rays_a_point, LEAST_LATER) * read)
 
 
 def only_specular(points: ShadingPoints) -> ShadingPoints:

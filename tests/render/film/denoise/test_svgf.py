@@ -8,7 +8,7 @@ import torch
 from drgs.reference import denoise as reference
 from drgs.reference.denoise import reflectances
 from drgs.render.film.denoise import denoise
-from drgs.render.film.denoise.svgf import denoise_svgf, filter_pixels, filter_sixteen_pixels, levels_for
+from drgs.render.film.denoise.svgf import MOVING, FilterSettings, denoise_svgf, filter_pixels, filter_sixteen_pixels, levels_for
 from drgs.render.records import DemodulatedLight, GBuffer, Radiance, RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.render.visible.trace_primary import trace_primary
@@ -27,19 +27,22 @@ def noisy_radiance(gbuffer: GBuffer, deviation: float) -> Radiance:
     return Radiance(*parts, variances[0], torch.ones(size), 1, *variances)
 
 
-def test_kernel_filters_as_the_reference_does(device: str) -> None:
+@pytest.mark.parametrize("moving", [False, True])
+def test_kernel_filters_as_the_reference_does(moving: bool, device: str) -> None:
     gbuffer = trace_primary(sphere_mesh(3), CAMERA)
     noisy = noisy_radiance(gbuffer, 0.3)
     there = GBuffer(**{f.name: getattr(gbuffer, f.name).to(device) for f in dataclasses.fields(gbuffer)})
     values = {f.name: getattr(noisy, f.name) for f in dataclasses.fields(noisy)}
     moved = Radiance(**{k: v.to(device) if isinstance(v, torch.Tensor) else v for k, v in values.items()})
-    ours = denoise_svgf(moved, there, CAMERA)
+    ours = denoise(moved, there, CAMERA, "svgf", moving)
+    settings = MOVING if moving else FilterSettings(levels_for(moved.samples))
     factors = [f.double() for f in reflectances(gbuffer)]
     exact = GBuffer(**{f.name: getattr(gbuffer, f.name).double() for f in dataclasses.fields(gbuffer)})
     parts = (noisy.diffuse.double() / factors[0], noisy.specular.double() / factors[1])
     variance = torch.full((40, 40, 2), 0.3**2, dtype=torch.float64)
-    for level in range(levels_for(moved.samples)):
-        parts, variance = reference.filter_level(parts, variance, exact, 1 / float(CAMERA.intrinsics[0, 0]), 1 << level)
+    sigmas = settings.sigma_luminance, settings.neighbour_variance
+    for level in range(settings.levels):
+        parts, variance = reference.filter_level(parts, variance, exact, 1 / float(CAMERA.intrinsics[0, 0]), 1 << level, *sigmas)
     covered = gbuffer.coverage > 0
     torch.testing.assert_close(ours.diffuse.cpu()[covered].double(), (parts[0] * factors[0])[covered], atol=1e-4, rtol=1e-3)
     torch.testing.assert_close(ours.specular.cpu()[covered].double(), (parts[1] * factors[1])[covered], atol=1e-4, rtol=1e-3)
@@ -52,7 +55,9 @@ def test_sixteen_pixels_at_once_are_the_pixels_one_by_one(size: int) -> None:
     light = DemodulatedLight(torch.rand(size, size, 3), torch.rand(size, size, 3), 0.1 * torch.rand(size, size, 2))
     covered = gbuffer.coverage > 0
     footprint = 1 / float(camera.intrinsics[0, 0])
-    one_by_one, at_once = (filter_all(light, gbuffer, footprint, 5) for filter_all in (filter_pixels, filter_sixteen_pixels))
+    one_by_one, at_once = (
+        filter_all(light, gbuffer, footprint, FilterSettings(5)) for filter_all in (filter_pixels, filter_sixteen_pixels)
+    )
     for name in ("diffuse", "specular", "variance"):
         torch.testing.assert_close(getattr(one_by_one, name)[covered], getattr(at_once, name)[covered], atol=1e-5, rtol=1e-4)
 

@@ -1,0 +1,132 @@
+"""Pictures of a moving camera: what they leave out is named, errs no more, ends with the movement, and can be switched off."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.integrate.plan import FEWER_RAYS, KEPT_LIGHT, PIXEL_MIDDLES, moving_counts
+from drgs.render.progressive.frame_state import FrameState
+from drgs.render.progressive.refine import refine_frame
+from drgs.render.progressive.start_frame import start_frame
+from drgs.render.records import Frame, RenderSettings, SampleCounts
+from drgs.render.visible.trace_primary import trace_primary
+from drgs.scene.camera import Camera
+from drgs.scene.environment import Environment
+from drgs.scene.mesh import TriangleMesh
+from drgs.scene.posed_scene import PosedScene
+from tests.render.closed_form_scenes import front_camera, on_device, sphere_mesh, sunny_sky, two_spheres
+
+SETTINGS = RenderSettings(samples_per_pass=16, denoise="svgf", keep_light=True)
+METAL = two_spheres(roughness=0.4, metallic=1.0)
+LEFT_OUT = {PIXEL_MIDDLES, FEWER_RAYS, KEPT_LIGHT}
+
+
+def scene_of(mesh: TriangleMesh = METAL) -> PosedScene:
+    sky = sunny_sky(sun=20.0)
+    return PosedScene(None, mesh, Environment(sky.radiance.to(mesh.vertices.device)))
+
+
+def cameras(count: int, device: str = "cpu") -> list[Camera]:
+    """That come nearer."""
+    return [front_camera(48, distance=8 - 0.05 * k).to(device) for k in range(count)]
+
+
+def moved_through(scene: PosedScene, path: list[Camera], settings: RenderSettings = SETTINGS) -> FrameState:
+    state = None
+    for camera in path:
+        state = refine_frame(start_frame(scene, camera, settings, previous=state))
+    assert state is not None
+    return state
+
+
+def assert_same_sums(a: FrameState, b: FrameState) -> None:
+    for name, sums in vars(a.sums).items():
+        assert sums is None or torch.equal(getattr(b.sums, name), sums), name
+
+
+def bumpy_metal() -> TriangleMesh:
+    """Normals that turn within a pixel, as those of built assets do."""
+    mesh = sphere_mesh(5, roughness=0.3, metallic=1.0)
+    turned = mesh.normals + 0.1 * torch.randn(mesh.normals.shape, generator=torch.Generator().manual_seed(1))
+    return dataclasses.replace(mesh, normals=torch.nn.functional.normalize(turned, dim=-1))
+
+
+def error(shown: Frame, truth: Frame) -> float:
+    inside = (truth.gbuffer.coverage == 1) & (shown.gbuffer.coverage == 1)
+    difference = (shown.radiance_linear - truth.radiance_linear)[inside].square()
+    return float((difference / (truth.radiance_linear[inside].square() + 1e-2)).mean())
+
+
+@pytest.mark.slow
+def test_a_moving_picture_of_metal_errs_less_with_a_quarter_of_its_rays(device: str) -> None:
+    scene, path = scene_of(on_device(bumpy_metal(), device)), cameras(8, device)
+    moving, traced = (resolve_frame(moved_through(scene, path, dataclasses.replace(SETTINGS, keep_light=keep))) for keep in (True, False))
+    truth = resolve_frame(refine_frame(start_frame(scene, path[-1], RenderSettings(samples_per_pass=16, seed=5)), 64))
+    assert moving.metadata["samples"] == 4 and traced.metadata["samples"] == 16
+    assert error(moving, truth) < error(traced, truth)
+
+
+def test_what_a_moving_picture_leaves_out_is_named_and_a_first_picture_leaves_nothing() -> None:
+    scene, path = scene_of(), cameras(3)
+    first, moving = moved_through(scene, path[:1]), moved_through(scene, path)
+    assert not first.is_moving and not LEFT_OUT & set(first.plan.skips)
+    assert moving.is_moving and LEFT_OUT & set(moving.plan.skips) == {PIXEL_MIDDLES, FEWER_RAYS}
+    named = [skip["what"] for skip in resolve_frame(moving).metadata["skipped"]]
+    assert PIXEL_MIDDLES.what in named and FEWER_RAYS.what in named
+    few = moved_through(scene, path, dataclasses.replace(SETTINGS, samples_per_pass=4))
+    assert few.is_moving and LEFT_OUT & set(few.plan.skips) == {PIXEL_MIDDLES}
+
+
+def test_a_moving_picture_sees_what_lies_in_the_middle_of_each_pixel() -> None:
+    scene, path = scene_of(), cameras(3)
+    shown, middles = resolve_frame(moved_through(scene, path)).gbuffer, trace_primary(scene.mesh, path[-1])
+    assert torch.equal(shown.coverage, middles.coverage)
+    torch.testing.assert_close(shown.position_world, middles.position_world)
+
+
+def test_a_picture_at_rest_holds_nothing_of_the_moving_one() -> None:
+    """Its sums are, to the bit, those of a frame that was begun there."""
+    scene, path = scene_of(), cameras(4)
+    moving, fresh = moved_through(scene, path), refine_frame(start_frame(scene, path[-1], SETTINGS), 3)
+    rested = refine_frame(refine_frame(moving), 2)
+    assert rested.passes == 3 and not rested.is_moving and not LEFT_OUT & set(rested.plan.skips)
+    assert_same_sums(fresh, rested)
+    # What the moving picture showed is worth something until the frame has samples of its own.
+    assert rested.reprojected is not None and float(rested.reprojected.samples.max()) > 0
+
+
+def test_an_edit_of_what_a_moving_picture_shows_is_traced_with_all_rays() -> None:
+    scene, path = scene_of(), cameras(3)
+    edited = dataclasses.replace(scene, mesh=dataclasses.replace(scene.mesh, albedo=0.5 * scene.mesh.albedo))
+    for changed in (edited, dataclasses.replace(scene, environment_rotation_degrees=40.0)):
+        state = refine_frame(start_frame(changed, path[-1], SETTINGS, previous=moved_through(scene, path)))
+        assert not state.is_moving and not LEFT_OUT & set(state.plan.skips)
+        assert_same_sums(refine_frame(start_frame(changed, path[-1], SETTINGS)), state)
+
+
+def test_a_moving_picture_goes_on_being_one_where_only_its_exposure_changes() -> None:
+    scene, path = scene_of(), cameras(3)
+    moving = moved_through(scene, path)
+    brighter = start_frame(scene, path[-1], dataclasses.replace(SETTINGS, exposure=1.0), previous=moving)
+    assert brighter.is_moving and brighter.samples == 4
+    assert_same_sums(moving, brighter)
+
+
+@pytest.mark.parametrize("change", [{"skip": False}, {"denoise": "none"}, {"split_indirect": True}, {"counts": SampleCounts(8, 4, 4)}])
+def test_without_skips_and_where_all_rays_are_wanted_no_picture_is_a_moving_one(change: dict) -> None:
+    scene, path, settings = scene_of(), cameras(3), dataclasses.replace(SETTINGS, **change)
+    state, without = (moved_through(scene, path, dataclasses.replace(settings, keep_light=keep)) for keep in (True, False))
+    assert not state.is_moving and not LEFT_OUT & set(state.plan.skips)
+    assert_same_sums(without, state)
+
+
+def test_a_quarter_of_the_rays_is_of_all_strategies_that_had_any() -> None:
+    assert moving_counts(SampleCounts(16, 8, 8)) == SampleCounts(4, 2, 2)
+    assert moving_counts(SampleCounts(0, 24, 8)) == SampleCounts(0, 6, 2)
+    assert moving_counts(SampleCounts(24, 8, 0)) == SampleCounts(6, 2, 0)
+    assert moving_counts(SampleCounts(2, 1, 1)) == SampleCounts(2, 1, 1)
+    assert moving_counts(SampleCounts(4, 2, 2)) == SampleCounts(2, 1, 1)
+    assert moving_counts(SampleCounts(1, 1, 0)) == SampleCounts(1, 1, 0)
+    assert moving_counts(SampleCounts(0, 0, 0)).total == 0
