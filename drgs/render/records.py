@@ -5,9 +5,12 @@ rays leave them and meet others (Rays, Hits, TracedRays); what they bring is sum
 helps (History, Reprojected); sums become a picture (Radiance, Frame). A frame between two passes is progressive/frame_state.py's.
 """
 
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -315,10 +318,26 @@ class Frame:
     rgba_srgb: Float[Tensor, "height width 4"]
     """Straight alpha, sRGB, 0..1."""
     radiance_linear: Float[Tensor, "height width 3"]
-    gbuffer: GBuffer
-    radiance: Radiance
+    surface_in_window: GBuffer
+    """Of the part of the image that shows something, or of all of it."""
+    light_in_window: Radiance
+    pad_fn: Callable[[Tensor, float], Tensor]
+    """From a map of that part, and what stands around it, to one of the whole image. Most who show a picture never ask for its maps."""
     metadata: dict = field(default_factory=dict)
     """Plain JSON: samples, seconds per step, what was skipped and why."""
+
+    @cached_property
+    def gbuffer(self) -> GBuffer:
+        """The whole image's."""
+        maps = {name: self.pad_fn(values, torch.inf if name == "depth" else 0.0) for name, values in vars(self.surface_in_window).items()}
+        return GBuffer(**maps)
+
+    @cached_property
+    def radiance(self) -> Radiance:
+        """The whole image's."""
+        light = self.light_in_window
+        maps: dict[str, Any] = {name: self.pad_fn(values, 0.0) for name, values in vars(light).items() if isinstance(values, Tensor)}
+        return replace(light, **maps)
 
     def __repr__(self) -> str:
         return f"Frame of {self.rgba_srgb.shape[1]}x{self.rgba_srgb.shape[0]} pixels"

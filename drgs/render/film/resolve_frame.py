@@ -4,8 +4,7 @@ All but the last step happens in the window around the tiles that show something
 """
 
 import time
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import asdict
 
 import torch
 import warp as wp
@@ -18,8 +17,7 @@ from drgs.render.integrate.environment_table import EnvironmentLight, lookup_rad
 from drgs.render.progressive.converge import frame_errors
 from drgs.render.progressive.frame_state import FrameState, GaussianView
 from drgs.render.progressive.mean_radiance import mean_gbuffer, mean_radiance
-from drgs.render.records import Frame, GBuffer, Radiance
-from drgs.render.visible.image_tiles import Window
+from drgs.render.records import Frame
 from drgs.scene.camera import world_from_pixel
 from drgs.warp_torch import launch, warp_array, warp_device
 
@@ -39,9 +37,9 @@ def resolve_frame(state: FrameState) -> Frame:
         rgba = window.pad(tonemap(window.crop(linear), maps.coverage, settings.exposure, curve=settings.tone_curve))
     else:
         rgba = tonemap(linear, window.pad(maps.coverage), settings.exposure, background, settings.tone_curve)
-    gbuffer = state.view.gbuffer if isinstance(state.view, GaussianView) else _padded_gbuffer(maps, window)
+    surface = state.view.gbuffer if isinstance(state.view, GaussianView) else maps
     seconds = {**state.seconds, "denoise": denoised - clock, "resolve": time.perf_counter() - denoised}
-    return Frame(rgba, linear, gbuffer, _padded_radiance(shown, window), _metadata(state, seconds))
+    return Frame(rgba, linear, surface, shown, window.pad, _metadata(state, seconds))
 
 
 def linear_picture(state: FrameState) -> Tensor:
@@ -68,7 +66,7 @@ def _metadata(state: FrameState, seconds: dict[str, float]) -> dict:
         "skipped": [asdict(skip) for skip in state.plan.skips],
         "horizons": _horizons(state),
         "made": list(state.computed_parts),
-        "error": round(float(frame_errors(state).max()), 6),
+        "error": None if state.is_moving else round(float(frame_errors(state).max()), 6),  # history and filter are in no estimate of it
         "tiles_at_rest": int((~state.tiles.active).sum()),
         "tiles": len(state.tiles.active),
         "primary": state.inputs.primary,
@@ -82,17 +80,6 @@ def _horizons(state: FrameState) -> dict[str, float]:
     if horizons is None:
         return {"faces": 0, "faces_known": 0, "rays_spared": 0.0}
     return {"faces": horizons.faces, "faces_known": horizons.found, "rays_spared": round(horizons.spared(), 4)}
-
-
-def _padded_gbuffer(maps: GBuffer, window: Window) -> GBuffer:
-    """The whole image's."""
-    return GBuffer(**{name: window.pad(values, torch.inf if name == "depth" else 0.0) for name, values in vars(maps).items()})
-
-
-def _padded_radiance(radiance: Radiance, window: Window) -> Radiance:
-    """The whole image's."""
-    maps: dict[str, Any] = {name: window.pad(values) for name, values in vars(radiance).items() if isinstance(values, Tensor)}
-    return replace(radiance, **maps)
 
 
 def _background(state: FrameState) -> Tensor | None:

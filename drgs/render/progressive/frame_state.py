@@ -42,6 +42,8 @@ class MeshView:
 
     first_primary_points: PrimaryPoints | None = None
     """Of the first pass over all covered tiles, once it is made: the next frame may start with them."""
+    middles: GBuffer | None = None
+    """Of the window: what a moving picture sees through the middles of pixels."""
 
 
 @dataclass(frozen=True, eq=False)

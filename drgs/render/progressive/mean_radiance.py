@@ -107,6 +107,8 @@ def mean_gbuffer(state: FrameState) -> GBuffer:
     """Of the window: the rasterised one, or the mean over passes of what rays to the mesh saw."""
     if isinstance(state.view, GaussianView):
         return GBuffer(**{name: state.window.crop(values) for name, values in vars(state.view.gbuffer).items()})
+    if state.view.middles is not None:
+        return state.view.middles
     passes = int(state.tiles.passes.sum())
     known = _gbuffers.get(state.sums)
     if known is None or known[0] != passes:

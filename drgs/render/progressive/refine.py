@@ -24,6 +24,7 @@ from drgs.render.progressive.frame_sums import add_estimate, copy_sums, no_sums
 from drgs.render.progressive.kept_light.shade_moving import shade_moving
 from drgs.render.progressive.mean_radiance import frame_history, mean_gbuffer
 from drgs.render.progressive.reproject import reproject
+from drgs.render.progressive.see_middles import see_middles
 from drgs.render.records import PrimaryPoints
 from drgs.render.visible.image_tiles import pixels_of_tiles, tile_of_pixels
 from drgs.render.visible.points_at import points_at
@@ -47,7 +48,9 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
     """
     if state.is_moving:
         state = _begin_anew(state)
-    if not (state.plan.moving and state.passes == 0 and passes == 1 and state.plan.counts.total > 0):
+    if state.plan.moving and state.passes == 0 and passes == 1 and state.plan.counts.total > 0:
+        state = replace(state, sums=replace(state.sums, surface=None))  # its view says what it sees
+    else:
         state = replace(state, plan=at_rest(state.plan))
     if not consume or state.passes == 0:  # sums of no pass share one zero
         state = _with_sums_of_its_own(state)
@@ -73,7 +76,8 @@ def _begin_anew(state: FrameState) -> FrameState:
     sums = no_sums(len(state.sums.weight), True, inputs.settings.split_indirect, covered.device)
     tiles = Tiles(covered, torch.zeros_like(state.tiles.passes), covered.clone())
     plan = at_rest(state.plan)
-    return replace(state, plan=plan, sums=sums, tiles=tiles, history=frame_history(state), reprojected=None, kept_samples=None)
+    history = frame_history(state)
+    return replace(state, plan=plan, view=MeshView(), sums=sums, tiles=tiles, history=history, reprojected=None, kept_samples=None)
 
 
 def _with_sums_of_its_own(state: FrameState) -> FrameState:
@@ -104,7 +108,9 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
         state = _shade_and_read(state, primary)
     else:
         _shade_and_add(state, primary, index, state.first_rays if whole_first_pass else None)
-    if whole_first_pass and isinstance(state.view, MeshView) and not state.plan.moving:
+    if state.plan.moving:
+        state = replace(state, view=MeshView(middles=see_middles(primary, state.window)))
+    elif whole_first_pass and isinstance(state.view, MeshView):
         state = replace(state, view=MeshView(first_primary_points=primary))
     seconds = {"trace_primary": traced - started, "shade": time.perf_counter() - traced}
     return _pay_for_horizons(with_seconds(state, seconds), primary.starts.face, len(primary.points.pixel))
@@ -200,5 +206,5 @@ def _pay_for_horizons(state: FrameState, starts: Tensor | None, points: int) -> 
     """
     started, horizons = time.perf_counter(), state.traced.tracer.horizons
     if state.inputs.settings.skip and horizons is not None:
-        horizons.pay(points * state.plan.counts.total, starts)
+        horizons.pay(points * _how(state).counts.total, starts)
     return with_seconds(state, {"horizons": time.perf_counter() - started})
