@@ -125,7 +125,9 @@ def test_rays_go_where_fewest_went_and_stop_at_a_bound() -> None:
     everything = vertices_to_light(kept, wanted, 1 << 20)
     assert bool((rounds[everything] < MOST_ROUNDS).all()) and len(everything) == int((wanted & (rounds < MOST_ROUNDS)).sum())
     assert len(vertices_to_light(kept, wanted, 0)) == 0
-    assert rays_to_keep(32, 100, 0) == 3200 and rays_to_keep(32, 0, 100) == 200 and rays_to_keep(4, 100, 100) == 450
+    assert rays_to_keep(32, 100, 0, 1000) == 3200 and rays_to_keep(32, 0, 100, 1000) == 200 and rays_to_keep(4, 100, 100, 1000) == 450
+    # What is not read for other reasons than that too little is known asks for nothing.
+    assert rays_to_keep(32, 100, 0, 3) == 3 * A_ROUND.total and rays_to_keep(32, 100, 100, 0) == 200
 
 
 # ---- where it is read ----------------------------------------------------------------------------------------------------

@@ -14,13 +14,15 @@ from torch import Tensor
 from drgs.maths.constants import F0
 from drgs.render.integrate.integrator import AbstractIntegrator, IntegratorSettings
 from drgs.render.progressive.kept_light.gather_light import gather_light, vertices_to_light
-from drgs.render.progressive.kept_light.kept_light import KeptLight
+from drgs.render.progressive.kept_light.kept_light import A_ROUND, KeptLight
 from drgs.render.progressive.kept_light.read_light import READ, LightThere, read_light
 from drgs.render.records import PrimaryPoints, SampleCounts, ShadedPoints, ShadingPoints
 from drgs.render.visible.points_at import points_at
 
 SPENT_FIRST = 1
 """Rays that go to kept light for each point that is not read, as a share of its own."""
+ENOUGH_ROUNDS = 4
+"""Of a vertex, from which on no more is spent on it for points that are not read: metal, and the edges of shadows, will never be."""
 SPENT_LATER, LEAST_LATER = 1 / 16, 0.5
 """The same for each point that is read; and at least."""
 SPECULAR = 3 / 8
@@ -60,7 +62,8 @@ def shade_moving(
     glossy = points_at(primary, here)
     fewer = replace(how, counts=specular_counts(how.counts))
     specular = integrator.shade(only_specular(glossy.points), glossy.starts, environment_light, fewer, 0, None, horizon)
-    vertices = vertices_to_light(kept, there.wanted, rays_to_keep(how.counts.total, len(elsewhere), len(here)))
+    young = int((there.wanted & (kept.indirect_rounds < ENOUGH_ROUNDS)).sum())
+    vertices = vertices_to_light(kept, there.wanted, rays_to_keep(how.counts.total, len(elsewhere), len(here), young))
     kept = gather_light(kept, vertices, integrator, environment_light, how)
     return MovingLight(_together(light, elsewhere, _with_kept(specular, glossy.points, there, here), here), there.samples, kept)
 
@@ -72,13 +75,14 @@ def specular_counts(counts: SampleCounts) -> SampleCounts:
     return SampleCounts(0, total - environment, environment)
 
 
-def rays_to_keep(rays_a_point: int, traced: int, read: int) -> int:
+def rays_to_keep(rays_a_point: int, traced: int, read: int, young: int) -> int:
     """What a picture may spend on kept light.
 
     Args:
-        traced: points that are not read. read: those that are.
+        traced: points that are not read. read: those that are. young: wanted vertices with fewer than ENOUGH_ROUNDS.
     """
-    return int(SPENT_FIRST * rays_a_point * traced + max(SPENT_LATER * rays_a_point, LEAST_LATER) * read)
+    first = min(SPENT_FIRST * rays_a_point * traced, A_ROUND.total * young)
+    return int(first + max(SPENT_LATER * rays_a_point, LEAST_LATER) * read)
 
 
 def only_specular(points: ShadingPoints) -> ShadingPoints:
