@@ -5,76 +5,46 @@ that `drgs --help` answers at once. Wrong input and full disks end with one sent
 with 2, Ctrl-C with 130; DRGS_TRACEBACK=1 shows where a sentence came from. With --json stdout holds one JSON document and nothing else.
 """
 
-import errno
 import json
-import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
+from drgs.cli_answers import print_document, print_report, print_skipped
+from drgs.cli_endings import INPUT_EXIT_CODE, Commands, UsageError, stopped, with_extra
 from drgs.cli_options import (
     EXPORT_HELP,
     AssetPath,
     BindingKind,
+    BoxCorners,
     DataFolder,
     DatasetPath,
     Denoiser,
     DeviceName,
+    FaceLimit,
     Json,
+    LightFrame,
     LightKind,
     Matching,
     Preset,
     Primary,
+    SheetPath,
     StrokesPath,
+    UpDirection,
+    VariantsPath,
+    open_asset,
+    picture_size,
 )
-from drgs.exchange.export_formats import (
-    DEFAULT_FACES,
-    FEWEST_FACES,
-    CommandFormat,
-    command_format_of,
-    refuse_faces,
-)
-from drgs.installation import missing_package, unsupported_system
+from drgs.exchange.export_formats import CommandFormat, command_format_of, refuse_faces
+from drgs.installation import unsupported_system
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.openmp import spin_briefly
 from drgs.scene.tone_curve import ToneCurve
 
-if TYPE_CHECKING:
-    from drgs.scene.asset import Asset
-
-
-INPUT_EXIT_CODE = 1
-USAGE_EXIT_CODE = 2
-
-
-class UsageError(ValueError):
-    """The command was called wrongly, which can be seen without looking at any file."""
-
-
-class _Commands(TyperGroup):
-    def invoke(self, ctx: Any) -> Any:
-        """Run the command; turn what a user can cause into one sentence and an exit code."""
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            print("drgs: stopped by Ctrl-C", file=sys.stderr)
-            raise typer.Exit(130) from None
-        except BrokenPipeError:
-            raise  # the reader of our pipe has gone: typer ends quietly
-        except (ValueError, OSError) as error:
-            if os.environ.get("DRGS_TRACEBACK"):
-                raise
-            print(f"drgs: {_sentence(error)}", file=sys.stderr)
-            raise typer.Exit(USAGE_EXIT_CODE if isinstance(error, UsageError) else INPUT_EXIT_CODE) from None
-
-
-app = typer.Typer(cls=_Commands, add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = typer.Typer(cls=Commands, add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def _print_version(wanted: bool) -> None:
@@ -119,8 +89,7 @@ def pose(
         try:
             found = pose_source(photos, out, settings, frames, progress=report, should_stop=interrupt.is_set).capture
         except BuildStopped:
-            print(f"drgs: stopped; go on with: drgs pose {photos} {out} --resume", file=sys.stderr)
-            raise typer.Exit(130) from None
+            raise stopped(f"drgs pose {photos} {out} --resume") from None
     if json_progress or as_json:
         print(json.dumps(vars(found)), flush=True)
     else:
@@ -135,22 +104,9 @@ def build(
     binding: Annotated[
         BindingKind, typer.Option(help="Where Gaussians lie: as fitted, or rebuilt on the faces of the mesh.")
     ] = BindingKind.particles,
-    light: Annotated[
-        LightKind,
-        typer.Option(help="What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."),
-    ] = LightKind.auto,
-    up: Annotated[
-        tuple[float, float, float],
-        typer.Option(metavar="X Y Z", help="Direction of the capture's world that points up; the asset's world is turned so that it is z."),
-    ] = (0.0, 0.0, 1.0),
-    box: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        typer.Option(
-            metavar="X0 Y0 Z0 X1 Y1 Z1",
-            help="Two corners in the asset's world, which is the capture's after --up: what lies outside is not built.",
-            show_default="all of the object",
-        ),
-    ] = None,
+    light: LightFrame = LightKind.auto,
+    up: UpDirection = (0.0, 0.0, 1.0),
+    box: BoxCorners = None,
     strokes: StrokesPath = None,
     device: Annotated[DeviceName, typer.Option()] = DeviceName.auto,
     seed: Annotated[int, typer.Option()] = 0,
@@ -184,8 +140,7 @@ def build(
             chosen += "" if up == (0.0, 0.0, 1.0) else f" --up {up[0]:g} {up[1]:g} {up[2]:g}"
             chosen += "" if box is None else f" --box {' '.join(f'{value:g}' for value in box)}"
             chosen += "" if strokes is None else f" --strokes {strokes}"
-            print(f"drgs: stopped; go on with: drgs build {dataset} {out} --preset {preset.value}{chosen} --resume", file=sys.stderr)
-            raise typer.Exit(130) from None
+            raise stopped(f"drgs build {dataset} {out} --preset {preset.value}{chosen} --resume") from None
     if json_progress:
         print(json.dumps({"stage": "done", "fraction": 1.0, "asset": str(out), "provenance": asset.provenance}), flush=True)
     else:
@@ -235,8 +190,8 @@ def render(
     changes = load_edits(edits) if edits else []
     if env or env_rotation:
         changes.append(EnvironmentEdit(op="environment", file=str(env.resolve()) if env else None, rotation=env_rotation))
-    views = load_cameras(cameras, _size(size))
-    opened = _open_asset(asset, device)
+    views = load_cameras(cameras, picture_size(size))
+    opened = open_asset(asset, device)
     scene = pose_scene(opened, changes, edits.parent if edits else Path())
     settings = RenderSettings(
         samples_per_pixel=spp,
@@ -255,10 +210,7 @@ def render(
     else:
         print(f"{len(frames)} {'picture' if len(frames) == 1 else 'pictures'} written to {out}", file=sys.stderr)
     if explain and not as_json:
-        for frame in frames:
-            for left_out in frame["skipped"]:
-                print(f"{frame['name']}: left out {left_out['what']}: {left_out['why']} ({left_out['bound']})")
-            print(json.dumps(frame, indent=1))
+        print_skipped(frames)
 
 
 @app.command("import")
@@ -279,13 +231,8 @@ def export(
     asset: AssetPath,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write.")],
     format: Annotated[CommandFormat | None, typer.Option(help=EXPORT_HELP, show_default="by OUT's suffix")] = None,
-    faces: Annotated[
-        int | None,
-        typer.Option(help="The most that a textured mesh (glb, mesh, usdz, usd) has.", show_default=str(DEFAULT_FACES), min=FEWEST_FACES),
-    ] = None,
-    variants: Annotated[
-        Path | None, typer.Option(help="Other materials of a GLB: JSON, lists of material edits by name (docs/formats.md).")
-    ] = None,
+    faces: FaceLimit = None,
+    variants: VariantsPath = None,
 ) -> None:
     """Write an asset as a file that other programs read."""
     try:
@@ -325,14 +272,14 @@ def simulate(
     with frame_progress("Simulating", None) as advance:
         folder = Path() if scene is None else scene.parent
         _, report = run_simulation(
-            _open_asset(asset, device),
+            open_asset(asset, device),
             setting,
             out,
             lambda done, total: advance(f"{done} of {total}"),
             lambda name: folder / name,
             warn=lambda sentence: print(f"drgs: {sentence}", file=sys.stderr),
         )
-    _print_document({"out": str(out)} | vars(report), as_json)
+    print_document({"out": str(out)} | vars(report), as_json)
 
 
 @app.command("eval")
@@ -354,17 +301,14 @@ def eval_(
 
     settings = EvaluationSettings(samples_per_pixel=spp, seed=seed)
     with frame_progress("Evaluating", None) as advance:
-        figures = evaluate_asset(_open_asset(asset, device), dataset, out, settings, done=advance)
-    _print_document(figures, as_json)
+        figures = evaluate_asset(open_asset(asset, device), dataset, out, settings, done=advance)
+    print_document(figures, as_json)
 
 
 @app.command()
 def doctor(
     dataset: DatasetPath,
-    sheet: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Draw all pictures small, with masks and what is wrong with them, into this PNG or JPEG."),
-    ] = None,
+    sheet: SheetPath = None,
     strokes: StrokesPath = None,
     as_json: Json = False,
 ) -> None:
@@ -392,11 +336,7 @@ def doctor(
     if as_json:
         print(json.dumps(report))
     elif report["ok"]:
-        _print_document({name: value for name, value in report.items() if name not in ("findings", "advice", "summary", "marks")}, as_json)
-        for line in [f"{finding['level']}: {finding['sentence']}" for finding in report["findings"]] + report["advice"]:
-            print(line)
-        if not report["findings"]:
-            print("Nothing was found that would hurt a build.")
+        print_report(report)
         if sheet is not None:
             print(f"All pictures: {sheet}")
     else:
@@ -418,7 +358,7 @@ def serve(
     restore_backup: Annotated[bool, typer.Option("--restore-backup", help="Begin with the last good copy of a damaged database.")] = False,
 ) -> None:
     """Start the server and a worker for its jobs; prints the address to open. More settings: docs/operations.md."""
-    with _extra("drgs serve", "serve"):
+    with with_extra("drgs serve", "serve"):
         from drgs_server.run import serve as run_server
 
     roots = tuple(path.resolve() for path in captures or ())
@@ -433,7 +373,7 @@ def worker(
     requeue: Annotated[str | None, typer.Option(metavar="WORKER", help="Give this dead worker's jobs to the others, and end.")] = None,
 ) -> None:
     """Run queued jobs without serving pages, for example on another machine."""
-    with _extra("drgs worker", "serve"):
+    with with_extra("drgs worker", "serve"):
         from drgs_worker.run import requeue_worker, run_worker
 
     if requeue is not None:
@@ -451,65 +391,6 @@ def bench(context: typer.Context, name: Annotated[str, typer.Argument(metavar="N
         raise ValueError("bench: the benchmarks are in the repository, not in the installed package; run this from a checkout") from error
 
     run_benchmark([name, *context.args])
-
-
-def _sentence(error: ValueError | OSError) -> str:
-    """What the error says, on one line; the system's own errors without their number."""
-    if isinstance(error, OSError) and error.strerror:
-        what = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-        return f"{what}; free some space and try again" if error.errno == errno.ENOSPC else what
-    return " ".join(f"{error} {getattr(error, 'advice', '')}".split())  # a CaptureFault knows what to do about it
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    """(width, height) of '400x300'."""
-    if text is None:
-        return None
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
-        raise UsageError(f"--size is {text!r}; expected WIDTHxHEIGHT in pixels, like 400x300")
-    return int(width), int(height)
-
-
-@contextmanager
-def _extra(what: str, extra: str) -> Iterator[None]:
-    """Around the imports of a command that needs an extra.
-
-    Raises:
-        ValueError: one of its packages is missing; the sentence holds the command that installs it.
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").split(".")[0]
-        if missing == "fcntl":
-            raise ValueError(f"{what} runs on Linux and macOS; on Windows, use it in the Windows Subsystem for Linux") from error
-        if missing.startswith("drgs"):
-            raise
-        raise ValueError(missing_package(what, missing, extra)) from error
-
-
-def _open_asset(path: Path, device: DeviceName) -> "Asset":
-    from drgs.scene.asset import load_asset
-    from drgs.warp_torch import device_from_name
-
-    return load_asset(path, device_from_name(device.value))
-
-
-def _print_document(document: dict, as_json: bool) -> None:
-    """One JSON document, or the same as lines 'name value'."""
-    if as_json:
-        print(json.dumps(document))
-        return
-
-    def show(value: Any, name: str) -> None:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                show(inner, f"{name}.{key}" if name else str(key))
-        else:
-            print(f"{name:40s} {value:.4f}" if isinstance(value, float) else f"{name:40s} {value}")
-
-    show(document, "")
 
 
 def main() -> None:

@@ -23,6 +23,8 @@ LAYERS = (
 TOP_FILES = {
     "drgs/__init__.py",
     "drgs/cli.py",
+    "drgs/cli_answers.py",
+    "drgs/cli_endings.py",
     "drgs/cli_options.py",
     "drgs/cli_progress.py",
     "drgs/installation.py",
