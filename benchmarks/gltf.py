@@ -13,6 +13,7 @@ compared with ours, or with what is nearer to ours). noise: what other rays of o
 import argparse
 import json
 import tempfile
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from PIL import Image
 from playwright.sync_api import Browser, sync_playwright
 
 from benchmarks.measures.shade_open import shade_open
-from benchmarks.measures.three_picture import SeenByThree, three_picture, three_version
+from benchmarks.measures.three_picture import SeenByThree, ThreePage, three_version
 from drgs.convert.export_asset import export_asset
 from drgs.deform.pose_scene import pose_scene
 from drgs.maths.constants import STILL_BOUNCES
@@ -77,16 +78,17 @@ def measure(
     export_asset(asset, out / "object.glb", "mesh", faces)
     found: dict[str, object] = {"three": three_version(), "bytes": (out / "object.glb").stat().st_size, "views": views}
     for light in lights:
-        rows = [
-            _compared(_pictures(browser, asset, out, light, 360 * view / views, side, samples), out / f"{light.stem}-{view}")
-            for view in range(views)
-        ]
+        with closing(ThreePage(browser, light.read_bytes())) as three:
+            rows = [
+                _compared(_pictures(three, asset, out, light, 360 * view / views, side, samples), out / f"{light.stem}-{view}")
+                for view in range(views)
+            ]
         found[light.stem] = {name: round(float(np.mean([row[name] for row in rows])), 2) for name in rows[0]}
     return found
 
 
 def _pictures(
-    browser: Browser, asset: Asset, out: Path, light: Path, azimuth_degrees: float, side: int, samples: int
+    three: ThreePage, asset: Asset, out: Path, light: Path, azimuth_degrees: float, side: int, samples: int
 ) -> dict[str, Picture]:
     low, high = asset.mesh.vertices.amin(0).tolist(), asset.mesh.vertices.amax(0).tolist()
     view = turntable_view(low, high, azimuth_degrees, ELEVATION_DEGREES)
@@ -101,13 +103,13 @@ def _pictures(
     in_metres = view.copy()
     in_metres[:3, 3] *= asset.meters_per_unit
     seen = SeenByThree(in_metres.tolist(), FOV_Y_DEGREES, side, side)
-    glb, exr = (out / "object.glb").read_bytes(), light.read_bytes()
+    glb = (out / "object.glb").read_bytes()
     return {
         "ours": 255 * ours.double().numpy(),
         "open": 255 * tonemap(alone.ours, coverage).double().numpy(),
         "gltf": 255 * tonemap(alone.gltf, coverage).double().numpy(),
-        "plain": three_picture(browser, glb, ".glb", exr, replace(seen, without=("aoMap",))).astype(float),
-        "three": three_picture(browser, glb, ".glb", exr, seen).astype(float),
+        "plain": three.picture(glb, ".glb", replace(seen, without=("aoMap",))).astype(float),
+        "three": three.picture(glb, ".glb", seen).astype(float),
         "other_rays": 255 * frame.rgba_srgb.double().numpy(),
     }
 

@@ -1,6 +1,6 @@
-"""What three.js draws of an exported file, in Chromium with software GL, on a page that has nothing of ours.
+"""What three.js draws of exported files, in Chromium with software GL, on a page that has nothing of ours.
 
-In: the bytes of a GLB or USDZ and of an EXR, and a camera. Out: RGBA as on the screen: three.js' standard material under the EXR as it filters it
+In: the bytes of an EXR, and of each GLB or USDZ with a camera. Out: RGBA as on the screen: three.js' standard material under the EXR as it filters it
 (PMREMGenerator), no lamps, no tone mapping, sRGB.
 """
 
@@ -46,41 +46,49 @@ def three_version() -> str:
     return json.loads((THREE / "package.json").read_text())["version"]
 
 
-def three_picture(browser: Browser, file: bytes, suffix: str, light: bytes, seen: SeenByThree) -> UInt8[ndarray, "height width 4"]:
-    """
-    Args:
-        suffix: .glb or .usdz.
-        light: an EXR, lat-long.
+class ThreePage:
+    """Final. A page of three.js under one light, which is filtered once, for about a second of a core in software GL; end it by `close`."""
 
-    Raises:
-        ValueError: web/node_modules has no three.js.
-    """
-    if not THREE.is_dir():
-        raise ValueError(f"{THREE} is not there; run: python web/build.py")
-    told = vars(seen) | {"file": f"/object{suffix}", "light": "/light.exr"}
-    answers: dict[str, tuple[str, bytes]] = {
-        "/": ("text/html", PAGE.read_bytes()),
-        f"/object{suffix}": ("application/octet-stream", file),
-        "/light.exr": ("image/x-exr", light),
-        "/seen.json": ("application/json", json.dumps(told).encode()),
-    }
+    def __init__(self, browser: Browser, light: bytes) -> None:
+        """
+        Args:
+            light: an EXR, lat-long.
 
-    def answer(route: Route) -> None:
+        Raises:
+            ValueError: web/node_modules has no three.js.
+        """
+        if not THREE.is_dir():
+            raise ValueError(f"{THREE} is not there; run: python web/build.py")
+        self._answers: dict[str, tuple[str, bytes]] = {"/": ("text/html", PAGE.read_bytes()), "/light.exr": ("image/x-exr", light)}
+        self._drawn = 0
+        self._page = browser.new_page()
+        self._page.route("**/*", self._answer)
+        self._page.goto("http://three.test/", timeout=WAIT_MS)
+        self._page.wait_for_function("Boolean(window.draw)", timeout=WAIT_MS)
+
+    def picture(self, file: bytes, suffix: str, seen: SeenByThree) -> UInt8[ndarray, "height width 4"]:
+        """
+        Args:
+            suffix: .glb or .usdz.
+        """
+        self._drawn += 1
+        path = f"/object-{self._drawn}{suffix}"
+        self._answers[path] = ("application/octet-stream", file)
+        self._page.evaluate("(told) => void window.draw(told)", vars(seen) | {"file": path})
+        self._page.wait_for_function("window.picture", timeout=WAIT_MS)
+        del self._answers[path]
+        data = self._page.evaluate("window.picture")
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGBA"))
+
+    def close(self) -> None:
+        self._page.close()
+
+    def _answer(self, route: Route) -> None:
         path = "/" + route.request.url.split("/", 3)[3]
         if path.startswith("/three/"):
             route.fulfill(content_type="text/javascript", body=(THREE / path.removeprefix("/three/")).read_bytes())
-        elif path in answers:
-            kind, body = answers[path]
+        elif path in self._answers:
+            kind, body = self._answers[path]
             route.fulfill(content_type=kind, body=body)
         else:
             route.abort()
-
-    page = browser.new_page()
-    try:
-        page.route("**/*", answer)
-        page.goto("http://three.test/", timeout=WAIT_MS)
-        page.wait_for_function("window.picture", timeout=WAIT_MS)
-        data = page.evaluate("window.picture")
-    finally:
-        page.close()
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGBA"))

@@ -1,6 +1,8 @@
 """An exported GLB, and a USDZ, look in three.js as the object looks here: same place, same materials, under the same light."""
 
 import io
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +13,7 @@ import trimesh
 from PIL import Image
 from playwright.sync_api import Browser
 
-from benchmarks.measures.three_picture import SeenByThree, three_picture
+from benchmarks.measures.three_picture import SeenByThree, ThreePage
 from drgs.convert.bake_edits import bake_edits
 from drgs.convert.export_asset import export_asset
 from drgs.deform.pose_scene import pose_scene
@@ -26,6 +28,7 @@ from drgs_server.client import Client
 from drgs_worker.jobs.start_view import FOV_Y_DEGREES, start_view
 from tests.web.browser import ROOT, RunningServer
 
+ENVIRONMENTS = ROOT / "examples" / "environments"
 SIDE = 256
 DIFFERENCE = 10.0
 """Mean over pixels and channels, sRGB 0..255. three.js filters its environment instead of sampling it, and textures are 8-bit."""
@@ -34,9 +37,16 @@ WAVES_DIFFERENCE = 7.0
 """The same of a ball with waves, 5.8; with twice the rays 4.9, and 11.3 without a texture of normals."""
 
 
+@pytest.fixture(scope="module")
+def studio(browser: Browser) -> Iterator[ThreePage]:
+    """three.js under the studio's light."""
+    with closing(ThreePage(browser, (ENVIRONMENTS / "studio.exr").read_bytes())) as page:
+        yield page
+
+
 @pytest.mark.parametrize("format", ["glb", "usdz"])
 def test_an_exported_file_looks_the_same_in_three(
-    format: Literal["glb", "usdz"], server: RunningServer, browser: Browser, ball_asset: str, tmp_path: Path
+    format: Literal["glb", "usdz"], server: RunningServer, studio: ThreePage, ball_asset: str, tmp_path: Path
 ) -> None:
     camera = start_view((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).tolist()
     path = tmp_path / f"ball.{format}"
@@ -45,11 +55,10 @@ def test_an_exported_file_looks_the_same_in_three(
         session = client.open_session(ball_asset)
         session.edit({"op": "environment", "file": "studio.exr"})
         picture = session.frame(SIDE, SIDE, 256, camera, FOV_Y_DEGREES, background="transparent")
-    light = (ROOT / "examples" / "environments" / "studio.exr").read_bytes()
     ours = Image.open(io.BytesIO(picture))
     seen = SeenByThree(camera, FOV_Y_DEGREES, SIDE, SIDE, stands(path))
     a = np.asarray(ours.convert("RGBA"), float)
-    b = three_picture(browser, path.read_bytes(), f".{format}", light, seen).astype(float)
+    b = studio.picture(path.read_bytes(), f".{format}", seen).astype(float)
     inside = (a[..., 3] > 254) & (b[..., 3] > 254)
     assert inside.sum() > 0.97 * max((a[..., 3] > 127).sum(), (b[..., 3] > 127).sum()) - 4 * SIDE, "the same silhouette"
     difference = np.abs(a - b)[inside][:, :3].mean()
@@ -58,7 +67,7 @@ def test_an_exported_file_looks_the_same_in_three(
 
 
 @pytest.mark.slow
-def test_waves_that_faces_were_too_few_for_are_seen_in_three(browser: Browser, tmp_path: Path) -> None:
+def test_waves_that_faces_were_too_few_for_are_seen_in_three(studio: ThreePage, tmp_path: Path) -> None:
     """By the texture of normals and the tangents with it: without them, or with one of their axes turned over, the bound is passed."""
     asset = wavy_ball(6)
     path = tmp_path / "ball.glb"
@@ -66,12 +75,10 @@ def test_waves_that_faces_were_too_few_for_are_seen_in_three(browser: Browser, t
     view = start_view((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     focal = SIDE / 2 / np.tan(np.radians(FOV_Y_DEGREES / 2))
     intrinsics = torch.tensor([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1]])
-    environments = ROOT / "examples" / "environments"
-    scene = pose_scene(asset, parse_edits([{"op": "environment", "file": "studio.exr"}]), environments)
+    scene = pose_scene(asset, parse_edits([{"op": "environment", "file": "studio.exr"}]), ENVIRONMENTS)
     frame = render_frame(scene, camera_from_opengl(torch.from_numpy(view), intrinsics, SIDE, SIDE), RenderSettings(samples_per_pixel=128))
     seen = SeenByThree(view.tolist(), FOV_Y_DEGREES, SIDE, SIDE)
-    light = (environments / "studio.exr").read_bytes()
-    a, b = 255 * frame.rgba_srgb.numpy(), three_picture(browser, path.read_bytes(), ".glb", light, seen).astype(float)
+    a, b = 255 * frame.rgba_srgb.numpy(), studio.picture(path.read_bytes(), ".glb", seen).astype(float)
     inside = (a[..., 3] > 254) & (b[..., 3] > 254)
     difference = np.abs(a - b)[inside][:, :3].mean()
     print(f"waves: mean difference {difference:.2f} of 255")
@@ -79,7 +86,7 @@ def test_waves_that_faces_were_too_few_for_are_seen_in_three(browser: Browser, t
 
 
 @pytest.mark.slow
-def test_three_shows_each_variant_as_an_asset_that_wears_it(browser: Browser, tmp_path: Path) -> None:
+def test_three_shows_each_variant_as_an_asset_that_wears_it(studio: ThreePage, tmp_path: Path) -> None:
     asset, path = wavy_ball(4), tmp_path / "ball.glb"
     gold = parse_edits(
         [{"op": "material", "select": {"all": True}, "set": {"albedo": [1.0, 0.77, 0.34], "metallic": 1.0, "roughness": 0.3}}]
@@ -87,11 +94,10 @@ def test_three_shows_each_variant_as_an_asset_that_wears_it(browser: Browser, tm
     export_asset(asset, path, "mesh", faces=1000, variants={"Gold": gold})
     export_asset(bake_edits(asset, gold, tmp_path, 2), tmp_path / "gold.glb", "mesh", faces=1000)
     view = start_view((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).tolist()
-    light = (ROOT / "examples" / "environments" / "studio.exr").read_bytes()
 
     def seen(file: Path, variant: str | None) -> np.ndarray:
         told = SeenByThree(view, FOV_Y_DEGREES, SIDE, SIDE, variant=variant)
-        return three_picture(browser, file.read_bytes(), ".glb", light, told).astype(float)
+        return studio.picture(file.read_bytes(), ".glb", told).astype(float)
 
     opened, captured, worn = seen(path, None), seen(path, AS_CAPTURED), seen(path, "Gold")
     np.testing.assert_array_equal(opened, captured)
