@@ -68,14 +68,26 @@ def color_of_normal(normal: np.ndarray) -> np.ndarray:
 
 
 def plane_from_pixels(lens: Lens, pixels: np.ndarray) -> np.ndarray:
-    """Directions (x, y, 1) that a lens shows there, by fixed-point iteration, for lenses that bend moderately."""
-    plane = (pixels - lens.principal_point) / lens.focal_lengths
-    for _ in range(200):
-        step = 0.7 * (pixels - pixels_from_plane(lens, plane)) / lens.focal_lengths
-        plane = plane + step
-        if np.abs(step).max() < 1e-9:
+    """Directions (x, y, 1) that a lens shows there, by Newton's method with differences for derivatives, for lenses that bend moderately."""
+    start = (pixels - lens.principal_point) / lens.focal_lengths
+    plane = start.reshape(-1, 2).T.copy()
+    wanted, going = pixels.reshape(-1, 2).T, np.arange(plane.shape[1])
+    apart = 1e-6
+
+    def off(places: np.ndarray) -> np.ndarray:
+        return pixels_from_plane(lens, places.T).T - wanted[:, going]
+
+    for _ in range(50):
+        at = plane[:, going]
+        miss = off(at)
+        across, down = ((off(at + step[:, None]) - miss) / apart for step in apart * np.eye(2))
+        area = across[0] * down[1] - down[0] * across[1]
+        step = np.stack([miss[0] * down[1] - down[0] * miss[1], across[0] * miss[1] - miss[0] * across[1]]) / area
+        plane[:, going] = at - step
+        going = going[np.abs(step).max(0) > 1e-9]
+        if len(going) == 0:
             break
-    return plane
+    return plane.T.reshape(start.shape)
 
 
 def sphere_views(count: int = VIEWS, square: bool = False, lens: Lens | None = None) -> list[TinyView]:

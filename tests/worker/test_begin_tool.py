@@ -69,6 +69,18 @@ def test_tools_say_what_is_wrong_and_leave_what_is_right_and_all_have_one_parent
     assert ended(begin_tool("asset", str(tmp_path / "four.obj"), str(tmp_path / "again"))) == (0, ""), "another parent was started"
 
 
+@pytest.mark.slow
+def test_a_tool_that_is_stopped_or_forgotten_is_over_while_others_go_on(waiting: Path, tmp_path: Path) -> None:
+    stopped, forgotten = (begin_tool("environment", str(waiting), str(tmp_path / "out")) for _ in range(2))
+    wait_until(lambda: len(children_of_parent()) == 2, "two tools that wait")
+    assert not stopped.wait(0.05)
+    stopped.stop()
+    assert ended(stopped) == (-9, "")
+    assert len(children_of_parent()) == 1
+    forgotten.close()
+    wait_until(lambda: not children_of_parent(), "the end of a tool that nobody waits for")
+
+
 def large_mesh() -> str:
     """So large that torch shares out its loops among threads."""
     side = 200
@@ -81,7 +93,6 @@ def large_mesh() -> str:
 @pytest.mark.slow
 @pytest.mark.skipif(not tool_parent.FORKS, reason="tools are started one by one here")
 def test_the_parent_has_no_threads_and_its_children_as_many_as_they_like(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_parent", None)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     (tmp_path / "large.obj").write_text(large_mesh())
     for name in ("first", "second"):
@@ -90,18 +101,6 @@ def test_the_parent_has_no_threads_and_its_children_as_many_as_they_like(tmp_pat
         assert psutil.Process(module._parent.process.pid).num_threads() == 1
     module._parent.asking.close()
     assert module._parent.process.wait(PATIENCE_SECONDS) == 0
-
-
-@pytest.mark.slow
-def test_a_tool_that_is_stopped_or_forgotten_is_over_while_others_go_on(waiting: Path, tmp_path: Path) -> None:
-    stopped, forgotten = (begin_tool("environment", str(waiting), str(tmp_path / "out")) for _ in range(2))
-    wait_until(lambda: len(children_of_parent()) == 2, "two tools that wait")
-    assert not stopped.wait(0.05)
-    stopped.stop()
-    assert ended(stopped) == (-9, "")
-    assert len(children_of_parent()) == 1
-    forgotten.close()
-    wait_until(lambda: not children_of_parent(), "the end of a tool that nobody waits for")
 
 
 @pytest.mark.slow
