@@ -14,7 +14,7 @@ from benchmarks.measures.fit_curves import curves_of, write_curves
 from benchmarks.measures.variants import Variant, apply_overrides, read_variants
 from drgs.reconstruct.presets import PRESETS
 from drgs.scene.asset import Asset, load_asset, save_asset
-from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, write_nerf_synthetic, write_nerfstudio
+from tests.reconstruct.tiny_capture import FEW_VIEWS, SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic, write_nerfstudio
 from tests.render.closed_form_scenes import constant_sky, mesh_of
 
 TINY = {
@@ -216,7 +216,7 @@ def test_rows_tables_and_curves_are_written(tmp_path: Path, monkeypatch: pytest.
 
 @pytest.mark.slow
 def test_a_variant_is_built_in_its_own_process_once(tmp_path: Path) -> None:
-    capture, work = write_nerf_synthetic(tmp_path / "capture"), tmp_path / "work"
+    capture, work = write_nerf_synthetic(tmp_path / "capture", sphere_views(FEW_VIEWS, square=True)), tmp_path / "work"
     command = variant_command(capture, work / "asset", "draft", "tiny", TINY, 0, "cpu")
     what = {"preset": "draft", "overrides": TINY, "seed": 0}
     built = built_asset(command, work, what)

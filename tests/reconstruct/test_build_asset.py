@@ -61,7 +61,7 @@ TINY = Preset(
 )
 WITHOUT_HOLLOWS = replace(TINY, hollows=HollowSettings(RadianceGridSettings(levels=())))
 """For tests of other files that ask nothing about hollows, as the preset `draft` does."""
-ON_SURFELS = replace(TINY, materials_on="surfels")
+ON_SURFELS = replace(WITHOUT_HOLLOWS, materials_on="surfels")
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
 
 

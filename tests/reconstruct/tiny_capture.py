@@ -19,7 +19,7 @@ FX, FY, CX, CY = 90.0, 84.0, 38.5, 26.0
 SPHERE_CENTER = np.array([0.1, -0.15, 0.2])
 SPHERE_RADIUS = 0.55
 VIEWS = 24
-FEW_VIEWS = 16
+FEW_VIEWS = 10
 """Enough for builds of which only is asked that they go through, stop and resume: their time is that of their views."""
 
 

@@ -46,12 +46,15 @@ TINY = Preset(
     hollows=HollowSettings(RadianceGridSettings(levels=((12, 4),), rays_a_step=64)),
     mesh_surfels=MeshFitSettings(iterations=3),
 )
+BOUND = replace(TINY, hollows=HollowSettings(RadianceGridSettings(levels=())))
+"""Hollows are looked for before anything is bound to a mesh: the other build says whether what is found of them is kept."""
 MORE = replace(TINY, materials=MeshMaterialSettings(iterations=8, points_a_step=64, samples=SampleCounts(4, 2, 2)))
 
 
 @pytest.fixture
 def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DataDirectory]:
     monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setitem(PRESETS, "bound", BOUND)
     monkeypatch.setitem(PRESETS, "more", MORE)
     write_nerf_synthetic(tmp_path, sphere_views(FEW_VIEWS, square=True))
     yield open_data_directory(tmp_path / "data")
@@ -79,25 +82,25 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("binding", ["particles", "mesh"])
+@pytest.mark.parametrize(("binding", "preset"), [("particles", "tiny"), ("mesh", "bound")])
 def test_a_build_that_begins_anew_after_every_stage_makes_the_same_asset_and_can_be_re_decoupled(
-    directory: DataDirectory, binding: str
+    directory: DataDirectory, binding: str, preset: str
 ) -> None:
     whole: list[str] = []
-    run = BuildRun(context(directory, "a" * 32, whole, binding=binding))
+    run = BuildRun(context(directory, "a" * 32, whole, binding=binding, preset=preset))
     for step in run.steps:
         run.run(step)
     parts: list[str] = []
     for step in run.steps:
         before = len(parts)
-        BuildRun(context(directory, "b" * 32, parts, binding=binding)).run(step)
+        BuildRun(context(directory, "b" * 32, parts, binding=binding, preset=preset)).run(step)
         if step == "materials":
             assert "fit" not in parts[before:]  # nothing but the capture is worked on again
     assert contents(directory.asset("a" * 32)) == contents(directory.asset("b" * 32))
     assert list(dict.fromkeys(whole)) == list(STAGE_SHARES[binding])
 
     said: list[str] = []
-    asked = {"asset": "a" * 32, "preset": "more", "built_preset": "tiny", "built_seed": 0, "binding": binding}
+    asked = {"asset": "a" * 32, "preset": "more", "built_preset": preset, "built_seed": 0, "binding": binding}
     again = RedecoupleRun(context(directory, "c" * 32, said, **asked))
     for step in again.steps:
         again.run(step)
@@ -108,7 +111,7 @@ def test_a_build_that_begins_anew_after_every_stage_makes_the_same_asset_and_can
     corners = first.mesh.vertices[first.mesh.faces.long()]
     edge = float((corners - corners.roll(1, 1)).norm(dim=-1).mean())
     assert float(moved.mean()) < 0.1 * edge and float(moved.max()) < edge
-    assert (first.provenance["materials"], second.provenance["materials"]) == ("tiny", "more")
+    assert (first.provenance["materials"], second.provenance["materials"]) == (preset, "more")
     assert first.provenance["binding"] == second.provenance["binding"] == binding
     from sqlalchemy.orm import Session
 
