@@ -40,6 +40,8 @@ def _init_warp() -> None:
 
 GRADIENT_SLICES = 4
 """Parts of a launch that add into a copy each of what many threads add to: fixed, so that sums do not depend on how many cores there are."""
+FEWEST_FOR_THREADS = 1024
+"""Indices of a launch; with fewer it takes longer to wake threads than to be done."""
 
 _init_warp()
 
@@ -73,6 +75,11 @@ def thread_pool() -> ThreadPoolExecutor:
 def warp_array(tensor: Tensor, dtype: Any = None) -> wp.array:
     """A Warp array on a tensor's memory; `dtype` (wp.vec3, ...) consumes trailing dimensions. No gradient is tracked."""
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+
+
+def warp_argument(tensor: Tensor, dtype: Any = None) -> Any:
+    """What warp_array gives, for arguments of kernels alone, where launches are many and short: a third of the price, and no check by Warp."""
+    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def warp_view(tensor: Tensor, dtype: Any = None) -> wp.array:
@@ -132,9 +139,9 @@ def device_from_name(name: str) -> torch.device:
     return torch.device(name)
 
 
-def in_gradient_slices(run: Callable[[int], None], device: wp.Device) -> None:
-    """run(k) for each of GRADIENT_SLICES parts: one after another on CUDA, by the thread pool on the CPU."""
-    if device.is_cuda:
+def in_gradient_slices(run: Callable[[int], None], device: wp.Device, count: int) -> None:
+    """run(k) for each of GRADIENT_SLICES parts of `count` indices: by the thread pool on the CPU, one after another on CUDA and where they are few."""
+    if device.is_cuda or count < FEWEST_FOR_THREADS:
         for k in range(GRADIENT_SLICES):
             run(k)
     else:

@@ -17,7 +17,7 @@ from torch import Tensor
 from drgs.maths.constants import F0, MIN_ROUGHNESS
 from drgs.render.integrate.brdf_warp import PI, ggx_d, smith_v
 from drgs.render.records import Rays, ShadingPoints
-from drgs.warp_torch import GRADIENT_SLICES, in_gradient_slices, load_kernel, warp_array, warp_device
+from drgs.warp_torch import GRADIENT_SLICES, in_gradient_slices, load_kernel, warp_argument, warp_device
 
 
 @wp.func
@@ -110,8 +110,8 @@ def _launch(height: int, inputs: Sequence[Tensor], contribution: Tensor, gradien
     if points == 0:
         return
     samples = len(contribution) // points
-    arrays = [warp_array(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True)]
-    out = warp_array(contribution, wp.vec3)
+    arrays = [warp_argument(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True)]
+    out = warp_argument(contribution, wp.vec3)
     load_kernel(ray_contributions, device)
 
     def run(k: int) -> None:
@@ -122,13 +122,13 @@ def _launch(height: int, inputs: Sequence[Tensor], contribution: Tensor, gradien
             wp.launch(ray_contributions, dim=last - first, inputs=values, outputs=[out], device=device)
             return
         point_gradients, table_gradients = gradients
-        adjoints = [warp_array(x, dtype) for x, dtype in zip(point_gradients, _DTYPES[-_DIFFERENTIABLE:-1], strict=True)]
+        adjoints = [warp_argument(x, dtype) for x, dtype in zip(point_gradients, _DTYPES[-_DIFFERENTIABLE:-1], strict=True)]
         wp.launch(
             ray_contributions, dim=last - first, inputs=values, outputs=[out], device=device, adjoint=True,
-            adj_inputs=[0, 0, 0, *[None] * (len(arrays) - _DIFFERENTIABLE), *adjoints, warp_array(table_gradients[k], wp.vec3)], adj_outputs=[out],
+            adj_inputs=[0, 0, 0, *[None] * (len(arrays) - _DIFFERENTIABLE), *adjoints, warp_argument(table_gradients[k], wp.vec3)], adj_outputs=[out],
         )  # fmt: skip
 
-    in_gradient_slices(run, device)
+    in_gradient_slices(run, device, points * samples)
 
 
 def integrate_samples(

@@ -17,7 +17,7 @@ from drgs.render.intersect.tracer import AbstractTracer, FirstHit, KernelQuery, 
 from drgs.render.native_source import native_source
 from drgs.render.records import Hits
 from drgs.scene.mesh import TriangleMesh
-from drgs.warp_torch import load_kernel, warp_array
+from drgs.warp_torch import load_kernel, warp_argument
 
 wp.set_module_options({"enable_backward": False})
 
@@ -114,13 +114,13 @@ class EmbreeTracer(AbstractTracer):
         count = len(origins)
         hit, distance = torch.empty(count, dtype=torch.bool), torch.empty(count)
         face, barycentric = torch.empty(count, dtype=torch.int32), torch.empty(count, 2)
-        inputs = [self._handles, warp_array(origins, wp.vec3), warp_array(directions, wp.vec3)]
-        outputs = [warp_array(hit), warp_array(distance), warp_array(face), warp_array(barycentric, wp.vec2)]
+        inputs = [self._handles, warp_argument(origins, wp.vec3), warp_argument(directions, wp.vec3)]
+        outputs = [warp_argument(hit), warp_argument(distance), warp_argument(face), warp_argument(barycentric, wp.vec2)]
         wp.launch(find_closest, dim=count, inputs=inputs, outputs=outputs, device="cpu")
         return Hits(hit, distance, face, barycentric)
 
     def occluded(self, origins: Tensor, directions: Tensor) -> Tensor:
         blocked = torch.empty(len(origins), dtype=torch.bool)
-        inputs = [self._handles, warp_array(origins, wp.vec3), warp_array(directions, wp.vec3)]
-        wp.launch(find_occluded, dim=len(origins), inputs=inputs, outputs=[warp_array(blocked)], device="cpu")
+        inputs = [self._handles, warp_argument(origins, wp.vec3), warp_argument(directions, wp.vec3)]
+        wp.launch(find_occluded, dim=len(origins), inputs=inputs, outputs=[warp_argument(blocked)], device="cpu")
         return blocked

@@ -11,6 +11,7 @@ Source: Karis 2013, with the BRDF of drgs/maths/brdf.py (docs/sources.md: karis2
 
 import math
 from functools import cache
+from typing import Any
 
 import torch
 import warp as wp
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from drgs.maths.brdf import ggx_d, smith_v
 from drgs.scene.environment import direction_from_uv
-from drgs.warp_torch import GRADIENT_SLICES, in_gradient_slices, load_kernel, warp_array, warp_device
+from drgs.warp_torch import FEWEST_FOR_THREADS, GRADIENT_SLICES, in_gradient_slices, load_kernel, warp_argument, warp_device
 
 ENVIRONMENT_SIZE = (128, 256)
 """Rows and columns of the learned table."""
@@ -219,31 +220,35 @@ def _launch_slices(
     device, count = warp_device(radiance), len(radiance)
     if count == 0:
         return
-    arrays = [warp_array(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True)]
-    out = warp_array(radiance, wp.vec3)
+    arrays = [warp_argument(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True)]
+    out = warp_argument(radiance, wp.vec3)
     load_kernel(split_sum_kernel, device)
+    if point_gradients is None and count < FEWEST_FOR_THREADS:
+        wp.launch(split_sum_kernel, dim=count, inputs=[0, *arrays], outputs=[out], device=device)
+        return
 
     # No function within this one: under test each call would check its definition anew.
-    in_gradient_slices(lambda k: _launch_slice(k, count, arrays, out, point_gradients, table_gradients), device)
+    in_gradient_slices(lambda k: _launch_slice(k, count, arrays, out, device, point_gradients, table_gradients), device, count)
 
 
 def _launch_slice(
     k: int,
     count: int,
-    arrays: list[wp.array],
-    out: wp.array,
+    arrays: list,
+    out: Any,
+    device: Any,
     point_gradients: list[Tensor] | None,
     table_gradients: Float[Tensor, "slice texel 3"] | None,
 ) -> None:
     """One of GRADIENT_SLICES parts of the points; with gradients, into that slice of the tables'."""
     first, last = count * k // GRADIENT_SLICES, count * (k + 1) // GRADIENT_SLICES
     if point_gradients is None or table_gradients is None:
-        wp.launch(split_sum_kernel, dim=last - first, inputs=[first, *arrays], outputs=[out], device=out.device)
+        wp.launch(split_sum_kernel, dim=last - first, inputs=[first, *arrays], outputs=[out], device=device)
         return
-    adjoints = [warp_array(x, dtype) for x, dtype in zip(point_gradients, _DTYPES, strict=False)]
+    adjoints = [warp_argument(x, dtype) for x, dtype in zip(point_gradients, _DTYPES, strict=False)]
     wp.launch(
-        split_sum_kernel, dim=last - first, inputs=[first, *arrays], outputs=[out], device=out.device, adjoint=True,
-        adj_inputs=[0, *adjoints, None, None, None, None, warp_array(table_gradients[k], wp.vec3), None], adj_outputs=[out],
+        split_sum_kernel, dim=last - first, inputs=[first, *arrays], outputs=[out], device=device, adjoint=True,
+        adj_inputs=[0, *adjoints, None, None, None, None, warp_argument(table_gradients[k], wp.vec3), None], adj_outputs=[out],
     )  # fmt: skip
 
 
