@@ -57,7 +57,7 @@ ELEVATION = 30.0
 WIDER = 0.65
 """The view's focal length, as a part of the photographs': heaps are wider than the object."""
 SIDE = 320
-"""Of a traced picture [pixels]; the sheet shows half."""
+"""Of a traced picture [pixels]; the sheet shows half, the film all."""
 BOUNCES = 1
 BALL_SUBDIVISIONS = 1
 """Of the reference's balls in the lit picture: 80 faces, four times those of a grain."""
@@ -126,13 +126,13 @@ def laws(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -
             for place in range(simulation.frame_count):
                 seen = clips.picture(clips.posed(simulation.at(place / FPS)))
                 rgba = rgba_of(seen)
-                shown[name, action].append(halved(np.concatenate([on_white(rgba), rgba[..., 3:]], -1)))
+                shown[name, action].append(np.concatenate([on_white(rgba), rgba[..., 3:]], -1))
                 if name == "sand" and action == "drop" and place in map(picture_at, moments):
                     told = against_balls(clips, simulation, seen)
                     figures |= {f"{word} at {place / FPS:g} s": value for word, value in told.items()}
     rows = [
         [
-            (f"{name}, {action} {seconds:g} s", shown[name, action][picture_at(seconds)])
+            (f"{name}, {action} {seconds:g} s", halved(shown[name, action][picture_at(seconds)]))
             for action, moments in MOMENTS.items()
             for seconds in moments
         ]
