@@ -1,10 +1,11 @@
 """How far before or behind the surface its texture lies, by what several photographs show alike: where paint has a pattern, parallax tells depth.
 
 Shading knows which way a surface faces and masks know where it ends; neither knows how deep the floor of a recess lies, and masks that are drawn by
-hand are a few pixels wide. A small patch at a vertex, across its normal, is laid at several depths along that normal and looked up in the photographs
-that see it best. Where their patterns agree (zero-mean normalised cross-correlation, the better half of the pairs, so that a view that is hidden there
+hand are a few pixels wide. A small patch of the surface around a vertex is moved to several depths along its normal and looked up in the photographs
+that see it best. (A flat patch lies before a round surface but at its middle, so its best depth is too deep, by half a pixel on limbs 25 pixels wide; and it
+reaches beyond what is narrower than it.) Where their patterns agree (zero-mean normalised cross-correlation, the better half of the pairs, so that a view that is hidden there
 does not count) at one depth and at no other, the texture lies there. Plain places agree everywhere or nowhere, mirrors at depths that depend on
-the pair: neither says anything. A scene of which hardly any place says something is not asked further.
+the pair: neither says anything. What the patches around say differently is believed less. A scene of which hardly any place says something is not asked further.
 
 In: the mesh through its tracer, normals, photographs. Out: MatchedDepths. Source: Furukawa and Ponce 2010 (patches along normals;
 docs/sources.md: furukawa2010).
@@ -40,6 +41,8 @@ NEAREST, FARTHEST = 0.105, 0.78
 """Angles between the views of a pair [radians]: from 6 degrees there is parallax, up to 45 patterns look alike."""
 MARGIN = 8
 """Pixels of a photograph's border where no patch is looked up."""
+RELIEF = 1.0
+"""Of half a patch's width: how far before or behind its vertex a patch may reach, along the normal. What turns away more is not asked."""
 FAINT = 0.01
 """Standard deviation of a patch, of display values 0..1, that is noise."""
 ALIKE, WELL_ALIKE = 0.5, 0.8
@@ -95,13 +98,20 @@ def matched_texture(
         return MatchedDepths(tracer.mesh.vertices, torch.zeros_like(metal))
     some, found = every(ASKED)
     # The surroundings lie about as deep: what chance makes agree at one vertex it does not at the next.
-    rings = 1 if len(some) == count else 2
+    rings, around = 1 if len(some) == count else 2, averaging_matrix(edges, count)
     sums = search.vertices.new_zeros(count, len(search.depths) + 1)
     sums[some] = torch.cat([found.score, found.seen[:, None].to(found.score)], -1)
-    sums = averaged(averaging_matrix(edges, count), sums, rings)
+    sums = averaged(around, sums, rings)
     score = sums[:, :-1] / sums[:, -1:].clamp(min=1e-6)
     weight = _believed(score) * paint
     depth = torch.where(weight > 0, _best_depth(score, search.depths), 0.0)
+    start, end = search.vertices[edges.vertices].unbind(1)
+    # A mean over neighbours is as wide as 0.65 edges along each axis, and squares of widths add.
+    wide = max(1, round((0.5 * PATCH * SPACING * search.pixel / (0.65 * float((start - end).norm(dim=1).mean()))) ** 2))
+    known, mean, square = averaged(around, torch.stack([weight, weight * depth, weight * depth.square()], -1), wide).unbind(-1)
+    mean, square = mean / known.clamp(min=1e-9), square / known.clamp(min=1e-9)
+    odds = ((depth - mean).square() + (square - mean.square()).clamp(min=0)) / (0.5 * search.step) ** 2
+    weight = weight / (1 + odds)
     return MatchedDepths(tracer.mesh.vertices + depth[:, None] * search.normals, weight)
 
 
@@ -143,9 +153,10 @@ class _Search:
         return _Scores(torch.cat([part.score for part in parts]), torch.cat([part.seen for part in parts]))
 
     def _scores_of(self, index: Int[Tensor, "asked"]) -> _Scores:
-        facing = self._facing(index)
+        across, whole = self._across(index)
+        facing = self._facing(index) * whole[:, None]
         facing, view = facing.topk(min(VIEWS, len(self.cameras)), dim=1)
-        patterns = self._patterns(index, view, facing > 0)
+        patterns = self._patterns(index, across, view, facing > 0)
         one, other = torch.triu_indices(view.shape[1], view.shape[1], 1, device=index.device)
         towards = self.towards[index[:, None], view]
         apart = (towards[:, one] * towards[:, other]).sum(-1).clamp(-1, 1).acos()
@@ -174,15 +185,29 @@ class _Search:
             facing[sees[open_], view] = cosine[sees[open_]]
         return facing
 
-    def _patterns(
-        self, index: Int[Tensor, "asked"], view: Int[Tensor, "asked chosen"], counts: Bool[Tensor, "asked chosen"]
-    ) -> Float[Tensor, "asked depth chosen sample"]:
-        """Patches of mean 0 and length 1, at each depth and in each of the chosen views."""
+    def _across(self, index: Int[Tensor, "asked"]) -> tuple[Float[Tensor, "asked sample 3"], Bool[Tensor, "asked"]]:
+        """From each vertex to the samples of its patch [world units], on the surface before and behind its tangent plane; and whether all were found."""
         normal = self.normals[index]
         helper = torch.where(normal[:, 2:].abs() < 0.9, normal.new_tensor([0.0, 0.0, 1.0]), normal.new_tensor([1.0, 0.0, 0.0]))
         tangent = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=-1)
         bitangent = torch.linalg.cross(normal, tangent)
-        across = self.patch[:, :1] * tangent[:, None] + self.patch[:, 1:] * bitangent[:, None]
+        flat = self.patch[:, :1] * tangent[:, None] + self.patch[:, 1:] * bitangent[:, None]
+        above = RELIEF * float(self.patch.max())
+        start = (self.vertices[index] + above * normal)[:, None] + flat
+        hits = trace_rays(start.reshape(-1, 3), -normal[:, None].expand_as(start).reshape(-1, 3), self.tracer)
+        found = (hits.hit & (hits.distance < 2 * above)).view(flat.shape[:2])
+        relief = torch.where(found, above - hits.distance.view(found.shape), 0.0)
+        return flat + relief[..., None] * normal[:, None], found.all(1)
+
+    def _patterns(
+        self,
+        index: Int[Tensor, "asked"],
+        across: Float[Tensor, "asked sample 3"],
+        view: Int[Tensor, "asked chosen"],
+        counts: Bool[Tensor, "asked chosen"],
+    ) -> Float[Tensor, "asked depth chosen sample"]:
+        """Patches of mean 0 and length 1, at each depth and in each of the chosen views."""
+        normal = self.normals[index]
         patterns = normal.new_zeros(len(index), len(self.depths), view.shape[1], len(self.patch))
         for number, (camera, picture) in enumerate(zip(self.cameras, self.pictures, strict=True)):
             vertex, slot = ((view == number) & counts).nonzero().unbind(1)

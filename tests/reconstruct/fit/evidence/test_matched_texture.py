@@ -109,3 +109,48 @@ def test_one_view_two_and_an_object_of_a_pixel_say_nothing(views: int, radius: f
     )
     found = matched_texture(build_tracer(mesh), mesh.normals, torch.zeros(len(mesh.vertices)), mesh_edges(mesh.faces), few, radius)
     assert not found.weight.any() and torch.equal(found.places, mesh.vertices)
+
+
+TUBE = 0.2
+"""Radius, 12 pixels: a patch is as wide."""
+
+
+def photographs_of_a_tube() -> Views:
+    """Along x, through the origin; nothing behind it."""
+    cameras, images, coverage = cameras_above(), [], []
+    row, column = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    for camera in cameras:
+        rotation, center = camera.camera_from_world[:3, :3], camera.center_world
+        ray = torch.stack([(column - SIZE / 2) / FOCAL, (row - SIZE / 2) / FOCAL, torch.ones_like(row)], -1) @ rotation
+        a, half_b = ray[..., 1:].square().sum(-1), (ray[..., 1:] * center[1:]).sum(-1)
+        root = half_b.square() - a * (center[1:].square().sum() - TUBE**2)
+        at = center + ray * ((-half_b - root.clamp(min=0).sqrt()) / a)[..., None]
+        value = pattern(at[..., 0], TUBE * torch.atan2(at[..., 1], at[..., 2]))
+        images.append(((root > 0) * (0.1 + 0.8 * value) * 255)[..., None].expand(-1, -1, 3).round().to(torch.uint8))
+        coverage.append(((root > 0) * 255).to(torch.uint8))
+    return Views(cameras, tuple(images), tuple(coverage), None, None, True, "test")
+
+
+def tube(along: int = 49, around: int = 96) -> TriangleMesh:
+    """The surface itself over x in [-0.6, 0.6]."""
+    x, turn = torch.meshgrid(torch.linspace(-0.6, 0.6, along), torch.arange(around) * (2 * math.pi / around), indexing="ij")
+    normals = torch.stack([torch.zeros_like(x), turn.sin(), turn.cos()], -1).reshape(-1, 3)
+    vertices = torch.stack([x, TUBE * turn.sin(), TUBE * turn.cos()], -1).reshape(-1, 3)
+    ring, place = torch.meshgrid(torch.arange(along - 1), torch.arange(around), indexing="ij")
+    here, beside = (ring * around + place).flatten(), (ring * around + (place + 1) % around).flatten()
+    faces = torch.cat([torch.stack([here, here + around, beside], -1), torch.stack([beside, here + around, beside + around], -1)]).int()
+    count = len(vertices)
+    return TriangleMesh(vertices, faces, normals, torch.full((count, 3), 0.5), torch.full((count,), 0.5), torch.zeros(count))
+
+
+def test_a_tube_as_wide_as_patches_that_lies_right_is_left_there():
+    mesh = tube()
+    nothing = torch.zeros(len(mesh.vertices))
+    found = matched_texture(build_tracer(mesh), mesh.normals, nothing, mesh_edges(mesh.faces), photographs_of_a_tube(), 1.0)
+    pixel = FAR / FOCAL
+    # What the cameras look down on: farther round they all look from one side, and not at all of a patch.
+    asked = (mesh.normals[:, 2] > math.cos(math.radians(30))) & (mesh.vertices[:, 0].abs() < 0.4)
+    believed = asked & (found.weight > 0.1)
+    off = ((found.places - mesh.vertices) * mesh.normals).sum(-1)[believed] / pixel
+    assert float(believed.sum() / asked.sum()) > 0.8
+    assert abs(float(off.median())) < 0.2 and float(off.abs().quantile(0.95)) < 0.5, (off.median(), off.abs().quantile(0.95))
