@@ -21,6 +21,13 @@ def averaging_matrix(edges: MeshEdges, count: int, weight: Float[Tensor, "edge"]
     return diags(1 / np.asarray(adjacency.sum(1)).ravel()) @ adjacency
 
 
+def rings_as_wide_as(width: float, edges: MeshEdges, vertices: Float[Tensor, "vertex 3"]) -> int:
+    """How often to average for a mean that is `width` wide (standard deviation along each axis, in units of the vertices); at least once."""
+    start, end = vertices[edges.vertices].unbind(1)
+    # A mean over neighbours is as wide as 0.65 edges along each axis, and squares of widths add.
+    return max(1, round((width / (0.65 * float((start - end).norm(dim=1).mean()))) ** 2))
+
+
 def averaged(around: csr_matrix, values: Tensor, rings: int) -> Tensor:
     """Values (vertex, k), averaged `rings` times by an averaging_matrix."""
     result = values.cpu().double().numpy()

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix, rings_as_wide_as
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges, mesh_edges
 from drgs.scene.mesh import vertex_normals
 
@@ -180,9 +180,7 @@ def emptied(
 def _creases(vertices: Tensor, faces: Tensor, edges: MeshEdges, radius: float, settings: FillingSettings) -> Int[np.ndarray, "crease"]:
     """Vertices on concave creases, the deepest first and none near another."""
     count = len(vertices)
-    start, end = vertices[edges.vertices].unbind(1)
-    # A mean over neighbours is as wide as 0.65 edges along each axis, and squares of widths add.
-    rings = max(1, round((settings.concavity_width * radius / (0.65 * float((start - end).norm(dim=1).mean()))) ** 2))
+    rings = rings_as_wide_as(settings.concavity_width * radius, edges, vertices)
     inward = vertices - averaged(averaging_matrix(edges, count), vertices, rings)
     depth = (-(inward * vertex_normals(vertices, faces)).sum(-1) / radius).cpu().numpy()
     order = np.argsort(-depth, kind="stable")

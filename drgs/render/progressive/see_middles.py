@@ -3,31 +3,16 @@
 Frames at rest add up what their passes see (frame_sums.py) and take the mean. A moving picture has one pass, which is its own mean.
 """
 
-from typing import Any
-
 import torch
 import warp as wp
 
 from drgs.render.integrate.sample_rays import PointArrays, point_arrays
 from drgs.render.records import GBuffer, PrimaryPoints
 from drgs.render.visible.image_tiles import Window
+from drgs.render.visible.rasterize.gbuffer import GBufferArrays, gbuffer_arrays
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class MapArrays:
-    """GBuffer as kernels write it, in the order of a window's pixels."""
-
-    coverage: wp.array[float]
-    depth: wp.array[float]
-    position: wp.array[wp.vec3]
-    normal: wp.array[wp.vec3]
-    wo: wp.array[wp.vec3]
-    albedo: wp.array[wp.vec3]
-    roughness: wp.array[float]
-    metallic: wp.array[float]
 
 
 @wp.kernel
@@ -40,7 +25,7 @@ def scatter_points(
     column: int,
     width: int,
     # outputs
-    maps: MapArrays,
+    maps: GBufferArrays,
 ):
     i = first + wp.tid()
     y = points.pixel[i] / image_width
@@ -62,14 +47,5 @@ def see_middles(primary: PrimaryPoints, window: Window) -> GBuffer:
     position, normal, wo, albedo = (primary.depth.new_zeros(*shape, 3) for _ in range(4))
     maps = GBuffer(coverage, primary.depth.new_full(shape, torch.inf), position, normal, wo, albedo, roughness, metallic)
     inputs = [point_arrays(primary.points), warp_array(primary.depth), window.width, window.rows.start, window.columns.start, shape[1]]
-    launch(scatter_points, len(primary.depth), inputs, [_map_arrays(maps)], warp_device(primary.depth))
+    launch(scatter_points, len(primary.depth), inputs, [gbuffer_arrays(maps)], warp_device(primary.depth))
     return maps
-
-
-def _map_arrays(maps: GBuffer) -> Any:
-    arrays = MapArrays()
-    arrays.coverage, arrays.depth = warp_array(maps.coverage.view(-1)), warp_array(maps.depth.view(-1))
-    arrays.roughness, arrays.metallic = warp_array(maps.roughness.view(-1)), warp_array(maps.metallic.view(-1))
-    vectors = (maps.position_world, maps.normal_world, maps.wo_world, maps.albedo)
-    arrays.position, arrays.normal, arrays.wo, arrays.albedo = (warp_array(values.view(-1, 3), wp.vec3) for values in vectors)
-    return arrays

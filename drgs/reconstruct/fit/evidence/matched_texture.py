@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix, rings_as_wide_as
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -41,6 +41,8 @@ NEAREST, FARTHEST = 0.105, 0.78
 """Angles between the views of a pair [radians]: from 6 degrees there is parallax, up to 45 patterns look alike."""
 MARGIN = 8
 """Pixels of a photograph's border where no patch is looked up."""
+HALF_BELIEVED = 0.5
+"""Of a step: what is so far from the patches around, or among patches that are so far apart, counts half."""
 RELIEF = 1.0
 """Of half a patch's width: how far before or behind its vertex a patch may reach, along the normal. What turns away more is not asked."""
 FAINT = 0.01
@@ -105,13 +107,11 @@ def matched_texture(
     score = sums[:, :-1] / sums[:, -1:].clamp(min=1e-6)
     weight = _believed(score) * paint
     depth = torch.where(weight > 0, _best_depth(score, search.depths), 0.0)
-    start, end = search.vertices[edges.vertices].unbind(1)
-    # A mean over neighbours is as wide as 0.65 edges along each axis, and squares of widths add.
-    wide = max(1, round((0.5 * PATCH * SPACING * search.pixel / (0.65 * float((start - end).norm(dim=1).mean()))) ** 2))
+    wide = rings_as_wide_as(0.5 * PATCH * SPACING * search.pixel, edges, search.vertices)
     known, mean, square = averaged(around, torch.stack([weight, weight * depth, weight * depth.square()], -1), wide).unbind(-1)
     mean, square = mean / known.clamp(min=1e-9), square / known.clamp(min=1e-9)
-    odds = ((depth - mean).square() + (square - mean.square()).clamp(min=0)) / (0.5 * search.step) ** 2
-    weight = weight / (1 + odds)
+    disagreement = ((depth - mean).square() + (square - mean.square()).clamp(min=0)) / (HALF_BELIEVED * search.step) ** 2
+    weight = weight / (1 + disagreement)
     return MatchedDepths(tracer.mesh.vertices + depth[:, None] * search.normals, weight)
 
 

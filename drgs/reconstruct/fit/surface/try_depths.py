@@ -33,7 +33,7 @@ from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, seen_p
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import drawn_view, view_targets
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
-from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix, rings_as_wide_as
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.thickness import thickness
 from drgs.render.intersect.tracer import AbstractTracer
@@ -137,9 +137,7 @@ def try_depths(
     trials = Trials(views, faces, settings, seed, report, should_stop)
     edges, count = trials.edges, len(parameters["vertices"])
     around = averaging_matrix(edges, count)
-    start, end = parameters["vertices"][edges.vertices].unbind(1)
-    # A mean over neighbours is as wide as 0.65 edges along each axis, and squares of widths add.
-    rings = max(1, round((settings.spread * radius / (0.65 * float((start - end).norm(dim=1).mean()))) ** 2))
+    rings = rings_as_wide_as(settings.spread * radius, edges, parameters["vertices"])
     outward = averaged(around, vertex_normals(parameters["vertices"], faces), 2 * rings)
     inward = -torch.nn.functional.normalize(outward, dim=-1)
 

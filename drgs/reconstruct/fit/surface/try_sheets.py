@@ -19,7 +19,7 @@ from torch import Tensor
 
 from drgs.reconstruct.fit.fit_loop import FitReport
 from drgs.reconstruct.fit.surface.try_depths import FOREIGN_ERROR, Settled, Trials, TrialSettings, error_ratio
-from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix, rings_as_wide_as
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.find_fillings import FillingSettings, emptied, find_fillings
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -95,9 +95,7 @@ def try_sheets(
     nothing = torch.zeros(count, dtype=torch.bool, device=vertices.device)
     if not fillings:
         return TriedSheets(parameters, nothing)
-    start, end = vertices[edges.vertices].unbind(1)
-    # A mean over neighbours is as wide as 0.65 edges along each axis, and squares of widths add.
-    rings = max(1, round((settings.trials.spread * radius / (0.65 * float((start - end).norm(dim=1).mean()))) ** 2))
+    rings = rings_as_wide_as(settings.trials.spread * radius, edges, vertices)
 
     def smoothed(values: Tensor, over: int = rings) -> Tensor:
         return averaged(around, values.float().view(count, -1), over).squeeze(1)

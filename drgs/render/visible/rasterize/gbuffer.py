@@ -176,7 +176,7 @@ def rasterize_gbuffer(surfels: PosedSurfels, camera: Camera, settings: RasterSet
     gbuffer = GBuffer(coverage, depth, position, normal, wo, albedo, roughness, metallic)
     sums = [warp_view(values) for values in (maps.features, maps.coverage, maps.depth_sum)]
     inputs = [_pixel_view(camera, rows.start, maps.depth_origin), *sums]
-    launch(write_gbuffer, size[0] * size[1], inputs, [_gbuffer_arrays(gbuffer)], warp)
+    launch(write_gbuffer, size[0] * size[1], inputs, [gbuffer_arrays(gbuffer)], warp)
     return gbuffer
 
 
@@ -188,7 +188,8 @@ def _pixel_view(camera: Camera, top: int, depth_origin: float) -> Any:
     return view
 
 
-def _gbuffer_arrays(gbuffer: GBuffer) -> Any:
+def gbuffer_arrays(gbuffer: GBuffer) -> Any:
+    """Its memory, for kernels to write."""
     arrays = GBufferArrays()
     arrays.coverage, arrays.depth = warp_array(gbuffer.coverage.view(-1)), warp_array(gbuffer.depth.view(-1))
     arrays.position = warp_array(gbuffer.position_world.view(-1, 3), wp.vec3)
