@@ -89,6 +89,7 @@ def build(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Build:
     """One build, never stopped."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "tiny", TINY)
+        patch.setattr(report_progress, "REPORT_SECONDS", 0.0)  # every step is told, however fast the machine
         progress: list[Progress] = []
         out = tmp_path_factory.mktemp("built") / "sphere"
         return Build(build_asset(capture, out, SETTINGS, progress.append), out, progress)
