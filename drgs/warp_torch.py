@@ -8,8 +8,9 @@ them to a thread pool. Kernels launched this way take `first: int` as their firs
 import os
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -39,7 +40,8 @@ def _init_warp() -> None:
 
 
 GRADIENT_SLICES = 4
-"""Parts of a launch that add into a copy each of what many threads add to: fixed, so that sums do not depend on how many cores there are."""
+"""Parts of a launch that add into a copy each of what many threads add to: fixed, so that sums do not depend on how many cores there are. In the
+pool's own threads a launch is one part."""
 FEWEST_FOR_THREADS = 1024
 """Indices of a launch; with fewer it takes longer to wake threads than to be done."""
 
@@ -47,6 +49,8 @@ _init_warp()
 
 _pool: ThreadPoolExecutor | None = None
 _here = threading.local()
+_loading = threading.Lock()
+"""One thread at a time compiles or loads modules."""
 
 
 def in_thread_pool() -> bool:
@@ -54,8 +58,34 @@ def in_thread_pool() -> bool:
     return getattr(_here, "pooled", False)
 
 
-def _mark_thread() -> None:
+@contextmanager
+def as_in_thread_pool() -> Iterator[None]:
+    """For work that the pool would do, were there more than one thread: it is to have the same sums."""
+    pooled, _here.pooled = in_thread_pool(), True
+    try:
+        yield
+    finally:
+        _here.pooled = pooled
+
+
+def gradient_slices() -> int:
+    """Parts that in_gradient_slices cuts a launch of the caller's into."""
+    return 1 if in_thread_pool() else GRADIENT_SLICES
+
+
+def _begin_thread(threads: int) -> None:
+    """Of the pool: torch gives what is done here to this thread alone, or each would want all cores for itself.
+
+    Args:
+        threads: torch's for all others.
+    """
     _here.pooled = True
+    torch.get_num_threads()  # the first question takes over what is set for all, and would undo the next line later
+    torch.set_num_threads(1)
+    # That number is also what threads begin with that are started from now on; so it is set again, by one that ends.
+    restoring = threading.Thread(target=torch.set_num_threads, args=(threads,))
+    restoring.start()
+    restoring.join()
 
 
 def thread_count() -> int:
@@ -68,7 +98,8 @@ def thread_pool() -> ThreadPoolExecutor:
     """The pool shared by all CPU launches (and by other callers of code that releases the GIL)."""
     global _pool
     if _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="drgs", initializer=_mark_thread)
+        threads = (torch.get_num_threads(),)
+        _pool = ThreadPoolExecutor(thread_count(), thread_name_prefix="drgs", initializer=_begin_thread, initargs=threads)
     return _pool
 
 
@@ -95,7 +126,8 @@ def warp_device(tensor: Tensor) -> Any:
 def load_kernel(kernel: Any, device: Any) -> None:
     """Compile a kernel's module before threads race for it; the CPU's launches have blocks of 1, and Warp compiles for a block size."""
     device = wp.get_device(device)
-    kernel.module.load(device, None if device.is_cuda else 1)
+    with _loading:
+        kernel.module.load(device, None if device.is_cuda else 1)
 
 
 def launch(kernel: Any, count: int, inputs: list, outputs: list, device: Any, slices_per_thread: int = 4) -> None:
@@ -139,11 +171,13 @@ def device_from_name(name: str) -> torch.device:
     return torch.device(name)
 
 
-def in_gradient_slices(run: Callable[[int], None], device: wp.Device, count: int) -> None:
-    """run(k) for each of GRADIENT_SLICES parts of `count` indices: by the thread pool on the CPU, one after another on CUDA and where they are few."""
-    if device.is_cuda or count < FEWEST_FOR_THREADS:
-        for k in range(GRADIENT_SLICES):
-            run(k)
+def in_gradient_slices(run: Callable[[int, int], None], device: wp.Device, count: int) -> None:
+    """run(k, slices) for each of gradient_slices() parts of `count` indices: by the thread pool on the CPU, one after another on CUDA and where they
+    are few."""
+    slices = gradient_slices()
+    if device.is_cuda or count < FEWEST_FOR_THREADS or slices == 1:
+        for k in range(slices):
+            run(k, slices)
     else:
-        for done in [thread_pool().submit(run, k) for k in range(GRADIENT_SLICES)]:
+        for done in [thread_pool().submit(run, k, slices) for k in range(slices)]:
             done.result()

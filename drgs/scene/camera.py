@@ -50,6 +50,14 @@ def scaled_camera(camera: Camera, factor: float) -> Camera:
     return Camera(camera.camera_from_world, scale @ camera.intrinsics, width, height, camera.name)
 
 
+def windowed_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
+    """The part of the view in these rows and columns (exact: what falls on a pixel falls on it still)."""
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[0, 2] -= columns.start
+    intrinsics[1, 2] -= rows.start
+    return Camera(camera.camera_from_world, intrinsics, columns.stop - columns.start, rows.stop - rows.start, camera.name)
+
+
 def world_from_pixel(camera: Camera) -> Tensor:
     """(3, 3): takes (x, y, 1) of a place on the image [pixels; centres at + 0.5] to its viewing direction, not of unit length."""
     return camera.camera_from_world[:3, :3].T @ torch.linalg.inv(camera.intrinsics)

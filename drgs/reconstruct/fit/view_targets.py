@@ -1,17 +1,22 @@
 """Photographs as the losses want them, and which of them a step looks at.
 
-In: Views. Out: one ViewTarget a view, at full or at half size, on the fit's device.
+In: Views. Out: one ViewTarget a view, at full or at half size, on the fit's device; of the whole photograph or of what is around its mask.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from drgs.maths.color import linear_from_srgb, srgb_from_linear
-from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.camera import Camera, scaled_camera, windowed_camera
 from drgs.scene.views import Views
+
+BOX_MARGIN = 8
+"""[pixels] around the mask."""
+WINDOW_SHARE = 8
+"""The windows of `windowed` are wider than the mask's box by its longer side over this, on each side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +36,14 @@ class ViewTarget:
     """Value of `saturation` from which the camera's sensor clipped."""
     light_from_world: Float[Tensor, "3 3"] | None = None
     """Rotation of directions in the world to those of the light's table; None: the same."""
+    whole: Camera | None = None
+    """Of the photograph, where this is a window of it; None: this is all of it."""
+
+    @property
+    def share(self) -> float:
+        """Pixels over the whole photograph's."""
+        whole = self.whole or self.camera
+        return self.camera.width * self.camera.height / (whole.width * whole.height)
 
     @property
     def box(self) -> tuple[slice, slice]:
@@ -55,12 +68,32 @@ def view_targets(views: Views, factor: float, device: torch.device) -> list[View
         else:
             premultiplied = photo * alpha[..., None]
         rows, columns = (alpha > 0).any(1).nonzero().flatten(), (alpha > 0).any(0).nonzero().flatten()
-        margin = 8
-        down, across = (slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else slice(0, 1) for x in (rows, columns))
+        down, across = (
+            slice(max(0, int(x[0]) - BOX_MARGIN), int(x[-1]) + BOX_MARGIN + 1) if len(x) else slice(0, 1) for x in (rows, columns)
+        )
         premultiplied, photo, alpha = (x.contiguous().to(device) for x in (premultiplied, photo, alpha))
         turn = None if turn is None else turn.to(device)
         targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, down, across, ceiling, turn))
     return targets
+
+
+def windowed(target: ViewTarget) -> ViewTarget:
+    """The part of a photograph around its mask's box, with a margin in which what strays beyond the mask is still seen."""
+    height, width = target.mask.shape
+    down, across = (slice(part.start, min(part.stop, size)) for part, size in zip(target.box, (height, width), strict=True))
+    margin = -(-max(down.stop - down.start, across.stop - across.start) // WINDOW_SHARE)
+    rows, columns = (slice(max(0, part.start - margin), min(size, part.stop + margin)) for part, size in ((down, height), (across, width)))
+    photo, saturation, mask = (x[rows, columns].contiguous() for x in (target.photo, target.saturation, target.mask))
+    return replace(
+        target,
+        camera=windowed_camera(target.camera, rows, columns),
+        photo=photo,
+        saturation=saturation,
+        mask=mask,
+        rows=slice(down.start - rows.start, down.stop - rows.start),
+        columns=slice(across.start - columns.start, across.stop - columns.start),
+        whole=target.camera,
+    )
 
 
 def drawn_view(iteration: int, count: int, seed: int) -> int:

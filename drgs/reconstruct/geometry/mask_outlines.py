@@ -18,7 +18,7 @@ from scipy.ndimage import map_coordinates
 from skimage.measure import find_contours
 from torch import Tensor
 
-from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.trace_rays import over_slices, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Hits
 from drgs.scene.camera import Camera, world_from_pixel
@@ -93,7 +93,8 @@ def mask_outlines(views: Views) -> list[MaskOutline | None]:
 @torch.no_grad()
 def outline_residuals(tracer: AbstractTracer, cameras: tuple[Camera, ...], outlines: list[MaskOutline | None]) -> OutlineResiduals:
     """How far the mesh's outlines lie from the masks'."""
-    parts = [_residuals_of_view(tracer, camera, outline) for camera, outline in zip(cameras, outlines, strict=True) if outline is not None]
+    views = [(camera, outline) for camera, outline in zip(cameras, outlines, strict=True) if outline is not None]
+    parts = over_slices(len(views), tracer.mesh.vertices.device, lambda k, _: _residuals_of_view(tracer, *views[k]), 1)
     if not parts:
         nothing = tracer.mesh.vertices.new_zeros(0)
         return OutlineResiduals(nothing.new_zeros(0, 3).long(), *(nothing.new_zeros(0, *tail) for tail in ((3,), (), (3,), ())))

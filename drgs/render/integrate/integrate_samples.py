@@ -17,7 +17,7 @@ from torch import Tensor
 from drgs.maths.constants import F0, MIN_ROUGHNESS
 from drgs.render.integrate.brdf_warp import PI, ggx_d, smith_v
 from drgs.render.records import Rays, ShadingPoints
-from drgs.warp_torch import GRADIENT_SLICES, in_gradient_slices, load_kernel, warp_argument, warp_device
+from drgs.warp_torch import gradient_slices, in_gradient_slices, load_kernel, warp_argument, warp_device
 
 
 @wp.func
@@ -99,7 +99,7 @@ class _Contributions(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         point_gradients = [torch.zeros_like(x) for x in inputs[-_DIFFERENTIABLE:-1]]
-        table_gradients = torch.zeros(GRADIENT_SLICES, *inputs[-1].shape, device=gradient.device)
+        table_gradients = torch.zeros(gradient_slices(), *inputs[-1].shape, device=gradient.device)
         _launch(ctx.height, inputs, gradient.contiguous(), (point_gradients, table_gradients))
         return None, *[None] * (len(inputs) - _DIFFERENTIABLE), *point_gradients, table_gradients.sum(0)
 
@@ -114,9 +114,9 @@ def _launch(height: int, inputs: Sequence[Tensor], contribution: Tensor, gradien
     out = warp_argument(contribution, wp.vec3)
     load_kernel(ray_contributions, device)
 
-    def run(k: int) -> None:
+    def run(k: int, slices: int) -> None:
         # Slices end between points, so no two threads add to one point's gradient.
-        first, last = points * k // GRADIENT_SLICES * samples, points * (k + 1) // GRADIENT_SLICES * samples
+        first, last = points * k // slices * samples, points * (k + 1) // slices * samples
         values = [first, samples, height, *arrays]
         if gradients is None:
             wp.launch(ray_contributions, dim=last - first, inputs=values, outputs=[out], device=device)

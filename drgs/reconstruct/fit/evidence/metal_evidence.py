@@ -34,6 +34,7 @@ from drgs.reconstruct.fit.light.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.render.intersect.trace_rays import over_slices
 from drgs.render.intersect.tracer import AbstractTracer
 
 FEWEST_VIEWS = 4
@@ -64,6 +65,8 @@ DECISIVE = 0.3
 """Agreement of a place and its surroundings, -1..1, at which evidence is 0.76."""
 
 
+VIEW_PARTS = 4
+"""Parts of the views that are summed up side by side."""
 SCALES = tuple(2 ** (k / 2) for k in range(-6, 7))
 """Of the light, that are compared."""
 RIGHT_SCALE = 1.2
@@ -114,6 +117,19 @@ class ViewSums:
 
 def view_sums(tracer: AbstractTracer, targets: list[ViewTarget], light_of: LightOf) -> ViewSums:
     """Of the tracer's mesh, whose roughness is taken as known."""
+    device = tracer.mesh.vertices.device
+    # So many parts on any machine: sums must not depend on how many cores there are.
+    length = max(1, -(-len(targets) // VIEW_PARTS))
+    parts = over_slices(len(targets), device, lambda first, last: _sums_of(targets[first:last], tracer, light_of), length)
+    parts = parts or [_sums_of([], tracer, light_of)]
+    sums = torch.stack([part[0] for part in parts]).sum(0)
+    pp, pe, pa, pb, ee, ea, eb, aa, ab, bb = sums.unbind()
+    return ViewSums(pp, pe, pa, pb, ee, ea, eb, aa, ab, bb, torch.stack([part[1] for part in parts]).sum(0))
+
+
+@torch.no_grad()
+def _sums_of(targets: list[ViewTarget], tracer: AbstractTracer, light_of: LightOf) -> tuple[Tensor, Tensor]:
+    """(10, vertex, 3) products and (vertex,) number of these views."""
     mesh = tracer.mesh
     count, device = len(mesh.vertices), mesh.vertices.device
     sums = torch.zeros(10, count, 3, device=device)
@@ -139,8 +155,7 @@ def view_sums(tracer: AbstractTracer, targets: list[ViewTarget], light_of: Light
         for k, product in enumerate(products):
             sums[k].index_add_(0, seen, weight * product)
         views.index_add_(0, seen, torch.ones_like(roughness))
-    pp, pe, pa, pb, ee, ea, eb, aa, ab, bb = sums.unbind()
-    return ViewSums(pp, pe, pa, pb, ee, ea, eb, aa, ab, bb, views)
+    return sums, views
 
 
 def metal_evidence(sums: ViewSums, edges: MeshEdges, turned: bool, scale: float = 1.0) -> Float[Tensor, "vertex"]:

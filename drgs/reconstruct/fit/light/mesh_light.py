@@ -19,7 +19,7 @@ from drgs.reconstruct.fit.light.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.integrate.environment_table import build_environment_table
 from drgs.render.integrate.sample_rays import sample_rays
-from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.trace_rays import over_slices, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import SampleCounts, ShadingPoints
 from drgs.scene.environment import Environment, environment_radiance
@@ -29,7 +29,7 @@ SHARE_LIFT = 4.0
 """Of the tracer's lift: rays from vertices must clear all faces around them."""
 BRIGHTEST_SHARE = 3.0
 """More than this times the open sky's irradiance is noise."""
-SHARED_AT_ONCE = 8192
+SHARED_AT_ONCE = 4096
 """Vertices whose rays are traced together."""
 MIRRORS = 2
 """Times that what a mirrored ray meets mirrors the object again. Few rays meet anything, so it costs little."""
@@ -57,7 +57,8 @@ def at_corners(values: Tensor, corners: Tensor, weights: Tensor) -> Tensor:
     """(point, ...) of vertex values (vertex, ...) at corners (point, 3) by weights (point, 3)."""
     # index_select, whose gradient is one index_add: that of values[corners] takes five times as long on a CPU.
     around = values.index_select(0, corners.reshape(-1)).view(*corners.shape, *values.shape[1:])
-    return (around * weights.view(*weights.shape, *[1] * (values.ndim - 1))).sum(1)
+    first, second, third = (around * weights.view(*weights.shape, *[1] * (values.ndim - 1))).unbind(1)
+    return first + second + third  # a sum over an axis of three takes a CPU four times as long
 
 
 def corner_weights(barycentric: Tensor) -> Tensor:
@@ -169,12 +170,13 @@ def irradiance_share(tracer: AbstractTracer, environment: Environment, light: Me
     by_light = rays // 2
     counts = SampleCounts(rays - by_light, 0, by_light)
     seed = int(torch.randint(1 << 31, (1,), generator=generator))
-    shares = []
-    for first in range(0, len(mesh.vertices), SHARED_AT_ONCE):
-        some = slice(first, first + SHARED_AT_ONCE)
-        normal, count = mesh.normals[some], len(mesh.normals[some])
+
+    @torch.no_grad()
+    def shares(first: int, last: int) -> Tensor:
+        some, count = slice(first, last), last - first
+        normal = mesh.normals[some]
         one = torch.ones(count, device=normal.device)
-        index = torch.arange(first, first + count, dtype=torch.int32, device=normal.device)
+        index = torch.arange(first, last, dtype=torch.int32, device=normal.device)
         points = ShadingPoints(mesh.vertices[some], normal, normal, torch.ones_like(normal), one, 0 * one, index)
         sampled = sample_rays(points, table, counts, seed, SHARE_LIFT * tracer.lift)
         direction = sampled.direction_world.reshape(-1, 3)
@@ -184,5 +186,7 @@ def irradiance_share(tracer: AbstractTracer, environment: Environment, light: Me
         transmittance, met = radiance_along(tracer, origins, direction, light)
         sky = environment_radiance(environment, direction).view(count, rays, 3) * weight
         arriving = sky * transmittance.view(count, rays, 1) + met.view(count, rays, 3) * weight
-        shares.append(arriving.sum(1) / sky.sum(1).clamp(min=1e-6))
-    return torch.cat(shares).clamp(0, BRIGHTEST_SHARE)
+        return arriving.sum(1) / sky.sum(1).clamp(min=1e-6)
+
+    parts = over_slices(len(mesh.vertices), mesh.vertices.device, shares, SHARED_AT_ONCE)
+    return torch.cat([torch.zeros_like(mesh.vertices[:0]), *parts]).clamp(0, BRIGHTEST_SHARE)

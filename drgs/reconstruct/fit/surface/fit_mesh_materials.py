@@ -17,10 +17,12 @@ In: the state of fit_surface. Out: the same, further.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, radiance_along
@@ -28,10 +30,10 @@ from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, display_image
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, seen_twice
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_twice
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
-from drgs.render.integrate.environment_table import build_environment_table
+from drgs.render.integrate.environment_table import EnvironmentTable, build_environment_table
 from drgs.render.integrate.integrate_samples import integrate_samples
 from drgs.render.integrate.sample_rays import sample_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -95,6 +97,17 @@ def traced_light(tracer: AbstractTracer, light: MeshLight, points: ShadingPoints
     return transmittance, met
 
 
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What rays of a step meet."""
+
+    tracer: AbstractTracer
+    """With the materials of now."""
+    light: MeshLight
+    table: EnvironmentTable
+    """Of the light, for drawing from it."""
+
+
 class _Steps:
     """Final. Stage 2's part of the fit loop."""
 
@@ -118,17 +131,11 @@ class _Steps:
         normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
         materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
         terms: dict[str, Tensor] = {}
-        squared_error = None
-        chosen = self._drawn(self.solid[view])
-        twice = seen_twice(target, chosen, self.surface.tracer, self.state.generator)
-        if len(twice[0].pixels):
-            photo = target.saturation.reshape(-1, 3)[twice[0].pixels]
-            first, second = (
-                self._shown(seen, normals, materials, environment, photo, target, 2 * iteration + half) for half, seen in enumerate(twice)
-            )
-            terms["traced"] = crossed_halves(first, second, photo)
-            mean = 0.5 * (first + second).detach()
-            squared_error = float((mean.clamp(0, 1) - photo).square().mean())
+        traced, squared_error = self._traced(
+            target, self._drawn(self.solid[view]), environment, packed_surface(normals, materials), iteration
+        )
+        if squared_error is not None:
+            terms["traced"] = traced
         terms |= prior_terms(
             self.surface.edges, environment, normals, materials, parameters["metal"], settings.weight_bend, settings.weight_smooth,
             settings.weight_metal, settings.weight_white_light, settings.weight_rough_light,
@@ -140,36 +147,81 @@ class _Steps:
         most = min(self.settings.points_a_step, len(solid))
         return solid[torch.randint(max(1, len(solid)), (most,), generator=self.state.generator).to(solid.device)]
 
-    def _shown(
-        self,
-        seen: SeenPlaces,
-        normals: Tensor,
-        materials: dict[str, Tensor],
-        environment: Tensor,
-        photo: Tensor,
-        target: ViewTarget,
-        draw: int,
-    ) -> Tensor:
-        """(place, 3) colour in display space by one set of rays; gradients reach materials, normals and the light."""
-        points = ShadingPoints(
-            position_world=at_corners(self.surface.tracer.mesh.vertices, seen.corners, seen.weights),
-            normal_world=torch.nn.functional.normalize(at_corners(normals, seen.corners, seen.weights), dim=-1),
-            wo_world=seen.wo,
-            albedo=at_corners(materials["albedo"], seen.corners, seen.weights),
-            roughness=at_corners(materials["roughness"], seen.corners, seen.weights),
-            metallic=at_corners(materials["metallic"], seen.corners, seen.weights),
-            pixel=seen.pixels.int(),
-        )
-        face_normal = self.surface.tracer.face_normals[seen.face]
-        turned = in_light(points, target.light_from_world)
+    def _traced(
+        self, target: ViewTarget, pixels: Tensor, environment: Tensor, surface: Tensor, iteration: int
+    ) -> tuple[Tensor, float | None]:
+        """The mean error of `pixels` by two estimates of their colours, and the squared one of these estimates' mean; None where no pixel sees the mesh.
+
+        Args:
+            surface: of packed_surface.
+        """
         with torch.no_grad():
-            table = build_environment_table(Environment(environment.detach()))
-            rays = sample_rays(turned, table, self.settings.samples, self.settings.seed * 1_000_003 + draw)
             tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
-            light = self.surface.light_of(filter_environment(environment.detach()))(target)
-            transmittance, met = traced_light(tracer, light, points, face_normal, in_world(rays, target.light_from_world))
-        radiance = integrate_samples(turned, rays, transmittance, met, environment)
-        return display_image(radiance, torch.ones_like(points.roughness), photo, target.ceiling)
+            around = Surroundings(
+                tracer,
+                self.surface.light_of(filter_environment(environment.detach()))(target),
+                build_environment_table(Environment(environment.detach())),
+            )
+        cost = partial(_cost_of_pixels, pixels, target, around, self.settings, iteration)
+        total, (squared, count) = cost_in_slices(len(pixels), (environment, surface), cost, self.state.generator)
+        return (total / count, float(squared / count)) if count else (total, None)
+
+
+def _cost_of_pixels(
+    pixels: Tensor, target: ViewTarget, around: Surroundings, settings: MeshMaterialSettings, iteration: int, first: int, last: int,
+    leaves: tuple[Tensor, ...], generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """SliceCost of some of the `pixels`: the error, summed; the squared one and the number of channels that were compared.
+
+    Args:
+        leaves: the light's radiance and packed_surface.
+    """
+    environment, surface = leaves
+    twice = seen_twice(target, pixels[first:last], around.tracer, generator)
+    photo = target.saturation.reshape(-1, 3)[twice[0].pixels]
+    count = photo.numel()
+    if not count:
+        return environment.sum() * 0, environment.new_zeros(2)
+    halves = [
+        display_image(
+            _radiance(seen, surface, environment, target, around, settings, 2 * iteration + half),
+            torch.ones_like(photo[:, 0]),
+            photo,
+            target.ceiling,
+        )
+        for half, seen in enumerate(twice)
+    ]
+    mean = 0.5 * (halves[0] + halves[1]).detach()
+    squared = (mean.clamp(0, 1) - photo).square().sum()
+    return crossed_halves(halves[0], halves[1], photo) * count, torch.stack([squared, squared.new_tensor(count)])
+
+
+def _radiance(
+    seen: SeenPlaces,
+    surface: Tensor,
+    environment: Tensor,
+    target: ViewTarget,
+    around: Surroundings,
+    settings: MeshMaterialSettings,
+    draw: int,
+) -> Tensor:
+    """(place, 3) by one set of rays; gradients reach materials, normals and the light."""
+    tracer, turn = around.tracer, target.light_from_world
+    here = at_corners(surface, seen.corners, seen.weights)
+    points = ShadingPoints(
+        position_world=at_corners(tracer.mesh.vertices, seen.corners, seen.weights),
+        normal_world=torch.nn.functional.normalize(here[:, :3], dim=-1),
+        wo_world=seen.wo,
+        albedo=here[:, 3:6].contiguous(),
+        roughness=here[:, 6].contiguous(),
+        metallic=here[:, 7].contiguous(),
+        pixel=seen.pixels.int(),
+    )
+    turned = in_light(points, turn)
+    with torch.no_grad():
+        rays = sample_rays(turned, around.table, settings.samples, settings.seed * 1_000_003 + draw)
+        transmittance, met = traced_light(tracer, around.light, points, tracer.face_normals[seen.face], in_world(rays, turn))
+    return integrate_samples(turned, rays, transmittance, met, environment)
 
 
 def in_light(points: ShadingPoints, light_from_world: Tensor | None) -> ShadingPoints:

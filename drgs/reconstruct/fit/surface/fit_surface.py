@@ -14,21 +14,25 @@ In: Views with masks, a mesh, surfels for the normals to start from, the light o
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, rough_light, white_light
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, seen_twice, shade_places, steep_enough
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places, steep_enough
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
@@ -174,12 +178,9 @@ class _Steps:
         normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
         materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
         terms: dict[str, Tensor] = {}
-        pixels, first, second = self._shown(target, environment, normals, materials)
-        squared_error = None
-        if len(pixels):
-            photo = target.saturation.reshape(-1, 3)[pixels]
-            terms["shaded"] = crossed_halves(first, second, photo)
-            squared_error = float((first.detach().clamp(0, 1) - photo).square().mean())
+        shaded, squared_error = self._shaded(target, environment, normals, materials)
+        if squared_error is not None:
+            terms["shaded"] = shaded
         settings, progress = self.settings, iteration / self.settings.iterations
         bend = settings.weight_bend ** (1 - progress) * settings.weight_bend_end**progress
         smooth = settings.weight_smooth ** (1 - progress) * settings.weight_smooth_end**progress
@@ -189,20 +190,41 @@ class _Steps:
         )  # fmt: skip
         return StepLoss(terms, target.camera, squared_error)
 
-    def _shown(
+    def _shaded(
         self, target: ViewTarget, environment: Tensor, normals: Tensor, materials: dict[str, Tensor]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Flat indices of the pixels that mask and mesh fill, and two estimates of their colours (pixel, 3) in display space."""
+    ) -> tuple[Tensor, float | None]:
+        """The mean error of the pixels that mask and mesh fill, in display space, by two estimates of their colours, and the squared one of the
+        first; None where there is no such pixel."""
         solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
         if len(solid) > self.settings.pixels_a_step:
             drawn = torch.randperm(len(solid), generator=self.state.generator)[: self.settings.pixels_a_step]
             solid = solid[drawn.sort().values.to(solid.device)]
         tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
         light = self.surface.light_of(filter_environment(environment))(target)
-        twice = seen_twice(target, solid, self.surface.tracer, self.state.generator)
-        steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
-        first, second = (shade_places(seen[steep], target, tracer, normals, materials, light, self.state.generator) for seen in twice)
-        return twice[0].pixels[steep], first, second
+        cost = partial(_cost_of_pixels, solid, target, tracer, light)
+        leaves = (light.tables, packed_surface(normals, materials))
+        total, (squared, count) = cost_in_slices(len(solid), leaves, cost, self.state.generator)
+        return (total / count, float(squared / count)) if count else (total, None)
+
+
+def _cost_of_pixels(
+    pixels: Tensor, target: ViewTarget, tracer: AbstractTracer, light: MeshLight, first: int, last: int, leaves: tuple[Tensor, ...],
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """SliceCost of some of the `pixels`: the error, summed; the squared one and the number of channels that were compared.
+
+    Args:
+        leaves: the light's tables and packed_surface.
+    """
+    tables, surface = leaves
+    normals, light = surface.detach()[:, :3].contiguous(), replace(light, tables=tables)
+    twice = seen_twice(target, pixels[first:last], tracer, generator)
+    steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
+    halves = [shade_places(seen[steep], target, tracer, surface, light, generator) for seen in twice]
+    photo = target.saturation.reshape(-1, 3)[twice[0].pixels[steep]]
+    count = photo.numel()
+    error = crossed_halves(halves[0], halves[1], photo) * count if count else tables.sum() * 0
+    return error, torch.stack([(halves[0].detach().clamp(0, 1) - photo).square().sum(), tables.new_tensor(count)])
 
 
 def prior_terms(

@@ -84,6 +84,15 @@ def _places_of(chosen: Tensor, pixels: Tensor, direction: Tensor, hits: Hits, tr
     return SeenPlaces(pixels[at], -direction[at], face, tracer.mesh.faces[face].long(), corner_weights(hits.barycentric[at]))
 
 
+def packed_surface(normals: Float[Tensor, "vertex 3"], materials: dict[str, Tensor]) -> Float[Tensor, "vertex 8"]:
+    """Normals, albedo, roughness and metallic of the vertices side by side: places gather them at once.
+
+    Args:
+        materials: albedo, roughness and metallic.
+    """
+    return torch.cat([normals, materials["albedo"], materials["roughness"][:, None], materials["metallic"][:, None]], 1)
+
+
 @torch.no_grad()
 def steep_enough(seen: SeenPlaces, normals: Float[Tensor, "vertex 3"]) -> Bool[Tensor, "place"]:
     """Which are seen steeply enough to be compared."""
@@ -95,8 +104,7 @@ def shade_places(
     seen: SeenPlaces,
     target: ViewTarget,
     tracer: AbstractTracer,
-    normals: Float[Tensor, "vertex 3"],
-    materials: dict[str, Tensor],
+    surface: Float[Tensor, "vertex 8"],
     light: MeshLight,
     generator: torch.Generator,
 ) -> Float[Tensor, "place 3"]:
@@ -104,12 +112,12 @@ def shade_places(
     crossed_squares compare.
 
     Args:
-        tracer: its mesh has the materials that mirrors see. materials: albedo, roughness and metallic of the vertices. light: its tables may
-            want a gradient.
+        tracer: its mesh has the materials that mirrors see. surface: of packed_surface. light: its tables may want a gradient.
     """
     corners, weights = seen.corners, seen.weights
-    normal = torch.nn.functional.normalize(at_corners(normals, corners, weights), dim=-1)
-    albedo, roughness, metallic = (at_corners(materials[name], corners, weights) for name in ("albedo", "roughness", "metallic"))
+    here = at_corners(surface, corners, weights)
+    normal, albedo = torch.nn.functional.normalize(here[:, :3], dim=-1), here[:, 3:6]
+    roughness, metallic = here[:, 6].contiguous(), here[:, 7]
     diffuse, f0 = albedo * (1 - metallic)[:, None], f0_from_base(albedo, metallic)
     open_share = at_corners(light.open_share, corners, weights)
     position = at_corners(tracer.mesh.vertices, corners, weights).detach()

@@ -29,7 +29,7 @@ from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, crossed_squares
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, prior_terms
 from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, seen_places, shade_places, steep_enough
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_places, shade_places, steep_enough
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import drawn_view, view_targets
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
@@ -304,7 +304,8 @@ class Trials:
             """Pixels, their nearest vertices, two estimates of the colours and the photograph's colours of a view's pixels."""
             target, places = self._targets[index], seen[index][steep_enough(seen[index], normals)]
             tracer = surface.tracer.with_materials(mesh_from_surface_fit(state, self._faces))
-            first, second = (shade_places(places, target, tracer, normals, materials, light_of(target), state.generator) for _ in range(2))
+            packed = packed_surface(normals, materials)
+            first, second = (shade_places(places, target, tracer, packed, light_of(target), state.generator) for _ in range(2))
             return places.pixels, places.nearest, first, second, target.saturation.reshape(-1, 3)[places.pixels]
 
         def step(iteration: int) -> StepLoss:

@@ -41,7 +41,7 @@ from drgs.reconstruct.fit.surfel_parameters import (
     residual_sh,
 )
 from drgs.reconstruct.fit.surfels.render_stage_one import StageOneMaps, render_stage_one
-from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
+from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets, windowed
 from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.camera import Camera
 from drgs.scene.gaussians import Gaussians
@@ -135,7 +135,7 @@ class _Steps:
         )
         image = displayed(maps, target, parameters.get("background"))
         terms = stage_one_terms(maps, image, target, environment, self.settings, self.views.has_masks, normal_share(progress))
-        return StepLoss(terms, target.camera, squared_error(image, target))
+        return StepLoss(terms, target.whole or target.camera, squared_error(image, target))
 
     def gather_gradients(self, loss: StepLoss) -> None:
         centers, gradients = self.state.parameters["centers"], self.state.screen_gradients
@@ -160,7 +160,7 @@ class _Steps:
         if factor != self.target_factor:
             if iteration and not half_size:
                 self._look_at_exposures()
-            self.targets = view_targets(self.views, factor, self.state.parameters["centers"].device)
+            self.targets = [windowed(target) for target in view_targets(self.views, factor, self.state.parameters["centers"].device)]
             self.target_factor = factor
         return self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
 
@@ -216,7 +216,7 @@ def displayed(
 def squared_error(image: Float[Tensor, "height width 3"], target: ViewTarget) -> float:
     """Mean over the whole photograph, display space, of an image within the target's box."""
     with torch.no_grad():
-        return float(((image.clamp(0, 1) - target.photo[target.box]) ** 2).sum() / target.photo.numel())
+        return float(((image.clamp(0, 1) - target.photo[target.box]) ** 2).sum() * target.share / target.photo.numel())
 
 
 def stage_one_terms(
@@ -235,9 +235,9 @@ def stage_one_terms(
     if settings.weight_dissimilarity > 0:
         terms["dissimilarity"] = settings.weight_dissimilarity * structural_dissimilarity(image, photo)
     if has_masks:
-        terms["mask"] = settings.weight_mask * mask_loss(maps.coverage, target.mask)
+        terms["mask"] = settings.weight_mask * target.share * mask_loss(maps.coverage, target.mask)
     elif settings.weight_coverage > 0:
-        terms["coverage"] = settings.weight_coverage * maps.coverage.mean()
+        terms["coverage"] = settings.weight_coverage * target.share * maps.coverage.mean()
     if normal_weight_share > 0:
         consistency = normal_consistency(maps.normal_world, maps.depth, maps.coverage, target.camera)
         terms["normal"] = settings.weight_normal * normal_weight_share * consistency
