@@ -11,10 +11,13 @@ In: rays with colours, a box, what of it is inside. Out: RadianceGrid, which tel
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 
 HARMONICS = 4
 """Of degree 0 and 1: 1, x, y, z."""
@@ -55,7 +58,7 @@ class Rays:
     """Where the hull is entered first, and left last."""
     far: Float[Tensor, "ray"]
 
-    def __getitem__(self, index: Tensor) -> "Rays":
+    def __getitem__(self, index: Tensor | slice) -> "Rays":
         return Rays(self.origin[index], self.direction[index], self.near[index], self.far[index])
 
 
@@ -155,9 +158,12 @@ def fit_radiance_grid(
                 group["lr"] = rate * settings.decay**late
             drawn = torch.randint(len(colors), (settings.rays_a_step,), generator=generator).to(colors.device)
             shake = torch.rand(settings.rays_a_step, 1, generator=generator).to(colors.device)
-            loss = _loss(grid, rays[drawn], colors[drawn], shake, settings, done > settings.gathered_from * total)
+            batch = (rays[drawn], colors[drawn], shake)
+            cost = partial(_cost_of_rays, grid, batch, settings, done > settings.gathered_from * total)
+            loss, _ = cost_in_slices(len(drawn), (grid.density, grid.colors), cost, generator)
+            steps_between = [grid.density.diff(dim=axis).square().mean() for axis in range(3)]
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            (loss / len(drawn) + settings.weight_even * torch.stack(steps_between).sum()).backward()
             optimizer.step()
             done += 1
             if report is not None and done % 20 == 0:
@@ -192,6 +198,21 @@ def _finer(
     return RadianceGrid(low, cell, density.requires_grad_(), inside, colors.requires_grad_(), row)
 
 
+def _cost_of_rays(
+    grid: RadianceGrid, batch: tuple[Rays, Tensor, Tensor], settings: RadianceGridSettings, gather: bool, first: int, last: int,
+    leaves: tuple[Tensor, ...], generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """SliceCost of some rays of a batch (rays, colours, shakes).
+
+    Args:
+        leaves: density and colours.
+    """
+    some = slice(first, last)
+    rays, colors, shake = batch
+    here = replace(grid, density=leaves[0], colors=leaves[1])
+    return _loss(here, rays[some], colors[some], shake[some], settings, gather) * (last - first), shake.new_zeros(())
+
+
 def _loss(
     grid: RadianceGrid,
     rays: Rays,
@@ -200,6 +221,7 @@ def _loss(
     settings: RadianceGridSettings,
     gather: bool,
 ) -> Float[Tensor, ""]:
+    """Mean over rays."""
     count = len(grid.density)
     offsets = (torch.arange(count, device=shake.device) + shake) / count
     _, places, weights = grid.samples(rays, offsets)
@@ -211,8 +233,7 @@ def _loss(
     # What was not looked up has the photograph's colour, and no say.
     rest = (opacity - empty.index_add(0, ray, kept)).detach()
     image = torch.zeros_like(colors).index_add(0, ray, kept[:, None] * shown) + rest[:, None] * colors
-    steps = [grid.density.diff(dim=axis).square().mean() for axis in range(3)]
-    loss = (image - colors).square().mean() + settings.weight_even * torch.stack(steps).sum()
+    loss = (image - colors).square().mean()
     loss = loss - settings.weight_opaque * opacity.clamp(1e-4, 1).log().mean()
     if not gather:
         return loss
