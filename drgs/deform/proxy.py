@@ -20,6 +20,7 @@ from torch import Tensor
 
 from drgs.deform.drive_mesh import DEGENERATE
 from drgs.deform.gmls import GmlsSettings, Weights, build_weights, interpolate
+from drgs.maths.unique_rows import unique_rows
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -227,7 +228,7 @@ def _patches(
 ) -> tuple[Int[Tensor, "sample"], Float[Tensor, "sample"], Float[Tensor, "patch 3"]]:
     """Patch (sample,), share in it (sample,) by size, and middles of the patches (patch, 3): the cells of a grid that hold samples."""
     # Half a cell lower: walls along the axes would lie on the cells' borders, where rounding decides.
-    _, patch = torch.unique(torch.floor((sampled - low) / width + 0.5).long(), dim=0, return_inverse=True)
+    _, patch = unique_rows(torch.floor((sampled - low) / width + 0.5).long())
     total = size.new_zeros(int(patch.max()) + 1).index_add_(0, patch, size)
     share = size / total[patch]
     return patch, share, size.new_zeros(len(total), 3).index_add_(0, patch, sampled * share[:, None])

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from drgs.deform.drive_mesh import vertex_gradients
 from drgs.exchange.rig import Rig, RigAnimation, RigChannel, RigMesh, RigNode
+from drgs.maths.unique_rows import unique_rows
 
 NEARLY_ALIKE = 1 - 1e-9
 """Cosine of half the angle between rotations above which they are blended straight: the sphere's formula divides by its sine."""
@@ -68,7 +69,7 @@ def rig_gradients(rest: RigPose, moved: RigPose) -> Float[Tensor, "vertex 3 3"]:
     a, b, c = rest.vertices[rest.faces.long()].unbind(1)
     area = torch.linalg.cross(b - a, c - a).norm(dim=-1)
     weight = torch.zeros(len(rest.vertices), dtype=torch.float64).index_add_(0, rest.faces.reshape(-1).long(), area.repeat_interleave(3))
-    _, place = torch.unique(torch.cat([rest.vertices, rest.parts[:, None].double()], 1), dim=0, return_inverse=True)
+    _, place = unique_rows(torch.cat([rest.vertices, rest.parts[:, None].double()], 1))
     total = torch.zeros(int(place.max()) + 1, dtype=torch.float64).index_add_(0, place, weight)
     mean = torch.zeros(len(total), 3, 3, dtype=torch.float64).index_add_(0, place, gradient * weight[:, None, None])
     shared = mean / total.clamp(min=1e-300)[:, None, None]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from drgs.maths.unique_rows import unique_rows
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera
 from drgs.scene.mesh import TriangleMesh
@@ -43,7 +44,7 @@ def divided_faces(faces: Int[Tensor, "face 3"], vertices: int) -> DividedFaces:
     """Of a mesh with so many vertices; edges that faces share get one new vertex."""
     corners = faces.long()
     ends = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(1).values
-    between, number = torch.unique(ends, dim=0, return_inverse=True)
+    between, number = unique_rows(ends)
     first, second, third = (vertices + number).view(3, -1)
     a, b, c = corners.unbind(1)
     parts = [(a, first, third), (b, second, first), (c, third, second), (first, second, third)]
