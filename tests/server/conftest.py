@@ -1,12 +1,9 @@
 """A server in this process, with a painter instead of a renderer and no worker."""
 
 import json
-import sqlite3
 import uuid
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 from painter import Painter
@@ -17,25 +14,10 @@ from drgs_server.api.context import ServerContext
 from drgs_server.app import create_app
 from drgs_server.settings import ServerSettings
 from drgs_worker.jobs.file_tool import make_asset
-from drgs_worker.jobs.queue import migrate_queue
-from drgs_worker.store.data_directory import open_data_directory, read_token
-from drgs_worker.store.database import AssetRow, now, open_database
+from drgs_worker.store.data_directory import read_token
+from drgs_worker.store.database import AssetRow, now
 from drgs_worker.store.register_asset import register_asset
-
-
-@cache
-def new_databases() -> dict[str, bytes]:
-    """The SQLite files of a service that nobody used yet, by name: to go through all migrations takes longer than most tests."""
-    with TemporaryDirectory() as folder:
-        directory = open_data_directory(Path(folder))
-        open_database(directory).dispose()
-        migrate_queue(directory)
-        files = sorted(Path(folder).glob("*.sqlite"))
-        for file in files:
-            connection = sqlite3.connect(file)
-            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            connection.close()
-        return {file.name: file.read_bytes() for file in files}
+from tests.new_databases import put_new_databases
 
 
 class Service:
@@ -44,9 +26,7 @@ class Service:
     def __init__(self, root: Path, painter: Painter | None = None, **settings: object) -> None:
         self.painter = painter or Painter()
         if not (root / "data").exists() and "database_url" not in settings:
-            (root / "data").mkdir(parents=True)
-            for name, content in new_databases().items():
-                (root / "data" / name).write_bytes(content)
+            put_new_databases(root / "data")
         self.settings = ServerSettings(data=root / "data", bundled_environments=root / "none", static_folder=root / "none", **settings)
         self.app = create_app(self.settings, self.painter)
         self.context: ServerContext = self.app.state.context

@@ -13,6 +13,7 @@ from drgs_server.api.routes_assets import remove_deleted_assets
 from drgs_server.settings import Limits
 from drgs_worker.store.artifacts import share_job
 from drgs_worker.store.register_asset import register_asset
+from tests.new_databases import put_new_databases
 from tests.worker import store_server as servers
 
 ASSET = "a" * 32
@@ -34,6 +35,7 @@ def s3() -> Iterator[servers.StoreServer]:
 
 @pytest.fixture
 def pair(tmp_path: Path, s3: servers.StoreServer) -> Iterator[tuple[Service, Service]]:
+    put_new_databases(tmp_path)
     shared = {
         "database_url": f"sqlite:///{tmp_path / 'app.sqlite'}",
         "queue_url": f"sqlite:///{tmp_path / 'jobs.sqlite'}",

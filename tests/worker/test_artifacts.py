@@ -31,6 +31,7 @@ from drgs_worker.store.artifact_store import (
 from drgs_worker.store.data_directory import DataDirectory, open_data_directory
 from drgs_worker.store.database import AssetRow, open_database
 from drgs_worker.store.register_asset import register_asset
+from tests.new_databases import put_new_databases
 from tests.worker import store_server as servers
 
 ASSET = "a" * 32
@@ -181,6 +182,7 @@ class Machines:
     """Two data folders, one database, one store."""
 
     def __init__(self, root: Path) -> None:
+        put_new_databases(root)
         self.urls = (f"sqlite:///{root / 'app.sqlite'}", f"sqlite:///{root / 'jobs.sqlite'}", f"s3://{servers.BUCKET}/{uuid.uuid4().hex}")
         self.first: DataDirectory = open_data_directory(root / "first", *self.urls)
         self.second: DataDirectory = open_data_directory(root / "second", *self.urls)

@@ -18,6 +18,7 @@ from drgs_worker.jobs.builders import BUILDER_VARIABLE
 from drgs_worker.jobs.queue import JobNotInState, JobQueue
 from drgs_worker.store.data_directory import DataDirectory, open_data_directory
 from drgs_worker.store.database import JobRow, now, open_database
+from tests.new_databases import put_new_databases
 from tests.patience import PATIENCE_SECONDS
 
 REPOSITORY = Path(__file__).parents[2]
@@ -28,6 +29,7 @@ class Bench:
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        put_new_databases(root / "data")
         self.directory: DataDirectory = open_data_directory(root / "data")
         self.engine = open_database(self.directory)
         self.queue = JobQueue(self.directory, self.engine)

@@ -1,4 +1,4 @@
-"""Tables of the service (SQLAlchemy) and their migration at start (alembic). The queue's own tables are DBOS's.
+"""Tables of the service (SQLAlchemy) and their migration at start (alembic, if there is one to do). The queue's own tables are DBOS's.
 
 Times are UTC seconds since the epoch: one meaning in SQLite and Postgres, and comparisons need no time zones.
 """
@@ -9,9 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from alembic import command
-from alembic.config import Config
-from sqlalchemy import JSON, BigInteger, Engine, ForeignKey, UniqueConstraint, create_engine, event, text
+from sqlalchemy import JSON, BigInteger, Connection, Engine, ForeignKey, UniqueConstraint, create_engine, event, inspect, text
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
@@ -26,6 +24,7 @@ OUTAGE_POLL_SECONDS = 0.5
 Result = TypeVar("Result")
 MIGRATION_LOCK = 0x64726773
 """Any number, the same in all processes."""
+_MIGRATIONS = Path(__file__).parent / "migrations"
 
 
 class Base(DeclarativeBase):
@@ -178,15 +177,35 @@ def open_database(directory: DataDirectory) -> Engine:
     engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _prepare_sqlite)
-    with lock_file(directory.root / ".setup.lock"):
-        config = Config()
-        config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
-        with engine.begin() as connection:
-            if engine.dialect.name == "postgresql":  # the file lock holds on one machine only
-                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": MIGRATION_LOCK})
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+    with lock_file(directory.root / ".setup.lock"), engine.begin() as connection:
+        if engine.dialect.name == "postgresql":  # the file lock holds on one machine only
+            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": MIGRATION_LOCK})
+        if _revision(connection) != _newest_revision():
+            _migrate(connection)
     return engine
+
+
+def _newest_revision() -> str:
+    """Of the migrations that there are, by the names of their files."""
+    return max(path.stem[1:].partition("_")[0] for path in (_MIGRATIONS / "versions").glob("v*.py"))
+
+
+def _revision(connection: Connection) -> str | None:
+    """That a database has; None: it is new."""
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    return connection.scalar(text("SELECT version_num FROM alembic_version"))
+
+
+def _migrate(connection: Connection) -> None:
+    # Here, and not above: nearly every start finds the newest tables, and loading alembic and its templates takes longer than opening the database.
+    from alembic import command
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(_MIGRATIONS))
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
 
 
 def _refuse_lost_database(directory: DataDirectory) -> None:
