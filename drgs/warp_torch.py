@@ -5,6 +5,7 @@ them to a thread pool. Kernels launched this way take `first: int` as their firs
 `i = first + wp.tid()`. Warp's atomics on the CPU are plain adds, so two slices must never add to one address.
 """
 
+import copy
 import os
 import tempfile
 import threading
@@ -148,9 +149,15 @@ def launch(kernel: Any, count: int, inputs: list, outputs: list, device: Any, sl
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=outputs, device=device)
         return
     edges = [count * k // slices for k in range(slices + 1)]
+    # Python, which one thread runs at a time, puts the arguments together once for all slices.
+    whole = wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=outputs, device=device, record_cmd=True)
 
     def run(first: int, last: int) -> None:
-        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=outputs, device=device)
+        part = copy.copy(whole)
+        part.params, part.fwd_args = list(whole.params), None
+        part.set_dim(last - first)
+        part.set_param_at_index(0, first)
+        part.launch()
 
     for done in [thread_pool().submit(run, a, b) for a, b in pairwise(edges)]:
         done.result()

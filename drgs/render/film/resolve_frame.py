@@ -12,11 +12,12 @@ from torch import Tensor
 
 from drgs.render.film.blur_environment import blurred_light
 from drgs.render.film.denoise import denoise
+from drgs.render.film.denoise.svgf import MOVING, filter_light
 from drgs.render.film.tonemap import tonemap
 from drgs.render.integrate.environment_table import EnvironmentLight, lookup_radiance, uv_from_world_direction
 from drgs.render.progressive.converge import frame_errors
 from drgs.render.progressive.frame_state import FrameState, GaussianView
-from drgs.render.progressive.mean_radiance import mean_gbuffer, mean_radiance
+from drgs.render.progressive.mean_radiance import mean_gbuffer, mean_radiance, moving_radiance
 from drgs.render.records import Frame
 from drgs.scene.camera import world_from_pixel
 from drgs.warp_torch import launch, warp_array, warp_device
@@ -28,8 +29,11 @@ def resolve_frame(state: FrameState) -> Frame:
     """The picture so far."""
     clock = time.perf_counter()
     settings, window = state.inputs.settings, state.window
-    maps, radiance = mean_gbuffer(state), mean_radiance(state)
-    shown = denoise(radiance, maps, window.camera(state.inputs.camera), settings.denoise, state.is_moving)
+    maps, camera, moving = mean_gbuffer(state), window.camera(state.inputs.camera), state.moving_picture
+    if moving is not None and settings.denoise == "svgf":
+        shown = moving_radiance(moving, filter_light(moving.history.light, maps, camera, MOVING), state.samples)
+    else:
+        shown = denoise(mean_radiance(state), maps, camera, settings.denoise)
     denoised = time.perf_counter()
     background = _background(state)
     linear = window.pad(shown.diffuse + shown.specular)

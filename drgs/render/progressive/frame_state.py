@@ -14,6 +14,7 @@ from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.frame_sums import FrameSums
 from drgs.render.progressive.invalidate import Part
 from drgs.render.progressive.kept_light.kept_light import KeptLight
+from drgs.render.progressive.moving_picture import MovingPicture
 from drgs.render.records import FrameInputs, GBuffer, History, PrimaryPoints, RenderPlan, Reprojected
 from drgs.render.visible.image_tiles import Window, spread_over_pixels, window_of_tiles
 
@@ -42,8 +43,6 @@ class MeshView:
 
     first_primary_points: PrimaryPoints | None = None
     """Of the first pass over all covered tiles, once it is made: the next frame may start with them."""
-    middles: GBuffer | None = None
-    """Of the window: what a moving picture sees through the middles of pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +75,8 @@ class FrameState:
     """What can be used of it, in the window."""
     kept_light: KeptLight | None
     """Diffuse light on the mesh that moving pictures read; None until the camera moves."""
-    kept_samples: Float[Tensor, "pixel"] | None
-    """Rays behind the kept light that the one pass so far shows, 0 where it shows none; None where it was not asked."""
+    moving_picture: MovingPicture | None
+    """What the one pass so far shows, if that is a moving picture's; its sums stay empty."""
     computed_parts: tuple[Part, ...]
     """For this frame; the others were taken over from the frame before (invalidate.py)."""
     seconds: dict[str, float]
@@ -86,7 +85,13 @@ class FrameState:
     @property
     def is_moving(self) -> bool:
         """Whether the one pass so far is a moving picture. Such sums are not gone on with: the next pass begins anew, with this picture as history."""
-        return self.plan.moving and self.passes > 0
+        return self.moving_picture is not None
+
+    @property
+    def kept_samples(self) -> Float[Tensor, "pixel"] | None:
+        """Rays behind the kept light that a moving picture shows, 0 where it shows none; None where it was not asked."""
+        kept = None if self.moving_picture is None else self.moving_picture.kept_samples
+        return None if kept is None else self.window.pad(kept).flatten()
 
     @property
     def rays_a_pass(self) -> int:

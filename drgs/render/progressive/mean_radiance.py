@@ -1,5 +1,6 @@
 """What the passes so far amount to: sums in; mean radiance, its variance and the mean G-buffer out, of the window that shows something."""
 
+from dataclasses import replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -7,10 +8,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from drgs.render.progressive.demodulate_albedo import remodulate_albedo
 from drgs.render.progressive.frame_state import FrameState, GaussianView
 from drgs.render.progressive.frame_sums import FrameSums, SumArrays, sum_arrays
+from drgs.render.progressive.moving_picture import MovingPicture
 from drgs.render.progressive.reproject import blend_history, remember
-from drgs.render.records import GBuffer, History, Radiance
+from drgs.render.records import DemodulatedLight, GBuffer, History, Radiance
 from drgs.render.visible.image_tiles import TILE, Window, tile_grid
 from drgs.warp_torch import launch, warp_array, warp_device
 
@@ -85,6 +88,9 @@ def mean_radiance(state: FrameState) -> Radiance:
     """Straight (alpha-normalised) radiance of the window, with what history adds; the variance is that of the mean of one pixel's passes."""
     if state in _means:
         return _means[state]
+    if state.moving_picture is not None:
+        radiance = _means[state] = moving_radiance(state.moving_picture, state.moving_picture.history.light, state.samples)
+        return radiance
     own = _own_samples(state)
     height, width = own.shape[:2]
     diffuse, specular = (own.new_empty(height, width, 3) for _ in range(2))
@@ -99,6 +105,18 @@ def mean_radiance(state: FrameState) -> Radiance:
     return radiance
 
 
+def moving_radiance(picture: MovingPicture, light: DemodulatedLight, samples: int) -> Radiance:
+    """A moving picture's, with this light, as it is or filtered. Its variance is the most that the sum of both parts can have.
+
+    Args:
+        samples: rays a pixel.
+    """
+    none, surface = torch.empty_like(picture.visibility), picture.history.gbuffer
+    radiance = remodulate_albedo(light, Radiance(light.diffuse, light.specular, none, picture.visibility, samples), surface)
+    assert radiance.diffuse_variance is not None and radiance.specular_variance is not None
+    return replace(radiance, variance=2 * (radiance.diffuse_variance + radiance.specular_variance))
+
+
 _gbuffers: WeakKeyDictionary[FrameSums, tuple[int, GBuffer]] = WeakKeyDictionary()
 """Of sums that live, after so many passes over all tiles: denoiser, history and whoever shows the picture ask for it."""
 
@@ -107,8 +125,8 @@ def mean_gbuffer(state: FrameState) -> GBuffer:
     """Of the window: the rasterised one, or the mean over passes of what rays to the mesh saw."""
     if isinstance(state.view, GaussianView):
         return GBuffer(**{name: state.window.crop(values) for name, values in vars(state.view.gbuffer).items()})
-    if state.view.middles is not None:
-        return state.view.middles
+    if state.moving_picture is not None:
+        return state.moving_picture.history.gbuffer
     passes = int(state.tiles.passes.sum())
     known = _gbuffers.get(state.sums)
     if known is None or known[0] != passes:
@@ -130,6 +148,8 @@ def frame_history(state: FrameState) -> History | None:
     """What the frame is worth to the next one, seen by another camera; before the first pass that of the frame before it."""
     if state.passes == 0:
         return state.history
+    if state.moving_picture is not None:
+        return state.moving_picture.history
     camera = state.window.camera(state.inputs.camera)
     return remember(mean_radiance(state), mean_gbuffer(state), camera, _own_samples(state), state.reprojected)
 
@@ -137,10 +157,7 @@ def frame_history(state: FrameState) -> History | None:
 def _own_samples(state: FrameState) -> Tensor:
     """(rows, columns, 2) behind the diffuse and the specular part of the frame's own mean."""
     samples = (state.passes_in_window * state.rays_a_pass).float()
-    if state.kept_samples is None:
-        return torch.stack([samples, samples], -1)
-    kept = state.in_window(state.kept_samples)
-    return torch.stack([torch.where(kept > 0, kept, samples), samples], -1)
+    return torch.stack([samples, samples], -1)
 
 
 def _window_place(window: Window) -> Any:

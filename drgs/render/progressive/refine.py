@@ -23,10 +23,11 @@ from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshVi
 from drgs.render.progressive.frame_sums import add_estimate, copy_sums, no_sums
 from drgs.render.progressive.kept_light.shade_moving import shade_moving
 from drgs.render.progressive.mean_radiance import frame_history, mean_gbuffer
+from drgs.render.progressive.moving_picture import moving_picture
 from drgs.render.progressive.reproject import reproject
 from drgs.render.progressive.see_middles import see_middles
 from drgs.render.records import PrimaryPoints
-from drgs.render.visible.image_tiles import pixels_of_tiles, tile_of_pixels
+from drgs.render.visible.image_tiles import pixels_of_tiles, tile_of_pixels, tiles_of_mesh
 from drgs.render.visible.points_at import points_at
 from drgs.render.visible.trace_primary import trace_primary_points
 from drgs.warp_torch import thread_count
@@ -49,9 +50,8 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
     if state.is_moving:
         state = _begin_anew(state)
     if state.plan.moving and state.passes == 0 and passes == 1 and state.plan.counts.total > 0:
-        state = replace(state, sums=replace(state.sums, surface=None))  # its view says what it sees
-    else:
-        state = replace(state, plan=at_rest(state.plan))
+        return _move(state)
+    state = replace(state, plan=at_rest(state.plan))
     if not consume or state.passes == 0:  # sums of no pass share one zero
         state = _with_sums_of_its_own(state)
     while passes > 0 and bool(state.tiles.active.any()):
@@ -72,12 +72,35 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
 
 def _begin_anew(state: FrameState) -> FrameState:
     """A frame whose one pass was a moving picture, before its first pass: what it showed is history."""
-    inputs, covered = state.inputs, state.tiles.covered
+    inputs = state.inputs
+    covered = tiles_of_mesh(inputs.scene.mesh, inputs.camera)
+    covered[0] |= ~covered.any()
     sums = no_sums(len(state.sums.weight), True, inputs.settings.split_indirect, covered.device)
     tiles = Tiles(covered, torch.zeros_like(state.tiles.passes), covered.clone())
     plan = at_rest(state.plan)
     history = frame_history(state)
-    return replace(state, plan=plan, view=MeshView(), sums=sums, tiles=tiles, history=history, reprojected=None, kept_samples=None)
+    return replace(state, plan=plan, view=MeshView(), sums=sums, tiles=tiles, history=history, reprojected=None, moving_picture=None)
+
+
+def _move(state: FrameState) -> FrameState:
+    """The frame after the one pass of a moving picture; its sums stay empty."""
+    started = time.perf_counter()
+    middles = see_middles(state.traced.tracer, state.inputs.camera, state.tiles.covered)
+    seen, primary = time.perf_counter(), middles.primary
+    integrator, light, how = choose_integrator(state.traced.tracer), state.traced.environment_light, _how(state)
+    kept, kept_samples = state.kept_light, None
+    if state.plan.kept_light:
+        assert kept is not None
+        moving = shade_moving(integrator, primary, light, how, kept, _horizon(state), 1.0 / float(state.inputs.camera.intrinsics[0, 0]))
+        found, kept, kept_samples = moving.light, moving.kept, moving.kept_samples
+    else:
+        found = integrator.shade(primary.points, primary.starts, light, how, 0, None, _horizon(state))
+    shaded, camera = time.perf_counter(), middles.window.camera(state.inputs.camera)
+    picture = moving_picture(middles.surface, middles.place, found, kept_samples, how.counts.total, camera, state.history)
+    seconds = {"trace_primary": seen - started, "shade": shaded - seen, "history": time.perf_counter() - shaded}
+    tiles = Tiles(middles.tiles, middles.tiles.long(), middles.tiles.clone())
+    state = replace(state, tiles=tiles, view=MeshView(), history=None, kept_light=kept, moving_picture=picture)
+    return _pay_for_horizons(with_seconds(state, seconds), primary.starts.face, len(primary.points.pixel))
 
 
 def _with_sums_of_its_own(state: FrameState) -> FrameState:
@@ -104,13 +127,8 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
     whole_first_pass = index == 0 and bool((chosen == state.tiles.covered).all())
     primary = _primary_points(state, chosen, index, whole_first_pass)
     traced = time.perf_counter()
-    if state.plan.kept_light:
-        state = _shade_and_read(state, primary)
-    else:
-        _shade_and_add(state, primary, index, state.first_rays if whole_first_pass else None)
-    if state.plan.moving:
-        state = replace(state, view=MeshView(middles=see_middles(primary, state.window)))
-    elif whole_first_pass and isinstance(state.view, MeshView):
+    _shade_and_add(state, primary, index, state.first_rays if whole_first_pass else None)
+    if whole_first_pass and isinstance(state.view, MeshView):
         state = replace(state, view=MeshView(first_primary_points=primary))
     seconds = {"trace_primary": traced - started, "shade": time.perf_counter() - traced}
     return _pay_for_horizons(with_seconds(state, seconds), primary.starts.face, len(primary.points.pixel))
@@ -149,10 +167,10 @@ def _primary_points(state: FrameState, chosen: Tensor, index: int, whole_first_p
     if isinstance(view, GaussianView):
         everywhere = bool((chosen == state.tiles.covered).all())
         return view.primary_points if everywhere else points_in_tiles(view.primary_points, chosen, camera.width, state.inputs.first_pixel)
-    if whole_first_pass and view.first_primary_points is not None and not state.plan.moving:
+    if whole_first_pass and view.first_primary_points is not None:
         return view.first_primary_points
     seed, pixels = state.inputs.settings.seed, _pixels(state, chosen)
-    return trace_primary_points(state.traced.tracer, camera, seed, index, jitter=not state.plan.moving, pixels=pixels)
+    return trace_primary_points(state.traced.tracer, camera, seed, index, pixels=pixels)
 
 
 def _pixels(state: FrameState, chosen: Tensor) -> Tensor:
@@ -173,18 +191,6 @@ def _shade_and_add(state: FrameState, primary: PrimaryPoints, index: int | Tenso
     integrator = choose_integrator(traced.tracer)
     light = integrator.shade(primary.points, primary.starts, traced.environment_light, _how(state), index, memory, _horizon(state))
     add_estimate(state.sums, primary, light, state.inputs.first_pixel)
-
-
-def _shade_and_read(state: FrameState, primary: PrimaryPoints) -> FrameState:
-    """The same for the one pass of a moving picture, which reads kept light and adds to it."""
-    assert state.kept_light is not None
-    footprint = 1.0 / float(state.inputs.camera.intrinsics[0, 0])
-    integrator, light = choose_integrator(state.traced.tracer), state.traced.environment_light
-    moving = shade_moving(integrator, primary, light, _how(state), state.kept_light, _horizon(state), footprint)
-    add_estimate(state.sums, primary, moving.light, state.inputs.first_pixel)
-    kept_samples = torch.zeros_like(state.sums.weight)
-    kept_samples[primary.points.pixel.long() - state.inputs.first_pixel] = moving.kept_samples
-    return replace(state, kept_light=moving.kept, kept_samples=kept_samples)
 
 
 def _how(state: FrameState) -> IntegratorSettings:

@@ -75,44 +75,45 @@ class LightMaps:
     samples: wp.array2d[wp.vec2]
 
 
-@wp.kernel
-def look_up_history(
-    first: int,
-    width: int,
-    surface: SurfaceMaps,
+@wp.struct
+class OldLight:
+    """What a picture before says about one point of the surface."""
+
+    diffuse: wp.vec3
+    specular: wp.vec3
+    variance: wp.vec2
+    samples: wp.vec2
+    """That this is worth; 0 where nothing is known."""
+
+
+@wp.func
+def look_up(
+    here: wp.vec3,
+    n: wp.vec3,
+    wo: wp.vec3,
+    roughness: float,
     old_camera: PinholeArrays,
     old_surface: SurfaceMaps,
     old_light: LightMaps,
     most_samples: float,
-    # outputs
-    light: LightMaps,
-):
-    i = first + wp.tid()
-    y = i / width
-    x = i - y * width
-    light.diffuse[y, x] = wp.vec3(0.0, 0.0, 0.0)
-    light.specular[y, x] = wp.vec3(0.0, 0.0, 0.0)
-    light.variance[y, x] = wp.vec2(0.0, 0.0)
-    light.samples[y, x] = wp.vec2(0.0, 0.0)
-    if surface.coverage[y, x] <= 0.0:
-        return
-    here = surface.position[y, x]
-    n = surface.normal[y, x]
+) -> OldLight:
+    """Of a point with its normal, the direction it is seen from, and its roughness."""
+    found = OldLight()
     in_camera = wp.transform_point(old_camera.camera_from_world, here)
     if in_camera[2] <= 0.0:
-        return
+        return found
     on_screen = old_camera.intrinsics * in_camera
     u = on_screen[0] / on_screen[2] - 0.5
     v = on_screen[1] / on_screen[2] - 0.5
     column = int(wp.floor(u))
     row = int(wp.floor(v))
     if column < -1 or row < -1 or column >= old_camera.width or row >= old_camera.height:
-        return
+        return found
     footprint = in_camera[2] / old_camera.intrinsics[0, 0]
     reach = PLANE * footprint
     towards_old = wp.dot(n, wp.normalize(old_camera.center - here))
     if towards_old <= GRAZING:
-        return
+        return found
     spread = SPREAD * footprint / wp.max(towards_old, 0.25)
     sum_d = wp.vec3(0.0, 0.0, 0.0)
     sum_s = wp.vec3(0.0, 0.0, 0.0)
@@ -135,16 +136,46 @@ def look_up_history(
                 sum_samples += w * old_light.samples[qy, qx]
                 weights += w
     if weights < 0.05:
-        return
+        return found
     # The lobe of a rougher surface forgives a larger turn.
-    alpha = alpha_of(surface.roughness[y, x])
-    turned = wp.length(surface.wo[y, x] - wp.normalize(old_camera.center - here))
+    alpha = alpha_of(roughness)
+    turned = wp.length(wo - wp.normalize(old_camera.center - here))
     still = wp.exp(-wp.min((LOBE * turned / alpha) * (LOBE * turned / alpha), 80.0))
     worth = sum_samples / weights
-    light.diffuse[y, x] = sum_d / weights
-    light.specular[y, x] = sum_s / weights
-    light.variance[y, x] = sum_variance / weights
-    light.samples[y, x] = wp.vec2(wp.min(worth[0], most_samples), still * wp.min(worth[1], most_samples))
+    found.diffuse = sum_d / weights
+    found.specular = sum_s / weights
+    found.variance = sum_variance / weights
+    found.samples = wp.vec2(wp.min(worth[0], most_samples), still * wp.min(worth[1], most_samples))
+    return found
+
+
+@wp.kernel
+def look_up_history(
+    first: int,
+    width: int,
+    surface: SurfaceMaps,
+    old_camera: PinholeArrays,
+    old_surface: SurfaceMaps,
+    old_light: LightMaps,
+    most_samples: float,
+    # outputs
+    light: LightMaps,
+):
+    i = first + wp.tid()
+    y = i / width
+    x = i - y * width
+    light.diffuse[y, x] = wp.vec3(0.0, 0.0, 0.0)
+    light.specular[y, x] = wp.vec3(0.0, 0.0, 0.0)
+    light.variance[y, x] = wp.vec2(0.0, 0.0)
+    light.samples[y, x] = wp.vec2(0.0, 0.0)
+    if surface.coverage[y, x] <= 0.0:
+        return
+    here = surface.position[y, x]
+    found = look_up(here, surface.normal[y, x], surface.wo[y, x], surface.roughness[y, x], old_camera, old_surface, old_light, most_samples)
+    light.diffuse[y, x] = found.diffuse
+    light.specular[y, x] = found.specular
+    light.variance[y, x] = found.variance
+    light.samples[y, x] = found.samples
 
 
 @wp.func
@@ -199,10 +230,10 @@ def reproject(history: History, gbuffer: GBuffer, camera: Camera) -> Reprojected
         look_up_history,
         height * width,
         [
-            width, _surface_maps(gbuffer), _pinhole(history.camera, history.gbuffer), _surface_maps(history.gbuffer),
-            _light_maps(history), MOST_SAMPLES,
+            width, surface_maps(gbuffer), pinhole_arrays(history.camera, history.gbuffer), surface_maps(history.gbuffer),
+            light_maps(history), MOST_SAMPLES,
         ],
-        [_light_maps(found)],
+        [light_maps(found)],
         warp_device(gbuffer.coverage),
     )  # fmt: skip
     return found
@@ -219,7 +250,7 @@ def blend_history(radiance: Radiance, reprojected: Reprojected, gbuffer: GBuffer
     launch(
         add_history,
         height * width,
-        [width, warp_view(samples, wp.vec2), warp_view(gbuffer.albedo, wp.vec3), warp_view(gbuffer.metallic), _light_maps(reprojected)],
+        [width, warp_view(samples, wp.vec2), warp_view(gbuffer.albedo, wp.vec3), warp_view(gbuffer.metallic), light_maps(reprojected)],
         [
             warp_view(radiance.diffuse, wp.vec3), warp_view(radiance.specular, wp.vec3),
             warp_view(radiance.diffuse_variance), warp_view(radiance.specular_variance),
@@ -246,7 +277,8 @@ def brighten_light(light: DemodulatedLight, factor: float) -> DemodulatedLight:
     return DemodulatedLight(light.diffuse * factor, light.specular * factor, light.variance * factor**2)
 
 
-def _pinhole(camera: Camera, gbuffer: GBuffer) -> Any:
+def pinhole_arrays(camera: Camera, gbuffer: GBuffer) -> Any:
+    """The camera of a picture with these maps."""
     arrays = PinholeArrays()
     arrays.height, arrays.width = gbuffer.coverage.shape
     arrays.camera_from_world = wp.mat44(*camera.camera_from_world.flatten().tolist())
@@ -255,7 +287,8 @@ def _pinhole(camera: Camera, gbuffer: GBuffer) -> Any:
     return arrays
 
 
-def _surface_maps(gbuffer: GBuffer) -> Any:
+def surface_maps(gbuffer: GBuffer) -> Any:
+    """The struct that kernels read; shares memory with the tensors."""
     maps = SurfaceMaps()
     maps.coverage, maps.roughness = warp_view(gbuffer.coverage), warp_view(gbuffer.roughness)
     maps.position, maps.normal = warp_view(gbuffer.position_world, wp.vec3), warp_view(gbuffer.normal_world, wp.vec3)
@@ -263,7 +296,8 @@ def _surface_maps(gbuffer: GBuffer) -> Any:
     return maps
 
 
-def _light_maps(picture: History | Reprojected) -> Any:
+def light_maps(picture: History | Reprojected) -> Any:
+    """The struct that kernels read and write; shares memory with the tensors."""
     maps, light = LightMaps(), picture.light
     maps.diffuse, maps.specular = warp_view(light.diffuse, wp.vec3), warp_view(light.specular, wp.vec3)
     maps.variance, maps.samples = warp_view(light.variance, wp.vec2), warp_view(picture.samples, wp.vec2)

@@ -23,9 +23,10 @@ from drgs.render.progressive.frame_sums import brighten_sums, no_sums
 from drgs.render.progressive.invalidate import NOTHING_BEFORE, PARTS, Invalidation, Part, changed_in_scene, invalidate, parts_made_from
 from drgs.render.progressive.kept_light.kept_light import MOST_VERTICES, KeptLight, brighten_kept, no_light, without_indirect
 from drgs.render.progressive.mean_radiance import frame_history
+from drgs.render.progressive.moving_picture import brighten_picture
 from drgs.render.progressive.reproject import brighten_light
 from drgs.render.records import FrameInputs, GBuffer, History, PrimaryPoints, RenderPlan, RenderSettings
-from drgs.render.visible.image_tiles import TILE, tile_grid, tile_of_pixels, tiles_of_mesh
+from drgs.render.visible.image_tiles import TILE, tile_grid, tile_of_pixels, tiles_of_box, tiles_of_mesh
 from drgs.render.visible.lift_points import lift_points
 from drgs.render.visible.rasterize import rasterize_gbuffer
 from drgs.render.visible.refresh_materials import refresh_gbuffer, refresh_points, refresh_primary
@@ -81,7 +82,7 @@ def start_frame(
         history=history,
         reprojected=None,
         kept_light=kept_light,
-        kept_samples=None,
+        moving_picture=None,
         computed_parts=reuse.computed_parts,
         seconds=clock.seconds,
     )
@@ -223,7 +224,7 @@ def _see_gaussians(inputs: FrameInputs, tracer: AbstractTracer, gbuffer: GBuffer
 def _covered_tiles(inputs: FrameInputs, view: GaussianView | MeshView, reuse: Reuse, clock: StepClock) -> Tensor:
     """(tile,) bool: may show a surface; at least one, for a picture of nothing is done after one pass as well."""
     before = reuse.keeps("view")
-    if before is not None:
+    if before is not None and not before.is_moving:
         return before.tiles.covered
     camera, mesh = inputs.camera, inputs.scene.mesh
     across, down = tile_grid(camera.width, inputs.height)
@@ -232,7 +233,9 @@ def _covered_tiles(inputs: FrameInputs, view: GaussianView | MeshView, reuse: Re
         covered[:] = True
     elif isinstance(view, MeshView):
         above = inputs.rows.start // TILE * across
-        covered = tiles_of_mesh(mesh, camera)[above : above + across * down].clone()
+        # A moving picture finds out by its rays which tiles show something.
+        find_tiles = tiles_of_box if _is_moving(inputs, reuse) else tiles_of_mesh
+        covered = find_tiles(mesh, camera)[above : above + across * down].clone()
     else:
         covered[tile_of_pixels(view.primary_points.points.pixel - inputs.first_pixel, camera.width)] = True
     if not bool(covered.any()):
@@ -285,11 +288,12 @@ def _continue_sums(state: FrameState, brightness: float) -> FrameState:
     if not state.inputs.settings.split_indirect:
         state = replace(state, sums=replace(state.sums, indirect=None))
     if brightness != 1.0:
-        old, found = state.history, state.reprojected
+        old, found, moving = state.history, state.reprojected, state.moving_picture
         state = replace(
             state,
             sums=brighten_sums(state.sums, brightness),
             history=None if old is None else replace(old, light=brighten_light(old.light, brightness)),
             reprojected=None if found is None else replace(found, light=brighten_light(found.light, brightness)),
+            moving_picture=None if moving is None else brighten_picture(moving, brightness),
         )
     return replace(state, tiles=replace(state.tiles, active=still_active(state, state.tiles.covered)))

@@ -5,6 +5,7 @@ Tiles are numbered row-major, as pixels are. Knows nothing of rays or light.
 
 import math
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import torch
 import warp as wp
@@ -22,6 +23,10 @@ MARGIN = wp.constant(0.01)
 """By which triangles are widened on the screen, against rounding [pixels]."""
 
 
+_CORNERS = torch.tensor([[corner >> axis & 1 for axis in range(3)] for corner in range(8)], dtype=torch.bool)
+"""Of a box: which of both ends on each axis."""
+
+
 @dataclass(frozen=True)
 class Window:
     """The part of an image that holds all there is to see: what lies outside need not be filtered, blended or tone mapped."""
@@ -33,6 +38,11 @@ class Window:
     columns: slice
     top: int = 0
     """Where the image is a band of a larger one: the row of that at which it begins."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the window."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
 
     @property
     def tiles(self) -> tuple[slice, slice]:
@@ -60,7 +70,7 @@ class Window:
         intrinsics = camera.intrinsics.clone()
         intrinsics[0, 2] -= self.columns.start
         intrinsics[1, 2] -= self.top + self.rows.start
-        height, width = self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+        height, width = self.shape
         return replace(camera, intrinsics=intrinsics, width=width, height=height)
 
 
@@ -192,6 +202,33 @@ def tiles_of_mesh(mesh: TriangleMesh, camera: Camera) -> Tensor:
     inputs = [warp_array(mesh.faces.int().reshape(-1)), warp_array(side), warp_array(box, wp.vec4i), across, down]
     launch(mark_tiles, len(mesh.faces), inputs, [warp_array(covered), warp_array(crossing)], warp_device(covered))
     return torch.ones_like(covered) if bool(crossing) else covered
+
+
+_boxes: WeakKeyDictionary[TriangleMesh, Tensor] = WeakKeyDictionary()
+"""(2, 3) lowest and highest corner of meshes that live: every picture of a moving camera asks for them."""
+
+
+def tiles_of_box(mesh: TriangleMesh, camera: Camera) -> Tensor:
+    """(tile,) bool: those of tiles_of_mesh and more, found without a look at the faces: the rectangle around the mesh's box on the screen."""
+    across, down = tile_grid(camera.width, camera.height)
+    covered = torch.zeros(down, across, dtype=torch.bool, device=mesh.vertices.device)
+    if len(mesh.vertices) == 0:
+        return covered.flatten()
+    if mesh not in _boxes:
+        _boxes[mesh] = torch.stack([mesh.vertices.amin(0), mesh.vertices.amax(0)]).detach().double().cpu()
+    low, high = _boxes[mesh]
+    corners = torch.where(_CORNERS, high, low)
+    pose = camera.camera_from_world.double().cpu()
+    in_camera = corners @ pose[:3, :3].T + pose[:3, 3]
+    nearest = float(in_camera[:, 2].min())
+    if nearest <= 1e-6 * float(in_camera.abs().max()):  # the box reaches behind the camera: it may be seen anywhere
+        return torch.ones_like(covered).flatten()
+    on_screen = in_camera @ camera.intrinsics.double().cpu().T
+    places = on_screen[:, :2] / on_screen[:, 2:]
+    first = ((places.amin(0) - float(MARGIN)) / int(TILE)).floor().clamp(min=0).long().tolist()
+    last = ((places.amax(0) + float(MARGIN)) / int(TILE)).floor().long().tolist()
+    covered[first[1] : max(0, last[1] + 1), first[0] : max(0, last[0] + 1)] = True
+    return covered.flatten()
 
 
 def pixels_of_tiles(tiles: Tensor, width: int, height: int) -> Tensor:

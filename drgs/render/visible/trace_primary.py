@@ -12,7 +12,7 @@ from torch import Tensor
 
 from drgs.render.integrate.random_warp import hash_combine, sobol_2d
 from drgs.render.integrate.sample_rays import PointArrays, StartArrays, point_arrays, start_arrays
-from drgs.render.intersect.mesh_surface import MeshArrays, mesh_arrays, surface_at
+from drgs.render.intersect.mesh_surface import MeshArrays, Surface, mesh_arrays, surface_at
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import GBuffer, PrimaryPoints, RayStarts, ShadingPoints
@@ -53,6 +53,14 @@ def primary_rays(
     direction[i] = wp.normalize(world_from_camera * (camera_from_pixel * place))
 
 
+@wp.func
+def seen_normal(surface: Surface, arriving: wp.vec3) -> wp.vec3:
+    """Seen from the back a triangle is black: a normal that faces away makes it so whatever its vertices say."""
+    if wp.dot(surface.face_normal, arriving) > 0.0 and wp.dot(surface.normal, arriving) < 0.0:
+        return -surface.normal
+    return surface.normal
+
+
 @wp.kernel
 def surface_points(
     first: int,
@@ -73,12 +81,8 @@ def surface_points(
     r = int(ray[i])
     surface = surface_at(mesh, face[r], barycentric[r])
     arriving = ray_direction[r]
-    normal = surface.normal
-    # Seen from the back a triangle is black: a normal that faces away makes it so whatever its vertices say.
-    if wp.dot(surface.face_normal, arriving) > 0.0 and wp.dot(normal, arriving) < 0.0:
-        normal = -normal
     points.position[i] = surface.position
-    points.normal[i] = normal
+    points.normal[i] = seen_normal(surface, arriving)
     points.wo[i] = -arriving
     points.albedo[i] = surface.albedo
     points.roughness[i] = surface.roughness
@@ -91,6 +95,11 @@ def surface_points(
 
 def _mat33(matrix: Tensor) -> wp.mat33:
     return wp.mat33(*matrix.detach().double().cpu().reshape(-1).tolist())
+
+
+def camera_rotations(camera: Camera) -> tuple[wp.mat33, wp.mat33]:
+    """camera_from_pixel, which takes (x, y, 1) of a place on the image [pixels] to a viewing direction, and world_from_camera."""
+    return _mat33(torch.linalg.inv(camera.intrinsics.double())), _mat33(camera.camera_from_world[:3, :3].T)
 
 
 def trace_primary_points(
@@ -108,14 +117,12 @@ def trace_primary_points(
         pixels = pixels_of_tiles(tiles_of_mesh(mesh, camera), camera.width, camera.height)
     ray_count = passes * len(pixels)
     origin, direction = torch.empty(ray_count, 3, device=device), torch.empty(ray_count, 3, device=device)
-    world_from_camera = camera.camera_from_world[:3, :3].T
     center, view_axis = wp.vec3(*camera.center_world.tolist()), wp.vec3(*camera.camera_from_world[2, :3].tolist())
     pixel_array = warp_array(pixels)
     launch(
         primary_rays,
         ray_count,
-        [_mat33(torch.linalg.inv(camera.intrinsics.double())), _mat33(world_from_camera), center,
-         pixel_array, len(pixels), camera.width, wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
+        [*camera_rotations(camera), center, pixel_array, len(pixels), camera.width, wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
         [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3)],
         warp_device(origin),
     )  # fmt: skip

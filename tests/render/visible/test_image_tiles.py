@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from drgs.render.intersect.trace_rays import build_tracer
-from drgs.render.visible.image_tiles import pixels_of_tiles, tile_grid, tile_of_pixels, tiles_of_mesh
+from drgs.render.visible.image_tiles import pixels_of_tiles, tile_grid, tile_of_pixels, tiles_of_box, tiles_of_mesh
 from drgs.render.visible.trace_primary import trace_primary_points
 from drgs.scene.camera import Camera
 from tests.render.closed_form_scenes import front_camera, sphere_mesh, two_spheres
@@ -44,6 +44,16 @@ def test_tiles_are_those_of_the_triangles_boxes() -> None:
 def test_a_mesh_around_the_camera_may_be_seen_anywhere_and_one_behind_nowhere() -> None:
     assert bool(tiles_of_mesh(sphere_mesh(), front_camera(40, distance=0.5)).all())
     assert not bool(tiles_of_mesh(sphere_mesh(), front_camera(40, distance=-4.0)).any())
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (37.3, -50.1), (500.0, 0.0)])
+def test_the_tiles_of_a_meshs_box_are_a_rectangle_around_its_own(shift: tuple[float, float]) -> None:
+    mesh, camera = two_spheres(), shifted(front_camera(100, distance=12), *shift)
+    tiles, wider = tiles_of_mesh(mesh, camera), tiles_of_box(mesh, camera)
+    assert not bool((tiles & ~wider).any()) and int(wider.sum()) <= int(tiles.sum()) + 8
+    rows, columns = (wider.view(7, 7).any(axis) for axis in (1, 0))
+    assert torch.equal(wider.view(7, 7), rows[:, None] & columns)
+    assert bool(tiles_of_box(mesh, front_camera(40, distance=0.5)).all())
 
 
 def test_pixels_of_tiles_cover_an_image_that_is_no_multiple_of_them() -> None:

@@ -365,7 +365,10 @@ def denoise_svgf(radiance: Radiance, gbuffer: GBuffer, camera: Camera, settings:
         settings: None: by the samples behind the picture.
     """
     settings = settings or FilterSettings(levels_for(radiance.samples))
-    light = demodulate_albedo(radiance, gbuffer)
-    filter_light = filter_pixels if gbuffer.coverage.is_cuda else filter_sixteen_pixels
-    footprint = 1.0 / float(camera.intrinsics[0, 0])  # of a pixel at distance 1
-    return remodulate_albedo(filter_light(light, gbuffer, footprint, settings), radiance, gbuffer)
+    return remodulate_albedo(filter_light(demodulate_albedo(radiance, gbuffer), gbuffer, camera, settings), radiance, gbuffer)
+
+
+def filter_light(light: DemodulatedLight, gbuffer: GBuffer, camera: Camera, settings: FilterSettings) -> DemodulatedLight:
+    """The same for light without the reflectance of textures."""
+    filter_all = filter_pixels if gbuffer.coverage.is_cuda else filter_sixteen_pixels
+    return filter_all(light, gbuffer, 1.0 / float(camera.intrinsics[0, 0]), settings)
