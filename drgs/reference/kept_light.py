@@ -46,3 +46,17 @@ def read_between(
     if not bool(is_known.all()) or bool(is_steep) or bool(there.sqrt() > LARGEST_ERROR * mean):
         return WANTED, *nothing
     return READ, weights @ light, there
+
+
+def sent_by_vertex(direct: Tensor, rounds: int, albedo: Tensor, metallic: float) -> Tensor:
+    """(4,) radiance that a vertex is known to send back to rays that meet it, and 1; the last is 0 where it is not known, -1 where it never will be.
+
+    Args:
+        direct: (3,) sum over rounds of what white paint there would send of the environment's own light. albedo: (3,).
+    """
+    base = float(albedo.max())
+    diffuse, specular = (1 - metallic) * base, F0 * (1 - metallic) + metallic * base
+    verdict = -1.0 if diffuse < LEAST_DIFFUSE * (diffuse + specular) else float(rounds > 0)
+    facing = F0 * (1 - metallic) + metallic * albedo
+    sent = direct / max(rounds, 1) * ((1 - metallic) * albedo + facing + (1 - facing) / 21)
+    return torch.cat([sent if verdict > 0 else torch.zeros_like(sent), sent.new_tensor([verdict])])

@@ -17,8 +17,9 @@ from drgs.render.integrate.environment_pool import BLOCK_STREAM, BLOCKS
 from drgs.render.integrate.integrator import AbstractIntegrator, Estimate
 from drgs.render.integrate.path_arrays import PathArrays, path_arrays
 from drgs.render.integrate.ray_scene import RayScene
-from drgs.render.integrate.sample_rays import PointArrays, SampleSet, StartArrays
+from drgs.render.integrate.sample_rays import PointArrays, SampleSet, StartArrays, point_at
 from drgs.render.integrate.sum_samples import LightSums, RaySamples, ray_samples, sum_point
+from drgs.render.integrate.surface_light import light_of_hit
 from drgs.render.intersect.ray_memory import TracedArrays, traced_arrays
 from drgs.render.intersect.tracer_embree import EMBREE_RAY, EmbreeHandles
 from drgs.render.native_source import native_source
@@ -72,6 +73,24 @@ def scatter_sixteen_hits(
 ): ...  # fmt: skip
 
 
+@wp.func
+def leave_known_paths(scene: RayScene, paths: PathArrays, count: int, rays: RaySamples) -> int:
+    """Paths at whose surfaces light is known end there; the others move up. How many are left."""
+    left = wp.int32(0)
+    for path in range(count):
+        light = light_of_hit(scene.known, scene.mesh.faces, paths.face[path], paths.barycentric[path], paths.arriving[path])
+        if light[3] > 0.0:
+            rays.indirect[int(paths.ray[path])] = wp.vec3(light[0], light[1], light[2])
+        else:
+            paths.ray[left] = paths.ray[path]
+            paths.face[left] = paths.face[path]
+            paths.barycentric[left] = paths.barycentric[path]
+            paths.arriving[left] = paths.arriving[path]
+            paths.throughput[left] = paths.throughput[path]
+            left += 1
+    return left
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def shade_chunks(
     embree: EmbreeHandles,
@@ -96,13 +115,15 @@ def shade_chunks(
     scratch.counts[0] = 0
     for group in range((rays + 15) // 16):
         start_sixteen_rays(embree, 16 * group, rays, begin * count, bounces, points, starts, scene, samples, remembered, scratch)
+    if scene.known.vertex.shape[0] > 0:
+        scratch.counts[0] = leave_known_paths(scene, scratch.even, scratch.counts[0], scratch.rays)
     for depth in range(bounces):
         paths = scratch.counts[depth % 2]
         scratch.counts[1 - depth % 2] = 0
         for group in range((paths + 15) // 16):
             scatter_sixteen_hits(embree, 16 * group, begin, depth, depth + 1 == bounces, points, scene, samples, scratch)
-    for point in range(begin, end):
-        sum_point(point, (point - begin) * count, points, samples, scratch.rays, bounces, sums)
+    for listed in range(begin, end):
+        sum_point(point_at(points, listed), (listed - begin) * count, points, samples, scratch.rays, bounces, sums)
 
 
 class FusedEmbreeIntegrator(AbstractIntegrator):

@@ -21,6 +21,7 @@ from drgs.render.integrate.environment_pool import candidate_pools
 from drgs.render.integrate.ray_scene import ray_scene
 from drgs.render.integrate.sample_rays import point_arrays, sample_set, start_arrays
 from drgs.render.integrate.sum_samples import LightSums
+from drgs.render.integrate.surface_light import SurfaceLight
 from drgs.render.intersect.ray_memory import RayMemory, empty_rays, usable_rays
 from drgs.render.intersect.trace_rays import over_slices
 from drgs.render.intersect.tracer import AbstractTracer
@@ -96,19 +97,25 @@ class AbstractIntegrator(ABC):
         samples_round: int | Tensor = 0,
         memory: RayMemory | None = None,
         horizon: Tensor | None = None,
+        known: SurfaceLight | None = None,
+        order: Tensor | None = None,
+        onto: ShadedPoints | None = None,
     ) -> ShadedPoints:
-        """Outgoing light of all points, one estimate of `settings.counts.total` rays each.
+        """Outgoing light of all points, or of some, one estimate of `settings.counts.total` rays each.
 
         Args:
             light: EnvironmentLight struct (environment_table.environment_light).
             samples_round: how many estimates of the same settings came before; continues their sequences. (point,) int32 where it differs.
             memory: of an estimate of the same counts from the same starts: rays that are known are not traced, and it then knows these.
             horizon: (face, SECTORS) sines (horizon.Horizons); rays above them are not traced.
+            known: what surfaces of the tracer's mesh send, read where a ray meets one; only with one bounce.
+            order: (chosen,) int32, the points that are meant, without a memory; None: all, one after the other. The others stay 0, or
+            onto: what is known of all points so far; the light of those that are meant is written into it.
         """
-        device, point_count, rays_a_point = points.normal_world.device, len(points.pixel), settings.counts.total
-        diffuse, specular, variance = (torch.zeros(point_count, 3, device=device) for _ in range(3))
-        indirect, of_it_diffuse = (torch.zeros(point_count, 3, device=device) if settings.split_indirect else None for _ in range(2))
-        result = ShadedPoints(diffuse, specular, variance, torch.zeros(point_count, device=device), indirect, of_it_diffuse)
+        assert (known is None or settings.bounces == 1) and (order is None or memory is None)
+        device, rays_a_point = points.normal_world.device, settings.counts.total
+        point_count = len(points.pixel) if order is None else len(order)
+        result = _no_light(len(points.pixel), settings.split_indirect, device) if onto is None else onto
         ray_count, finds_surfaces = point_count * rays_a_point, settings.bounces > 0
         if ray_count == 0:
             return result
@@ -117,15 +124,15 @@ class AbstractIntegrator(ABC):
         lowest = first_round if rounds is None else int(rounds.min())
         pools = candidate_pools(light, settings.candidates, settings.seed, lowest, last_round, device)
         estimate = Estimate(
-            point_arrays(points, rounds),
+            point_arrays(points, rounds, order),
             start_arrays(starts),
-            ray_scene(light, self.tracer, horizon, pools),
+            ray_scene(light, self.tracer, horizon, pools, known),
             sample_set(settings.counts, settings.seed, first_round, settings.by_material, settings.candidates),
             rays_a_point,
             settings.bounces,
             usable_rays(memory, ray_count, finds_surfaces),
             empty_rays(memory, ray_count, finds_surfaces, device),
-            _light_sums(result),
+            light_sums(result),
         )
         self.load_kernels()
         shrinking = device.type == "cpu" and thread_count() > 1 and not in_thread_pool()
@@ -141,8 +148,14 @@ class AbstractIntegrator(ABC):
         return result
 
 
-def _light_sums(light: ShadedPoints) -> Any:
-    """The struct that kernels write to."""
+def _no_light(count: int, split_indirect: bool, device: torch.device) -> ShadedPoints:
+    diffuse, specular, variance = (torch.zeros(count, 3, device=device) for _ in range(3))
+    indirect, of_it_diffuse = (torch.zeros(count, 3, device=device) if split_indirect else None for _ in range(2))
+    return ShadedPoints(diffuse, specular, variance, torch.zeros(count, device=device), indirect, of_it_diffuse)
+
+
+def light_sums(light: ShadedPoints) -> Any:
+    """The struct that kernels write to; shares memory with the tensors."""
     sums = LightSums()
     sums.diffuse, sums.specular = warp_array(light.diffuse, wp.vec3), warp_array(light.specular, wp.vec3)
     sums.variance, sums.visibility = warp_array(light.variance, wp.vec3), warp_array(light.visibility)

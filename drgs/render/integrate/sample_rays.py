@@ -48,6 +48,8 @@ class PointArrays:
     pixel: wp.array[int]
     round: wp.array[int]
     """Each point's own rounds, added to SampleSet.round; empty where all are the same."""
+    order: wp.array[int]
+    """The points that are meant, one after the other; empty where all are (point_at)."""
 
 
 @wp.struct
@@ -99,6 +101,14 @@ def gather_points(
     points.roughness[i] = roughness[p]
     points.metallic[i] = metallic[p]
     points.pixel[i] = first_pixel + p
+
+
+@wp.func
+def point_at(points: PointArrays, listed: int) -> int:
+    """Number of the listed-th point that is meant."""
+    if points.order.shape[0] > 0:
+        return points.order[listed]
+    return listed
 
 
 @wp.func
@@ -209,11 +219,11 @@ def sample_directions(
     weight[i] = w
 
 
-def point_arrays(points: ShadingPoints, rounds: torch.Tensor | None = None) -> Any:
+def point_arrays(points: ShadingPoints, rounds: torch.Tensor | None = None, order: torch.Tensor | None = None) -> Any:
     """The struct that kernels read; shares memory with the tensors.
 
     Args:
-        rounds: (point,) int32, where points of several passes come together.
+        rounds: (point,) int32, where points of several passes come together. order: (chosen,) int32, of some of them.
     """
     arrays = PointArrays()
     arrays.position = warp_array(points.position_world.float(), wp.vec3)
@@ -223,7 +233,8 @@ def point_arrays(points: ShadingPoints, rounds: torch.Tensor | None = None) -> A
     arrays.roughness = warp_array(points.roughness.float())
     arrays.metallic = warp_array(points.metallic.float())
     arrays.pixel = warp_array(points.pixel.int())
-    arrays.round = warp_array(points.pixel[:0].int() if rounds is None else rounds)
+    none = points.pixel[:0].int()
+    arrays.round, arrays.order = warp_array(none if rounds is None else rounds), warp_array(none if order is None else order)
     return arrays
 
 

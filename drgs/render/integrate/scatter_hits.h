@@ -39,7 +39,8 @@ for (int lane = 0; lane < 16; ++lane) {
         arriving[k][lane] = ((const float*)from.arriving.data)[3 * (long)path + k];
         carried[k][lane] = ((const float*)from.throughput.data)[3 * (long)path + k];
     }
-    const int ray = (int)from.ray.data[path], point = first_point + ray / count;
+    const int ray = (int)from.ray.data[path], listed = first_point + ray / count;
+    const int point = points.order.shape[0] > 0 ? points.order.data[listed] : listed;
     int split[3];
     split_at(samples, points, point, split);
     const int round = samples.round + (points.round.shape[0] > 0 ? points.round.data[point] : 0);

@@ -3,7 +3,7 @@
 // Lanes never look at each other, so a ray's result does not depend on its group.
 //
 // in   base (first ray of the group in the chunk), ray_count (of the chunk), first (the chunk's first ray among all), bounces,
-//      points, starts, scene, samples, remembered.known
+//      points (those that are meant, in their order), starts, scene, samples, remembered.known
 // out  of rays base .. base + 15: scratch.rays without `indirect`; with bounces the rays that met a surface, packed in scratch.even
 //      behind scratch.counts[0], their `indirect` set to 0; scratch.counts[2] plus the rays traced; remembered.kept, where there is space
 
@@ -19,7 +19,8 @@ for (int k = 0; k < 3; ++k) normal_at[k] = wo_at[k] = triangle_at[k] = albedo_at
 u16 pixel = u16(0u), index = u16(0u), strategy = u16(0u);
 int point_lane[16], round_lane[16];
 for (int lane = 0; lane < lanes;) {
-    const int ray = first + base + lane, point = ray / count, slot = ray - point * count;
+    const int ray = first + base + lane, listed = ray / count, slot = ray - listed * count;
+    const int point = points.order.shape[0] > 0 ? points.order.data[listed] : listed;
     const long at = 3 * (long)point;
     const i16 here = __builtin_bit_cast(i16, LANE_NUMBERS) >= lane;
     int split[3];

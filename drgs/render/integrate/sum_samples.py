@@ -7,7 +7,7 @@ import warp as wp
 
 from drgs.render.color_warp import luminance_of
 from drgs.render.integrate.brdf_warp import PI
-from drgs.render.integrate.sample_rays import PointArrays, SampleSet, split_at
+from drgs.render.integrate.sample_rays import PointArrays, SampleSet, point_at, split_at
 from drgs.warp_torch import warp_array
 
 wp.set_module_options({"enable_backward": False})
@@ -141,7 +141,7 @@ def sum_samples(
     # outputs
     sums: LightSums,
 ):
-    """sum_point for the points from `first` on, whose rays the arrays hold."""
+    """sum_point for the points that are meant, from the `first` on, whose rays the arrays hold."""
     i = wp.tid()
     count = samples.cosine + samples.ggx + samples.environment
-    sum_point(first + i, i * count, points, samples, rays, bounces, sums)
+    sum_point(point_at(points, first + i), i * count, points, samples, rays, bounces, sums)

@@ -24,7 +24,8 @@ from drgs.render.integrate.integrator import Estimate
 from drgs.render.integrate.path_arrays import PathArrays
 from drgs.render.integrate.random_warp import hash_combine, shuffle_index, sobol_2d
 from drgs.render.integrate.ray_scene import RayScene
-from drgs.render.integrate.sample_rays import PointArrays, SampleSet, round_at, split_at, strategy_of, strategy_seed
+from drgs.render.integrate.sample_rays import PointArrays, SampleSet, point_at, round_at, split_at, strategy_of, strategy_seed
+from drgs.render.integrate.surface_light import light_of_hit
 from drgs.render.intersect.mesh_surface import Surface, face_limit, far_along, surface_at
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Hits
@@ -122,7 +123,7 @@ def scatter_hits(
         return
     count = samples.cosine + samples.ggx + samples.environment
     ray = int(paths.ray[i])
-    point = first_point + ray // count
+    point = point_at(points, first_point + ray // count)
     round_ = round_at(samples, points, point)
     strategy = strategy_of(split_at(samples, points, point), round_, ray % count)
     base = strategy_seed(samples, points.pixel[point], strategy[0])
@@ -171,6 +172,21 @@ def scatter_hits(
                 survival = wp.clamp(wp.max(reflected) / own, 0.05, 1.0)
             if u_choice[1] < survival:
                 scattered.throughput[i] = reflected / (own * survival)
+
+
+@wp.kernel
+def read_known_light(
+    paths: PathArrays,
+    scene: RayScene,
+    # outputs
+    indirect: wp.array[wp.vec3],
+    is_known: wp.array[wp.bool],
+):
+    i = wp.tid()
+    light = light_of_hit(scene.known, scene.mesh.faces, paths.face[i], paths.barycentric[i], paths.arriving[i])
+    is_known[i] = light[3] > 0.0
+    if light[3] > 0.0:
+        indirect[int(paths.ray[i])] = wp.vec3(light[0], light[1], light[2])
 
 
 @wp.kernel
@@ -228,6 +244,11 @@ def trace_indirect(estimate: Estimate, paths: Paths, ray_count: int, first_point
     """
     device, warp_dev, traced = paths.arriving.device, warp_device(paths.arriving), 0
     indirect = torch.zeros(ray_count, 3, device=device)
+    if estimate.scene.known.vertex.shape[0] > 0 and len(paths.ray) > 0:
+        is_known = torch.empty(len(paths.ray), dtype=torch.bool, device=device)
+        outputs = [warp_array(indirect, wp.vec3), warp_array(is_known)]
+        wp.launch(read_known_light, dim=len(paths.ray), inputs=[_arrays_of(paths), estimate.scene], outputs=outputs, device=warp_dev)
+        paths = Paths(*(values[~is_known] for values in vars(paths).values()))
     for depth in range(estimate.bounces):
         count = len(paths.ray)
         if count == 0:

@@ -21,6 +21,7 @@ from drgs.render.integrate.sample_rays import (
     SampleSet,
     StartArrays,
     balance_weight,
+    point_at,
     round_at,
     sampled_direction,
     split_at,
@@ -28,7 +29,7 @@ from drgs.render.integrate.sample_rays import (
     strategy_seed,
 )
 from drgs.render.integrate.sum_samples import RaySamples, ray_samples, sum_samples
-from drgs.render.integrate.trace_indirect import add_contributions, paths_of_hits, scatter_hits, trace_indirect
+from drgs.render.integrate.trace_indirect import add_contributions, paths_of_hits, read_known_light, scatter_hits, trace_indirect
 from drgs.render.intersect.mesh_surface import face_limit, far_along
 from drgs.render.intersect.ray_memory import note_directions, trace_batch
 from drgs.warp_torch import load_kernel, warp_array, warp_device
@@ -55,7 +56,7 @@ def start_rays(
 ):
     i = wp.tid()
     count = samples.cosine + samples.ggx + samples.environment
-    point = (first + i) // count
+    point = point_at(points, (first + i) // count)
     n = points.normal[point]
     wo = points.wo[point]
     roughness = points.roughness[point]
@@ -109,7 +110,7 @@ class WavefrontIntegrator(AbstractIntegrator):
     """Final."""
 
     def load_kernels(self) -> None:
-        for kernel in (start_rays, note_directions, scatter_hits, add_contributions, sum_samples):
+        for kernel in (start_rays, note_directions, read_known_light, scatter_hits, add_contributions, sum_samples):
             load_kernel(kernel, self._device())
 
     def rays_a_slice(self) -> int:

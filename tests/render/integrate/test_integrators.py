@@ -293,6 +293,28 @@ def test_both_integrators_bring_the_same_light(bounces: int, by_material: bool, 
 
 
 @INTEGRATORS
+def test_some_of_the_points_get_what_they_get_among_all_and_the_others_keep_theirs(integrator: type, device: str) -> None:
+    mesh = on_device(two_spheres(metallic=0.3), device)
+    points, starts = points_on(mesh), RayStarts(mesh.vertices + 1e-3 * mesh.normals, mesh.normals)
+    light = environment_light(build_environment_table(Environment(sunny_sky(sun=20.0).radiance.to(device))))
+    if device != "cpu" and integrator is FusedEmbreeIntegrator:
+        integrator = WavefrontIntegrator  # Embree's is the CPU's
+    chosen, how = integrator(build_tracer(mesh)), IntegratorSettings(SampleCounts(3, 2, 2), 1, 3, by_material=True)
+    whole = chosen.shade(points, starts, light, how)
+    order = torch.randperm(len(mesh.vertices), generator=torch.Generator().manual_seed(1))[:200].int().to(device)
+    other = torch.ones(len(mesh.vertices), dtype=torch.bool, device=device)
+    other[order.long()] = False
+    some = chosen.shade(points, starts, light, how, order=order)
+    before = ShadedPoints(*(torch.full_like(getattr(whole, name), 7.0) for name in MAPS))
+    onto = chosen.shade(points, starts, light, how, order=order, onto=before)
+    assert onto is before
+    for name in MAPS:
+        wanted = getattr(whole, name)
+        assert torch.equal(getattr(some, name)[~other], wanted[~other]) and not bool(getattr(some, name)[other].any())
+        assert torch.equal(getattr(onto, name)[~other], wanted[~other]) and bool((getattr(onto, name)[other] == 7).all())
+
+
+@INTEGRATORS
 @pytest.mark.parametrize("bounces", [0, 1, 3])
 def test_the_light_of_other_surfaces_is_what_bounces_add(integrator: type, bounces: int) -> None:
     mesh = two_spheres(metallic=0.3)

@@ -9,17 +9,43 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from drgs.render.integrate.integrator import AbstractIntegrator, IntegratorSettings
+from drgs.render.integrate.surface_light import SurfaceLight
 from drgs.render.intersect.horizon import usable_horizons
-from drgs.render.progressive.kept_light.kept_light import A_ROUND, KeptLight
+from drgs.render.progressive.kept_light.kept_light import A_ROUND, KeptArrays, KeptLight, kept_arrays
 from drgs.render.records import RayStarts, ShadingPoints
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
 
 MOST_ROUNDS = 16
 """Of a vertex: 256 rays."""
 VERTEX_STREAM = 0x51AB
 """Keeps the random numbers of vertices apart from those of pixels."""
+
+
+@wp.kernel
+def add_round(
+    first: int,
+    vertices: wp.array[wp.int64],
+    light: wp.array[wp.vec3],
+    indirect: wp.array[wp.vec3],
+    variance: wp.array[wp.vec3],
+    visibility: wp.array[float],
+    # in and out; each vertex occurs once, so plain adds are exact
+    kept: KeptArrays,
+):
+    i = first + wp.tid()
+    v = int(vertices[i])
+    kept.direct[v] = kept.direct[v] + (light[i] - indirect[i])
+    kept.indirect[v] = kept.indirect[v] + indirect[i]
+    kept.visibility[v] = kept.visibility[v] + visibility[i]
+    kept.variance[v] = kept.variance[v] + variance[i][1]
+    kept.rounds[v] = kept.rounds[v] + 1
+    kept.indirect_rounds[v] = kept.indirect_rounds[v] + 1
 
 
 def vertices_to_light(kept: KeptLight, wanted: Tensor, rays: int) -> Tensor:
@@ -29,11 +55,18 @@ def vertices_to_light(kept: KeptLight, wanted: Tensor, rays: int) -> Tensor:
     return here if len(here) <= most else here[torch.argsort(kept.indirect_rounds[here], stable=True)[:most]]
 
 
-def gather_light(kept: KeptLight, vertices: Tensor, integrator: AbstractIntegrator, light: Any, how: IntegratorSettings) -> KeptLight:
+def gather_light(
+    kept: KeptLight,
+    vertices: Tensor,
+    integrator: AbstractIntegrator,
+    light: Any,
+    how: IntegratorSettings,
+    known: SurfaceLight | None = None,
+) -> KeptLight:
     """The same with one more round at chosen vertices (chosen,) int64, no vertex twice.
 
     Args:
-        light: EnvironmentLight struct. how: of the picture; its bounces and seed are used.
+        light: EnvironmentLight struct. how: of the picture; its bounces and seed are used. known: what surfaces send that rays meet.
     """
     if len(vertices) == 0:
         return kept
@@ -47,19 +80,10 @@ def gather_light(kept: KeptLight, vertices: Tensor, integrator: AbstractIntegrat
     starts = RayStarts(position + tracer.lift * face_normal, face_normal, face)
     white = IntegratorSettings(A_ROUND, how.bounces, how.seed ^ VERTEX_STREAM, split_indirect=True)
     # Whatever share of the sky the picture takes for open without asking, what is kept outlives that setting.
-    found = integrator.shade(points, starts, light, white, rounds, None, usable_horizons(tracer.horizons))
+    found = integrator.shade(points, starts, light, white, rounds, None, usable_horizons(tracer.horizons), known)
     assert found.indirect_diffuse is not None
-
-    def more(sums: Tensor, values: Tensor) -> Tensor:
-        return sums.index_add(0, vertices, values)
-
-    a_round = torch.ones_like(rounds)
-    return replace(
-        kept,
-        direct=more(kept.direct, found.diffuse - found.indirect_diffuse),
-        indirect=more(kept.indirect, found.indirect_diffuse),
-        visibility=more(kept.visibility, found.visibility),
-        variance=more(kept.variance, found.variance[:, 1].contiguous()),
-        rounds=more(kept.rounds, a_round),
-        indirect_rounds=more(kept.indirect_rounds, a_round),
-    )
+    copies: dict[str, Any] = {name: values.clone() for name, values in vars(kept).items() if isinstance(values, Tensor)}
+    more = replace(kept, **copies)
+    inputs = [warp_array(vertices), *(warp_array(x, wp.vec3) for x in (found.diffuse, found.indirect_diffuse, found.variance))]
+    launch(add_round, len(vertices), [*inputs, warp_array(found.visibility)], [kept_arrays(more)], warp_device(position))
+    return more

@@ -13,6 +13,7 @@ Twin: drgs/reference/kept_light.py.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -189,8 +190,13 @@ def read_light(kept: KeptLight, primary: PrimaryPoints, tracer: AbstractTracer, 
         point_arrays(primary.points), warp_array(primary.starts.face), warp_array(primary.barycentric, wp.vec2), warp_array(primary.depth),
         mesh_arrays(tracer.mesh, tracer.lift), kept_arrays(kept), footprint,
     ]  # fmt: skip
+    launch(read_points, count, inputs, [there_arrays(there)], warp_device(primary.depth))
+    return there
+
+
+def there_arrays(there: LightThere) -> Any:
+    """The struct that kernels read and write; shares memory with the tensors."""
     arrays = ThereArrays()
     arrays.verdict, arrays.light, arrays.variance = warp_array(there.verdict), warp_array(there.light, wp.vec3), warp_array(there.variance)
     arrays.visibility, arrays.samples, arrays.wanted = (warp_array(x) for x in (there.visibility, there.samples, there.wanted))
-    launch(read_points, count, inputs, [arrays], warp_device(primary.depth))
-    return there
+    return arrays

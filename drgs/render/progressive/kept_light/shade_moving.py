@@ -8,19 +8,28 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
 from drgs.maths.constants import F0
-from drgs.render.integrate.integrator import AbstractIntegrator, IntegratorSettings
+from drgs.render.integrate.integrator import AbstractIntegrator, IntegratorSettings, light_sums
+from drgs.render.integrate.sample_rays import PointArrays, point_arrays
+from drgs.render.integrate.sum_samples import LightSums
+from drgs.render.progressive.demodulate_albedo import mean_square
 from drgs.render.progressive.kept_light.gather_light import gather_light, vertices_to_light
 from drgs.render.progressive.kept_light.kept_light import A_ROUND, KeptLight
-from drgs.render.progressive.kept_light.read_light import READ, LightThere, read_light
+from drgs.render.progressive.kept_light.light_of_hits import light_of_hits
+from drgs.render.progressive.kept_light.read_light import READ, ThereArrays, read_light, there_arrays
 from drgs.render.records import PrimaryPoints, SampleCounts, ShadedPoints, ShadingPoints
-from drgs.render.visible.points_at import points_at
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
 
 SPENT_FIRST = 1
 """Rays that go to kept light for each point that is not read, as a share of its own."""
+SPENT_ON_HITS = 1.0
+"""Rays of a picture, for each of its points, that go to light of surfaces that other rays met."""
 ENOUGH_ROUNDS = 4
 """Of a vertex, from which on no more is spent on it for points that are not read: metal, and the edges of shadows, will never be."""
 SPENT_LATER, LEAST_LATER = 1 / 16, 0.5
@@ -55,17 +64,40 @@ def shade_moving(
         how: of points that are not read. horizon: of the tracer's mesh. footprint: of a pixel at distance 1 [world units].
     """
     there = read_light(kept, primary, integrator.tracer, footprint)
+    known = light_of_hits(kept, integrator.tracer) if how.bounces == 1 else None
     read = there.verdict == int(READ)
-    here, elsewhere = torch.nonzero(read).squeeze(-1), torch.nonzero(~read).squeeze(-1)
-    traced = points_at(primary, elsewhere)
-    light = integrator.shade(traced.points, traced.starts, environment_light, how, 0, None, horizon)
-    glossy = points_at(primary, here)
-    fewer = replace(how, counts=specular_counts(how.counts))
-    specular = integrator.shade(only_specular(glossy.points), glossy.starts, environment_light, fewer, 0, None, horizon)
+    here, elsewhere = (torch.nonzero(chosen).squeeze(-1).int() for chosen in (read, ~read))
+    light = integrator.shade(primary.points, primary.starts, environment_light, how, 0, None, horizon, known, elsewhere)
+    fewer, glossy = replace(how, counts=specular_counts(how.counts)), only_specular(primary.points)
+    light = integrator.shade(glossy, primary.starts, environment_light, fewer, 0, None, horizon, known, here, light)
+    inputs = [warp_array(here), point_arrays(primary.points), there_arrays(there)]
+    launch(add_read_light, len(here), inputs, [light_sums(light)], warp_device(read))
     young = int((there.wanted & (kept.indirect_rounds < ENOUGH_ROUNDS)).sum())
     vertices = vertices_to_light(kept, there.wanted, rays_to_keep(how.counts.total, len(elsewhere), len(here), young))
-    kept = gather_light(kept, vertices, integrator, environment_light, how)
-    return MovingLight(_together(light, elsewhere, _with_kept(specular, glossy.points, there, here), here), there.samples, kept)
+    if known is not None:
+        asked = known.asked & (kept.rounds < 1) & ~there.wanted
+        vertices = torch.cat([vertices, vertices_to_light(kept, asked, int(SPENT_ON_HITS * len(there.samples)))])
+    return MovingLight(light, there.samples, gather_light(kept, vertices, integrator, environment_light, how, known))
+
+
+@wp.kernel
+def add_read_light(
+    first: int,
+    here: wp.array[int],
+    points: PointArrays,
+    there: ThereArrays,
+    # in and out
+    light: LightSums,
+):
+    """The diffuse light of points that are read, beside the specular light that rays brought."""
+    p = here[first + wp.tid()]
+    reflectance = (1.0 - points.metallic[p]) * points.albedo[p]
+    # The luminance of a product is no product; this is how denoisers take it apart again.
+    variance = there.variance[p] * mean_square(reflectance)
+    specular = light.variance[p][2]
+    light.diffuse[p] = wp.cw_mul(reflectance, there.light[p])
+    light.variance[p] = wp.vec3(variance + specular, variance, specular)
+    light.visibility[p] = there.visibility[p]
 
 
 def specular_counts(counts: SampleCounts) -> SampleCounts:
@@ -89,24 +121,3 @@ def only_specular(points: ShadingPoints) -> ShadingPoints:
     """Points that reflect as these do, without the diffuse part: metal whose colour is their reflectance at normal incidence."""
     metallic = points.metallic[:, None]
     return replace(points, albedo=F0 * (1 - metallic) + metallic * points.albedo, metallic=torch.ones_like(points.metallic))
-
-
-def _with_kept(specular: ShadedPoints, points: ShadingPoints, there: LightThere, here: Tensor) -> ShadedPoints:
-    """Light of points that are read: specular light, and kept light times their albedo."""
-    reflectance = (1 - points.metallic)[:, None] * points.albedo
-    # The luminance of a product is no product; this is how denoisers take it apart again.
-    variance = there.variance[here] * reflectance.square().mean(-1)
-    both = torch.stack([variance + specular.variance[:, 2], variance, specular.variance[:, 2]], -1)
-    return ShadedPoints(reflectance * there.light[here], specular.specular, both, there.visibility[here])
-
-
-def _together(a: ShadedPoints, where_a: Tensor, b: ShadedPoints, where_b: Tensor) -> ShadedPoints:
-    """Two sets of points in the order of the pass."""
-
-    def both(name: str) -> Tensor:
-        first, second = getattr(a, name), getattr(b, name)
-        values = first.new_empty(len(where_a) + len(where_b), *first.shape[1:])
-        values[where_a], values[where_b] = first, second
-        return values
-
-    return ShadedPoints(both("diffuse"), both("specular"), both("variance"), both("visibility"))
