@@ -67,7 +67,14 @@ class AbstractTracer(ABC):
         """A tracer of a mesh of the same shape with other materials; shares the tree."""
         other = copy.copy(self)
         other.mesh = mesh
+        if "swift" in other.__dict__:
+            other.__dict__["swift"] = other.swift.with_materials(mesh)
         return other
+
+    @property
+    def swift(self) -> "AbstractTracer":
+        """A tracer of the same mesh that may let a ray pass between triangles with a common edge, where that is faster. Made once."""
+        return self
 
     kernel_query: ClassVar[KernelQuery]
 

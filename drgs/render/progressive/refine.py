@@ -87,7 +87,7 @@ def _move(state: FrameState) -> FrameState:
     started = time.perf_counter()
     middles = see_middles(state.traced.tracer, state.inputs.camera, state.tiles.covered)
     seen, primary = time.perf_counter(), middles.primary
-    integrator, light, how = choose_integrator(state.traced.tracer), state.traced.environment_light, _how(state)
+    integrator, light, how = choose_integrator(state.traced.tracer.swift), state.traced.environment_light, _how(state)
     kept, kept_samples = state.kept_light, None
     if state.plan.kept_light:
         assert kept is not None
