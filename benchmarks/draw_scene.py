@@ -1,8 +1,10 @@
 """A capture with everything known, drawn by us: the mesh and cameras of a scene of the benchmark, of other matter or shape, under other light.
 
     python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn] --light FILE.exr --new-light FILE.exr [--spp 64]
+                                    [--turned] [--every 2] [--side 200]
 
-OUT has the layout of the scenes in shared/bench (photographs, test views with maps, the same under the new light), so that `drgs build` takes it
+With --turned the light of the photographs stands still with the camera, as on a turntable; the file holds it as the first photograph's camera
+sees it, which is how an asset holds it. OUT has the layout of the scenes in shared/bench (photographs, test views with maps, the same under the new light), so that `drgs build` takes it
 and `drgs eval` scores what was built. Our own renderer drew it, so it says nothing of that one; it says what a build makes of matter and light
 that no scene at hand has.
 """
@@ -10,21 +12,27 @@ that no scene at hand has.
 import argparse
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
-from benchmarks.measures.bench_scene import Array, open_scene, read_true_mesh, training_cameras
+from benchmarks.measures.bench_scene import Array, BenchScene, open_scene, read_true_mesh, training_cameras
 from benchmarks.measures.embossed_urn import embossed_urn
 from benchmarks.measures.swap_parts import swapped_picture
+from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.visible.trace_primary import trace_primary
-from drgs.scene.camera import Camera
+from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.environment import turned_environment
 from drgs.scene.load_environment import load_environment
 from drgs.scene.mesh import TriangleMesh
 
@@ -82,17 +90,49 @@ def true_maps(tracer: AbstractTracer, camera: Camera) -> Array:
     return torch.where(seen.coverage[..., None] > 0.5, maps, torch.zeros_like(maps)).double().numpy()
 
 
-def draw(tracer: AbstractTracer, cameras: list[Camera], light: Path, folder: Path, samples: int) -> None:
-    """RGBA pictures of the cameras' names into `folder`."""
+def turns_with(first: Camera) -> Callable[[Camera], Float[Tensor, "3 3"]]:
+    """Of a camera, the rotation of directions in the world to those of a light that stands still with the camera and is upright before the first."""
+    rotation = first.camera_from_world[:3, :3].double()
+    return lambda camera: (rotation.T @ camera.camera_from_world[:3, :3].double()).float()
+
+
+def draw(
+    tracer: AbstractTracer,
+    cameras: list[Camera],
+    light: Path,
+    folder: Path,
+    samples: int,
+    turn: Callable[[Camera], Float[Tensor, "3 3"]] | None = None,
+) -> None:
+    """RGBA pictures of the cameras' names into `folder`.
+
+    Args:
+        turn: of each camera, the rotation of directions in the world to those of the light; None: it stands still.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    environment = load_environment(light)
+    still = load_environment(light)
     for camera in cameras:
+        environment = still if turn is None else turned_environment(still, turn(camera))
         picture = swapped_picture(tracer, tracer, environment, camera, samples, BOUNCES)
         Image.fromarray((255 * picture + 0.5).astype(np.uint8)).save(folder / f"{Path(camera.name).name}.png")
 
 
+@dataclass(frozen=True)
+class Drawing:
+    """How a capture is drawn."""
+
+    samples: int = 64
+    """Rays a pixel of a photograph."""
+    turned: bool = False
+    """The light of the photographs stands still with the camera."""
+    every: int = 1
+    """Of the scene's photographs and test views, one in so many."""
+    side: int | None = None
+    """Of a picture [pixels]; None: as the scene's."""
+
+
 def draw_scene(
-    scene_folder: Path, out: Path, matter: Matter | None, light: Path, new_light: Path, samples: int, shape: TriangleMesh | None = None
+    scene_folder: Path, out: Path, matter: Matter | None, light: Path, new_light: Path, drawing: Drawing, shape: TriangleMesh | None = None
 ) -> None:
     """Write the capture.
 
@@ -108,12 +148,12 @@ def draw_scene(
     if out.exists():
         raise ValueError(f"{out} is there already; name a folder that is not")
     mesh = of_matter(shape or read_true_mesh(scene), matter)
-    tracer, tests = build_tracer(mesh), list(scene.cameras)
     (out / "env").mkdir(parents=True)
     for path in (light, new_light):
         shutil.copy(path, out / "env" / path.name)
     for name in ("transforms_train.json", "transforms_test.json"):
-        shutil.copy(scene_folder / name, out)
+        document = chosen_frames(json.loads((scene_folder / name).read_text()), drawing)
+        (out / name).write_text(json.dumps(document))
     if shape is None:
         shutil.copy(scene_folder / "gt_mesh.ply", out)
     else:
@@ -121,11 +161,45 @@ def draw_scene(
     np.savez(out / "gt_materials.npz", **{name: getattr(mesh, name).numpy() for name in ("albedo", "roughness", "metallic")})
     facts = {"name": out.name, "train_env": light.stem, "relight": [new_light.stem], "deform": {}}
     (out / "scene.json").write_text(json.dumps(facts))
-    draw(tracer, tests, light, out / "test", TEST_RAYS * samples)
+    tracer, (photographs, tests) = build_tracer(mesh), drawn_cameras(scene, drawing)
     for camera in tests:
+        (out / "test").mkdir(exist_ok=True)
         np.savez_compressed(out / "test" / f"{Path(camera.name).name}_aov.npz", aov=true_maps(tracer, camera).astype(np.float16))
-    draw(tracer, tests[::2], new_light, out / "relight" / new_light.stem, TEST_RAYS * samples)
-    draw(tracer, sorted(training_cameras(scene), key=lambda camera: camera.name), light, out / "train", samples)
+    draw(tracer, tests[::2], new_light, out / "relight" / new_light.stem, TEST_RAYS * drawing.samples)
+    draw_photographs(tracer, photographs, tests, light, out, drawing)
+
+
+def draw_photographs(
+    tracer: AbstractTracer, photographs: list[Camera], tests: list[Camera], light: Path, out: Path, drawing: Drawing
+) -> None:
+    """Photographs and test views under their light, which is upright before the first photograph's camera if it turns."""
+    turn = turns_with(photographs[0]) if drawing.turned else None
+    draw(tracer, tests, light, out / "test", TEST_RAYS * drawing.samples, turn)
+    draw(tracer, sorted(photographs, key=lambda camera: camera.name), light, out / "train", drawing.samples, turn)
+
+
+def drawn_cameras(scene: BenchScene, drawing: Drawing) -> tuple[list[Camera], list[Camera]]:
+    """Of the photographs, in the order of their file, and of the test views, in the order of their names."""
+
+    def chosen(cameras: list[Camera]) -> list[Camera]:
+        return [camera if drawing.side is None else scaled_camera(camera, drawing.side / camera.width) for camera in cameras]
+
+    tests = sorted(load_cameras(scene.folder / "transforms_test.json")[:: drawing.every], key=lambda camera: camera.name)
+    return chosen(training_cameras(scene)[:: drawing.every]), chosen(tests)
+
+
+def chosen_frames(document: dict[str, Any], drawing: Drawing) -> dict[str, Any]:
+    """A transforms.json without the frames that are not drawn, and of pictures as large as those that are.
+
+    Raises:
+        ValueError: its cameras do not say how wide their pictures are, or what they say cannot be scaled.
+    """
+    frames = document["frames"][:: drawing.every]
+    if drawing.side is None:
+        return document | {"frames": frames}
+    if "camera_angle_x" not in document or "fl_x" in document:
+        raise ValueError("--side needs a scene whose cameras are given by camera_angle_x; leave it out")
+    return {name: value for name, value in document.items() if name not in ("w", "h")} | {"frames": frames}
 
 
 def main(arguments: list[str]) -> None:
@@ -137,7 +211,10 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--light", type=Path, required=True)
     parser.add_argument("--new-light", type=Path, required=True)
     parser.add_argument("--spp", type=int, default=64, help="rays a pixel of a photograph; test pictures have twice as many")
+    parser.add_argument("--turned", action="store_true", help="the light of the photographs stands still with the camera")
+    parser.add_argument("--every", type=int, default=1, help="draw one in so many of the scene's views")
+    parser.add_argument("--side", type=int, help="of a picture [pixels]; as the scene's without")
     given = parser.parse_args(arguments)
-    draw_scene(
-        given.scene, given.out, MATTERS[given.matter], given.light, given.new_light, given.spp, urn() if given.shape == "urn" else None
-    )
+    drawing = Drawing(given.spp, given.turned, given.every, given.side)
+    shape = urn() if given.shape == "urn" else None
+    draw_scene(given.scene, given.out, MATTERS[given.matter], given.light, given.new_light, drawing, shape)

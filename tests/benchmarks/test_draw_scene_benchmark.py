@@ -12,7 +12,7 @@ from benchmarks import draw_scene
 from benchmarks.measures.embossed_urn import BEAD, embossed_urn
 from drgs.evaluate.metrics import score_renders
 from drgs.exchange.exr import encode_environment
-from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.capture.load_views import load_cameras, load_views
 from tests.render.closed_form_scenes import sphere_mesh
 
 
@@ -49,6 +49,49 @@ def test_the_capture_is_one_that_builds_read_and_scores_are_made_of(tmp_path: Pa
     assert figures["views"]["psnr"] > 90
     with pytest.raises(ValueError, match="is there already"):
         draw_scene.main([str(scene), str(tmp_path / "out"), *chosen])
+
+
+def seen_from_two_sides(folder: Path) -> Path:
+    """A fine ball under a lamp, photographed from the side and from behind."""
+    scene = small_scene(folder)
+    ball = sphere_mesh(subdivisions=4)
+    trimesh.Trimesh(ball.vertices.numpy(), ball.faces.numpy(), process=False).export(scene / "gt_mesh.ply")
+    side, behind = np.eye(4), np.eye(4)
+    side[:3, :3], side[:3, 3] = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), (4, 0, 0)
+    behind[:3, :3], behind[:3, 3] = np.diag([-1, 1, -1]), (0, 0, -4)
+    frames = [{"file_path": f"./SET/r_00{k}", "transform_matrix": pose.tolist()} for k, pose in enumerate((side, behind))]
+    for name in ("train", "test"):
+        text = json.dumps({"camera_angle_x": 0.55, "frames": frames})
+        (scene / f"transforms_{name}.json").write_text(text.replace("SET", name))
+    radiance = np.full((8, 16, 3), 0.1, np.float32)
+    radiance[2:4, 3:6] = 4
+    (scene / "lamp.exr").write_bytes(encode_environment(radiance))
+    return scene
+
+
+def test_light_that_turns_shows_a_ball_the_same_from_all_sides_and_light_that_stands_still_does_not(tmp_path: Path):
+    scene = seen_from_two_sides(tmp_path / "scene")
+    chosen = ["--matter", "gold", "--light", str(scene / "lamp.exr"), "--new-light", str(scene / "sky.exr"), "--spp", "64", "--side", "24"]
+    differences = []
+    for name, more in (("turned", ["--turned"]), ("still", [])):
+        draw_scene.main([str(scene), str(tmp_path / name), *chosen, *more])
+        shown = [np.asarray(Image.open(tmp_path / name / "train" / f"r_00{k}.png"), np.float64) for k in range(2)]
+        solid = (shown[0][..., 3] == 255) & (shown[1][..., 3] == 255)
+        differences.append(np.abs(shown[0][solid][:, :3] - shown[1][solid][:, :3]).mean() / 255)
+    assert differences[0] < 0.02 and differences[1] > 0.1, differences
+    # Upright before the first photograph's camera: that one shows the same either way.
+    first = [np.asarray(Image.open(tmp_path / name / "train" / "r_000.png"), np.float64)[..., :3] for name in ("turned", "still")]
+    assert np.abs(first[0] - first[1])[solid].mean() / 255 < 0.02
+    cameras = load_cameras(tmp_path / "turned" / "transforms_train.json")
+    assert {(camera.width, camera.height) for camera in cameras} == {(24, 24)}
+
+
+def test_one_view_in_so_many_is_drawn(tmp_path: Path):
+    scene = small_scene(tmp_path / "scene")
+    chosen = ["--light", str(scene / "lamp.exr"), "--new-light", str(scene / "sky.exr"), "--spp", "2", "--every", "2"]
+    draw_scene.main([str(scene), str(tmp_path / "out"), *chosen])
+    assert sorted(path.name for path in (tmp_path / "out" / "train").iterdir()) == ["r_000.png", "r_002.png"]
+    assert [camera.name for camera in load_cameras(tmp_path / "out" / "transforms_train.json")] == ["r_000", "r_002"]
 
 
 def test_the_urn_is_closed_looks_outward_and_carries_its_relief():

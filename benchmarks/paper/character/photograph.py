@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.draw_scene import draw_scene
+from benchmarks.draw_scene import Drawing, draw_scene
 from benchmarks.paper.character.rigged_glb import CELL, CLIP, write_character
 from drgs.convert.import_mesh import import_mesh
 
@@ -65,7 +65,7 @@ def photograph(out: Path, settings: CaptureSettings) -> None:
         write_character(Path(folder) / FILE, settings.cell)
         light, new_light = (ENVIRONMENTS / f"{name}.exr" for name in (LIGHT, NEW_LIGHT))
         # The very mesh that whoever imports the file gets.
-        draw_scene(stage, made, None, light, new_light, settings.samples, import_mesh(Path(folder) / FILE).mesh)
+        draw_scene(stage, made, None, light, new_light, Drawing(settings.samples), import_mesh(Path(folder) / FILE).mesh)
         shutil.copy(Path(folder) / FILE, made)
         facts = json.loads((made / "scene.json").read_text()) | {"rig": {"file": FILE, "clip": CLIP, "light": NEW_LIGHT}}
         (made / "scene.json").write_text(json.dumps(facts))
