@@ -19,6 +19,8 @@ from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings, fit_surface
 from drgs.reconstruct.fit.surface.moving_surface import mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.try_depths import TrialSettings, try_depths
+from drgs.reconstruct.fit.surface.try_kinds import iterations as iterations_of_kinds
+from drgs.reconstruct.fit.surface.try_kinds import try_kinds
 from drgs.reconstruct.fit.surface.try_sheets import SheetSettings, try_sheets
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
@@ -32,6 +34,9 @@ from drgs.scene.views import Views
 
 PASS_MESH = MeshSettings(resolution=200, face_limit=60_000, smoothing_passes=0, keep_component_fraction=0.01)
 """How fine the surface is meshed before a pass."""
+KINDS_AFTER = 1
+"""Pass, counted from 1, after which the fit begins once more as metal and as paint where light turns with the camera: normals are known a little, and no
+pass but the first was led by what one light said."""
 
 
 @dataclass(frozen=True)
@@ -187,6 +192,25 @@ def empty_tried_hollows(
     return True
 
 
+def begin_as_either_kind(
+    fit: SurfaceFit,
+    views: Views,
+    settings: PassSettings,
+    report: Callable[[FitReport], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> bool:
+    """Go on from what explains more, all metal or all paint at first; False: should_stop() said so, and nothing changed."""
+    fit.doing = "trying metal and paint"
+    found = try_kinds(views, fit.state.parameters, fit.faces, settings_of_pass(settings, fit.index + 1), report, should_stop)
+    fit.doing = ""
+    if found is None:
+        return False
+    with torch.no_grad():
+        for name, value in found.parameters.items():
+            fit.state.parameters[name].copy_(value)
+    return True
+
+
 @torch.no_grad()
 def _settle_where_tried(fit: SurfaceFit, before: dict[str, Tensor], found: dict[str, Tensor], moved: Tensor) -> None:
     """The fit goes on with what was found; what moved, (vertex,), is at home where it is now."""
@@ -267,6 +291,8 @@ def fit_surface_in_passes(
     steps = settings.surface.iterations
     between = [(after, settings.trials.iterations) for after in settings.try_after]
     between += [(after, settings.sheets.iterations) for after in settings.sheets_after]
+    turns = views.light_from_world is not None and settings.passes > KINDS_AFTER
+    between += [(KINDS_AFTER, iterations_of_kinds(settings_of_pass(settings, KINDS_AFTER)))] if turns else []
     total = settings.passes * steps + sum(more for _, more in between) + settings.relief_steps * (settings.division.most_faces > 0)
 
     def tell(done: int, r: FitReport) -> None:
@@ -285,6 +311,8 @@ def fit_surface_in_passes(
                 return True
             start_relief(fit, times, settings, radius)
             break
+        if turns and number == KINDS_AFTER and not begin_as_either_kind(fit, views, settings, partial(tell, done + steps), should_stop):
+            return False
         if number in settings.try_after and not move_to_tried_depths(
             fit, views, settings, radius, partial(tell, done + steps), should_stop
         ):

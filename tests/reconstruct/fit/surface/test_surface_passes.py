@@ -18,6 +18,7 @@ from drgs.reconstruct.fit.surface.surface_passes import (
     settings_of_pass,
 )
 from drgs.reconstruct.fit.surface.try_depths import TriedDepths
+from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, iterations
 from drgs.reconstruct.fit.surface.try_sheets import TriedSheets
 from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
@@ -138,6 +139,47 @@ def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tm
     total = 4 + settings.trials.iterations
     assert told == [(3, total), (total - 1, total), (total, total)]
     assert float(homes[0][0].norm()) == 0 and float(homes[0][1:].norm(dim=1).min()) > 0
+
+
+@pytest.mark.slow
+def test_where_light_turns_both_kinds_are_tried_after_the_first_pass_and_elsewhere_not(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    settings = PassSettings(
+        2,
+        SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)),
+        MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
+        relief_steps=0,
+    )
+    asked: list[int] = []
+    kept: list[float] = []
+
+    def tried(views, parameters, faces, own, report, should_stop):
+        asked.append(own.seed)
+        if len(asked) == 1:
+            return None
+        if report is not None:
+            report(FitReport(1, iterations(own), 20.0, len(faces), 0.0))
+        return TriedKinds(parameters | {"metal": torch.full_like(parameters["metal"], 0.7)}, (1.0, 2.0))
+
+    def start(fit, targets, settings, radius):
+        kept.append(float(fit.state.parameters["metal"].min()))
+        carve_and_start_next_pass(fit, targets, settings, radius)
+
+    monkeypatch.setattr(surface_passes, "try_kinds", tried)
+    monkeypatch.setattr(surface_passes, "carve_and_start_next_pass", start)
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    begun, views = placed_sphere(), painted_views(tmp_path)
+
+    def started() -> SurfaceFit:
+        return SurfaceFit(start_surface(surfels, begun, grey_light(), settings.surface, SPHERE_RADIUS), begun.faces)
+
+    fit, told = started(), []
+    turned = replace(views, light_from_world=tuple(torch.eye(3) for _ in views.cameras))
+    assert not fit_surface_in_passes(turned, fit, settings, SPHERE_RADIUS)
+    assert (fit.index, fit.state.iteration, kept) == (0, 2, [])
+    assert fit_surface_in_passes(turned, fit, settings, SPHERE_RADIUS, lambda r: told.append((r.iteration, r.iterations)))
+    assert asked == [asked[0]] * 2 and kept == [pytest.approx(0.7)]
+    assert told == [(3, 8), (7, 8), (8, 8)]
+    assert fit_surface_in_passes(views, started(), settings, SPHERE_RADIUS) and len(asked) == 2
 
 
 def test_a_surface_that_cannot_be_meshed_anew_stays_as_it_was_and_the_user_is_told(monkeypatch: pytest.MonkeyPatch):

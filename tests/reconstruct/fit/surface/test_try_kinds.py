@@ -1,0 +1,79 @@
+"""Metal and paint under light that turns with the camera: the fit ends with what the sphere is made of, whatever was believed before."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from drgs.reconstruct.fit.fit_loop import FitReport
+from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings
+from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, iterations, try_kinds
+from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
+from drgs.scene.mesh import TriangleMesh
+from drgs.scene.views import Views
+from tests.reconstruct.fit.evidence.test_metal_evidence import light, pictures
+from tests.reconstruct.fit.painted_sphere import grey_light
+from tests.render.closed_form_scenes import sphere_mesh
+
+SETTINGS = SurfaceSettings(
+    rounds=1,
+    steps_a_round=60,
+    rates=SurfaceRates(normals=0.002, albedo_logits=0.1, roughness_logits=0.1, metallic_logits=0.1, environment=0.1),
+    weight_smooth=0.02,
+    pixels_a_step=2000,
+)
+
+
+def sphere_of(metallic: float) -> TriangleMesh:
+    mesh = sphere_mesh(subdivisions=3, albedo=0.6, roughness=0.25)
+    return dataclasses.replace(mesh, metallic=torch.full((len(mesh.vertices),), metallic))
+
+
+def turned_views(mesh: TriangleMesh) -> Views:
+    """Photographs of the sphere under light that stands still with the camera."""
+    targets = pictures(mesh, filter_environment(light()), turned=True)
+    images, masks = ([(255 * getattr(target, name) + 0.5).byte() for target in targets] for name in ("photo", "mask"))
+    turns = tuple(target.light_from_world for target in targets)
+    return Views(tuple(target.camera for target in targets), tuple(images), tuple(masks), None, None, True, "test", light_from_world=turns)
+
+
+def believed(mesh: TriangleMesh, metallic: float) -> dict[str, torch.Tensor]:
+    """Of a fit that has found the shape, no light, and that belief."""
+    count = len(mesh.vertices)
+    nothing, shares = torch.zeros(count, 3), {"albedo": torch.full((count, 3), 0.4), "roughness": torch.full((count,), 0.35)}
+    shares["metallic"] = torch.full((count,), metallic)
+    return (
+        {f"{name}_logits": logits_of_shares(value) for name, value in shares.items()}
+        | {"vertices": mesh.vertices, "normals": mesh.normals, "homeward": nothing, "to_texture": nothing}
+        | {"texture_weight": torch.zeros(count), "open_share": torch.ones(count, 3), "metal": torch.full((count,), 2 * metallic - 1)}
+        | grey_light()
+    )
+
+
+def tried(metallic: float, belief: float) -> TriedKinds:
+    mesh = sphere_of(metallic)
+    found = try_kinds(turned_views(mesh), believed(mesh, belief), mesh.faces, SETTINGS)
+    assert found is not None
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_the_fit_ends_with_what_it_is_though_the_other_was_believed(metallic: float) -> None:
+    found = tried(metallic, belief=1 - metallic)
+    seen = sphere_of(metallic).vertices[:, 2].abs() < 0.6
+    shares = torch.sigmoid(found.parameters["metallic_logits"])[seen]
+    assert float((shares - metallic).abs().mean()) < 0.2
+    assert float(((2 * metallic - 1) * found.parameters["metal"] > 0)[seen].float().mean()) > 0.95
+
+
+def test_told_to_stop_it_finds_nothing_and_steps_are_counted_over_both_beginnings() -> None:
+    mesh, told = sphere_of(1.0), list[FitReport]()
+    settings = dataclasses.replace(SETTINGS, steps_a_round=4)
+    parameters = believed(mesh, 0.5)
+    before = {name: value.clone() for name, value in parameters.items()}
+    views = turned_views(mesh)
+    assert try_kinds(views, parameters, mesh.faces, settings, told.append, lambda: len(told) == 5) is None
+    assert [r.iteration for r in told] == [1, 2, 3, 4, 5] and {r.iterations for r in told} == {iterations(settings)} == {8}
+    assert all(torch.equal(parameters[name], value) for name, value in before.items())
