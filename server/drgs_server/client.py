@@ -386,7 +386,7 @@ class RemoteSession:
         Args:
             format: exr holds linear radiance, or with `channel="all"` every channel as a layer of its own.
             world_from_camera: 4x4 OpenGL camera-to-world; the start view when absent.
-            settings: exposure_stops, tone_curve, background, channel, bounces, denoise, environment (a stored one, or `captured`, in the place
+            settings: exposure_stops, tone_curve, background, channel, bounces, denoise, turn_light, environment (a stored one, or `captured`, in the place
                 of the light in force).
         """
         query: dict[str, Any] = {"width": width, "height": height, "spp": spp, **settings}

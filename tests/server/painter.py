@@ -64,6 +64,7 @@ class PaintedAsset(AbstractLoadedAsset):
         self.painter = painter
         self.bounds = BOUNDS
         self.start_view = view_of_bounds(BOUNDS)
+        self.light_camera = None
 
     def pose(self, edits: Sequence[Edit], previous: AbstractPose | None, go_on: Callable[[], None] | None = None) -> "PaintedPose":
         if any(isinstance(edit, DeformEdit) for edit in edits):

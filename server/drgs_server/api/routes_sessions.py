@@ -189,6 +189,8 @@ class FrameQuery(BaseModel):
     channel: Channel | Literal["all"] = "final"
     """all: every channel that the asset has, as layers of one EXR."""
     denoise: bool = False
+    turn_light: bool = False
+    """The asset's own light turns with the camera, where it stood still with the camera of the photographs."""
     environment: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     """Name of a stored environment, or `captured` for the asset's own, in the place of the light in force: turned and as bright as that is."""
     captured: bool = False
@@ -306,6 +308,7 @@ def _settings_of(query: FrameQuery) -> Settings:
         bounces=query.bounces,
         channel="final" if query.channel == "all" else query.channel,
         denoise=query.denoise,
+        turn_light=query.turn_light,
     )
 
 

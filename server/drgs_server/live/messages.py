@@ -168,6 +168,9 @@ class Settings(_Message):
     channel: Channel = "final"
     denoise: bool = True
     """Filter what is left of the noise; the filter follows the measured variance, so it fades as samples add up."""
+    turn_light: bool = False
+    """The asset's own light turns with this viewer's camera, where it stood still with the camera of the photographs (light_camera of hello). Any other
+    light stands still with the object."""
 
 
 class SettingsMessage(_Message):
@@ -283,6 +286,9 @@ class ServerHello(_Answer):
     """Bounds of the object at rest [world units]."""
     maximum: Vector
     start_view: StartView
+    light_camera: Annotated[tuple[Vector, Vector, Vector] | None, Field(json_schema_extra={"x-optional": True})] = None
+    """Rows of the rotation of the first photograph's camera (world from camera, OpenGL), where the asset's own light stood still with the
+    camera of the photographs, as on a turntable: its table is as that camera saw it. null: it stands still with the object."""
     log: EditLog
     settings: Settings
     """Those in force until the client sends its own."""

@@ -151,6 +151,7 @@ class Connection:
             minimum=loaded.bounds.minimum,
             maximum=loaded.bounds.maximum,
             start_view=loaded.start_view,
+            light_camera=loaded.light_camera,
             log=session.log.message(),
             settings=self.viewer.settings,
         )

@@ -9,7 +9,7 @@ Imported only on the render thread, and torch only inside functions: the API pro
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ from drgs_server.render.interface import (
     Picked,
     Pixels,
     Positions,
+    Rotation,
     view_of_bounds,
 )
 from drgs_server.render.layers import LayeredStill, certainty_layers, light_layers, visibility_layers
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from drgs.render.records import GBuffer
     from drgs.render.render_bands import Band
     from drgs.scene.asset import Asset
+    from drgs.scene.camera import Camera
     from drgs.scene.environment import Environment
     from drgs.scene.posed_scene import PosedScene
 
@@ -55,6 +57,8 @@ REFINE_SECONDS = 0.03
 """A refinement lasts about this long, so that a new input need not wait; never less than one pass."""
 CHANNEL_SAMPLES = 32
 """Behind a picture of albedo, normals ...: passes are its antialiasing."""
+TURNS_KEPT = 4
+"""Lights as cameras turn them, that a pose keeps: of as many viewers, who then find their own again while their cameras rest."""
 
 LIGHT_CHANNELS = ("final", "visibility", "indirect", "variance")
 """Channels of Picture that are summed over rays; the others are known once the surface is."""
@@ -95,6 +99,7 @@ class LoadedAsset(AbstractLoadedAsset):
         low, high = asset.mesh.vertices.amin(0).tolist(), asset.mesh.vertices.amax(0).tolist()
         self.bounds = Bounds(tuple(low), tuple(high))
         self.start_view = view_of_bounds(self.bounds)
+        self.light_camera = _light_camera(asset)
 
     def pose(self, edits: Sequence[Edit], previous: AbstractPose | None, go_on: Callable[[], None] | None = None) -> "Pose":
         from drgs.deform.pose_scene import pose_scene
@@ -172,8 +177,9 @@ class Pose(AbstractPose):
             maps = settings.model_copy(update={"channel": "depth"})
             return SurfelPicture(self.scene, _camera(camera, width, height), known, lambda: self.begin(camera, maps, width, height, known))
         before = None if known is None else known.state
-        scene, tracer = self._shown(settings)
-        state = start_frame(scene, _camera(camera, width, height), _render_settings(settings), tracer, previous=before)
+        seen = _camera(camera, width, height)
+        scene, tracer = self._shown(settings, seen)
+        state = start_frame(scene, seen, _render_settings(settings), tracer, previous=before)
         return Picture(self, state, settings, known if state.computed_parts == () else None)
 
     def still(self, camera: CameraMessage, settings: Settings, width: int, height: int, linear: bool) -> AbstractStill:
@@ -184,7 +190,7 @@ class Pose(AbstractPose):
             return SurfelStill(self.scene, seen)
         if settings.channel == "certainty" and self.certainty is None:
             raise ValueError(NO_CERTAINTY)
-        scene, tracer = self._shown(settings)
+        scene, tracer = self._shown(settings, seen)
         rendered = replace(_render_settings(settings), samples_per_pixel=_samples_wanted(settings, self.scene.primary))
         bands = render_bands(scene, seen, rendered, tracer, SLICE_SECONDS)
         return Still(bands, height, width, settings, linear)
@@ -200,7 +206,7 @@ class Pose(AbstractPose):
 
         def bands(channel: Channel) -> "Iterator[Band | None]":
             shown = settings.model_copy(update={"channel": channel, "background": "transparent"})
-            scene, tracer = self._shown(shown)
+            scene, tracer = self._shown(shown, seen)
             samples = _samples_wanted(shown, self.scene.primary)
             rendered = replace(_render_settings(shown), samples_per_pixel=samples, split_indirect=channel == "final")
             return render_bands(scene, seen, rendered, tracer, SLICE_SECONDS)
@@ -210,11 +216,35 @@ class Pose(AbstractPose):
             parts.append((bands("certainty"), certainty_layers))
         return LayeredStill(parts, None if self.scene.surfels is None else SurfelStill(self.scene, seen))
 
-    def _shown(self, settings: Settings) -> tuple["PosedScene", "AbstractTracer"]:
+    def _shown(self, settings: Settings, camera: "Camera") -> tuple["PosedScene", "AbstractTracer"]:
         """What a picture of this channel is made of."""
         if settings.channel == "certainty" and self.certainty is not None:
             return self.certainty
-        return (self._under_white_sky if settings.channel == "visibility" else self.scene), self.tracer
+        if settings.channel == "visibility":
+            return self._under_white_sky, self.tracer
+        return self._lit(settings, camera), self.tracer
+
+    def _lit(self, settings: Settings, camera: "Camera") -> "PosedScene":
+        """The scene, its light as the camera turns it where that was asked for."""
+        from drgs.scene.asset import light_from_world
+
+        own = self.scene.environment.radiance is self.asset.environment.radiance
+        turn = light_from_world(self.asset, [])(camera) if settings.turn_light and own else None
+        return self.scene if turn is None else self._turned(tuple(turn.flatten().tolist()))
+
+    @cached_property
+    def _turned(self) -> "Callable[[tuple[float, ...]], PosedScene]":
+        """Of a rotation of directions in the world to the light's: the very same scene for the same one, so that a picture's sums go on."""
+        import torch
+
+        from drgs.scene.environment import turned_environment
+
+        @lru_cache(maxsize=TURNS_KEPT)
+        def turned(rotation: tuple[float, ...]) -> "PosedScene":
+            turn = torch.tensor(rotation).view(3, 3)
+            return replace(self.scene, environment=turned_environment(self.scene.environment, turn))
+
+        return turned
 
     @cached_property
     def certainty(self) -> "tuple[PosedScene, AbstractTracer] | None":
@@ -336,6 +366,16 @@ def _camera(message: CameraMessage, width: int, height: int):
     focal_x = focal * (width / height) * (message.height / message.width)
     intrinsics = torch.tensor([[focal_x, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return camera_from_opengl(torch.tensor(message.world_from_camera, dtype=torch.float64), intrinsics, width, height)
+
+
+def _light_camera(asset: "Asset") -> Rotation | None:
+    """Of ServerHello."""
+    from drgs.scene.camera import opengl_from_camera
+
+    if asset.light_frame == "object":
+        return None
+    rows = opengl_from_camera(asset.cameras[0])[:3, :3].tolist()
+    return (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
 
 
 def _bounces(settings: Settings) -> int:

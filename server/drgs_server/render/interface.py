@@ -23,6 +23,8 @@ Layers: TypeAlias = dict[str, np.ndarray]
 """Name in the EXR -> (height, width) float32."""
 Positions: TypeAlias = np.ndarray
 """(vertex, 3) little-endian float32 [world units]."""
+Rotation: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+"""Rows."""
 LINEAR_CHANNELS = ("final", "albedo", "roughness", "metallic", "normal", "depth", "certainty")
 """Of which there are values to work with, not only a picture to look at."""
 
@@ -140,6 +142,8 @@ class AbstractLoadedAsset(ABC):
 
     bounds: Bounds
     start_view: StartView
+    light_camera: Rotation | None
+    """Of ServerHello."""
 
     @abstractmethod
     def pose(self, edits: Sequence[Edit], previous: AbstractPose | None, go_on: Callable[[], None] | None = None) -> AbstractPose:

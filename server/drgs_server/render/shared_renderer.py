@@ -45,7 +45,7 @@ class SharedAsset(AbstractLoadedAsset):
     def __init__(self, asset: AbstractLoadedAsset, directory: DataDirectory) -> None:
         self._asset = asset
         self._directory = directory
-        self.bounds, self.start_view = asset.bounds, asset.start_view
+        self.bounds, self.start_view, self.light_camera = asset.bounds, asset.start_view, asset.light_camera
 
     def pose(self, edits: Sequence[Edit], previous: AbstractPose | None, go_on: Callable[[], None] | None = None) -> AbstractPose:
         """

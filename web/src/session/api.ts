@@ -204,6 +204,7 @@ export function frameQuery(view: View, { width, height }: { width: number; heigh
     tone_curve: settings.tone_curve ?? 'standard',
     channel: settings.channel ?? 'final',
     denoise: String(settings.denoise),
+    turn_light: String(settings.turn_light ?? false),
     background: transparent ? 'transparent' : settings.background === 'blurred' ? 'blurred' : 'environment',
     fov_y_degrees: String(view.fov_y_degrees),
     world_from_camera: view.world_from_camera.flat().join(','),

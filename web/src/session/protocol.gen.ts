@@ -720,6 +720,11 @@ export interface ServerHello {
   minimum: [number, number, number];
   maximum: [number, number, number];
   start_view: StartView;
+  /**
+   * Rows of the rotation of the first photograph's camera (world from camera, OpenGL), where the asset's own light stood still with the
+   * camera of the photographs, as on a turntable: its table is as that camera saw it. null: it stands still with the object.
+   */
+  light_camera?: [[number, number, number], [number, number, number], [number, number, number]] | null;
   log: EditLog;
   /** Those in force until the client sends its own. */
   settings: Settings;
@@ -764,6 +769,11 @@ export interface Settings {
   channel?: "final" | "albedo" | "roughness" | "metallic" | "normal" | "depth" | "visibility" | "indirect" | "variance" | "surfels" | "certainty";
   /** Filter what is left of the noise; the filter follows the measured variance, so it fades as samples add up. */
   denoise?: boolean;
+  /**
+   * The asset's own light turns with this viewer's camera, where it stood still with the camera of the photographs (light_camera of hello). Any other
+   * light stands still with the object.
+   */
+  turn_light?: boolean;
 }
 
 export interface SettingsMessage {

@@ -19,7 +19,9 @@ export const openedAsset = computed(() => session.value?.asset ?? null);
 export const connection = signal<Connection>('closed');
 /** What the server says of its newest picture. */
 export const status = signal<StatusMessage | null>(null);
-export const settings = signal<Required<Settings>>({ exposure_stops: 0, tone_curve: 'standard', background: 'environment', spp_target: 256, bounces: 1, channel: 'final', denoise: true });
+export const settings = signal<Required<Settings>>({ exposure_stops: 0, tone_curve: 'standard', background: 'environment', spp_target: 256, bounces: 1, channel: 'final', denoise: true, turn_light: false });
+/** Rows of the first photograph's rotation, world from camera, where the opened asset's own light stood still with the camera; null: with the object. */
+export const lightCamera = signal<NonNullable<ServerHello['light_camera']> | null>(null);
 
 let stream: Stream | null = null;
 type HelloListener = (hello: ServerHello) => void;
@@ -54,6 +56,7 @@ export async function openAsset(id: string): Promise<void> {
     session.value = { id: info.id, asset: info.asset, assetName: info.asset_name };
     resetLog(logOf(info));
     status.value = null;
+    lightCamera.value = null;
   });
   history.replaceState(null, '', `#asset=${encodeURIComponent(id)}`);
   document.title = `${info.asset_name} · DR-GS`;
@@ -84,6 +87,7 @@ function events(asset: string): StreamEvents {
       receiveLog(hello.log);
       queueMicrotask(sendSplice); // one that waited for a connection
       lastHello = hello;
+      lightCamera.value = hello.light_camera ?? null;
       helloListener?.(hello);
     },
     message: (message) => {

@@ -15,7 +15,7 @@ import { mesh } from '../edit/mesh';
 import { pinWeights } from '../edit/shape/pins';
 import { shapeTool } from '../edit/shape/shape_tools';
 import { notify } from '../session/notices';
-import { openedAsset, session, settings } from '../session/session';
+import { lightCamera, openedAsset, session, settings } from '../session/session';
 import { DynamicResolution, screenPixelRatio } from './dynamic_resolution';
 import { LocalPicture } from './local_picture';
 import { shapeIsKnown, shapeNow } from './shape_now';
@@ -119,6 +119,7 @@ export class LocalLayer {
       near: Math.max(0.002 * radius, distance - 1.5 * radius),
       far: distance + 1.5 * radius,
       light: light.value,
+      lightCamera: settings.value.turn_light && light.value.file === null ? lightCamera.value : null,
       settings: settings.value,
       highlight: marks ? PINS_STRENGTH : flashing ? pulse : 0,
       onlyHighlight: overlay,

@@ -42,6 +42,7 @@ import type { RestMesh, VertexMaterials } from '../edit/mesh';
 import type { Settings } from '../session/protocol.gen';
 import type { Vec3 } from '../session/view';
 import { blurEnvironment, BLURRED_HEIGHT } from './blur_environment';
+import { lightTurn } from './camera/light_turn';
 import { drawsInSoftware, filterEnvironment } from './filter_environment';
 import { loadMesh, restGeometry } from './mesh_file';
 import { drawEnvironment, drawMaterials } from './thumbnails';
@@ -63,6 +64,8 @@ export interface LocalFrame {
   far: number;
   /** `rotation` in degrees. */
   light: { rotation: number; intensity: number };
+  /** Rows of the rotation of the camera before which the light is as its table has it, where it turns with the camera; null: it stands still. */
+  lightCamera: readonly Vec3[] | null;
   settings: Pick<Required<Settings>, 'exposure_stops' | 'tone_curve' | 'background'>;
   /** Strength 0..1 of the selection's colour. */
   highlight: number;
@@ -246,7 +249,9 @@ export class LocalPicture {
     this.uniforms.onlyHighlight.value = frame.onlyHighlight ? 1 : 0;
     if (this.edges) this.edges.visible = frame.edges;
     this.scene.background = this.backgroundOf(frame);
-    const lightFromWorld = new Matrix4().makeRotationZ((-light.rotation * Math.PI) / 180).premultiply(lightFromYUp);
+    const lightFromWorld = new Matrix4().makeRotationZ((-light.rotation * Math.PI) / 180);
+    if (frame.lightCamera) lightFromWorld.premultiply(lightTurn(frame.lightCamera, camera.matrixWorld));
+    lightFromWorld.premultiply(lightFromYUp);
     this.root.matrix.copy(lightFromWorld);
     this.root.matrixWorldNeedsUpdate = true;
     Object.assign(this.eye, { fov: camera.fov, aspect: camera.aspect, near: frame.near, far: frame.far });

@@ -224,8 +224,8 @@ export class Viewport {
   private followPicture(): void {
     let last: unknown[] = [];
     effect(() => {
-      const { exposure_stops, tone_curve, background, channel, denoise } = settings.value;
-      const now = [edits.value, exposure_stops, tone_curve, background, channel, denoise];
+      const { exposure_stops, tone_curve, background, channel, denoise, turn_light } = settings.value;
+      const now = [edits.value, exposure_stops, tone_curve, background, channel, denoise, turn_light];
       if (now.every((value, i) => value === last[i])) return;
       // Settings renumber the camera; the next animation frame asks by which number.
       if (now.slice(1).some((value, i) => value !== last[i + 1])) this.cameraNumber = -1;

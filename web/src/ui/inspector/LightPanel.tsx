@@ -7,8 +7,8 @@ import { takeFile } from '../../capture/take_file';
 import { capturedEnvironmentThumbnail, editLight, light, restoreCapturedLight } from '../../edit/light';
 import { elevationOf, HIGHEST_SUN, LOWEST_SUN, SUN_AND_SKY, sunAndSky, USUAL_SUN } from '../../edit/sun_and_sky';
 import { environments } from '../../session/library';
-import { changeSettings, settings } from '../../session/session';
-import { Choice, Section, Slider } from '../fields';
+import { changeSettings, lightCamera, settings } from '../../session/session';
+import { Choice, Section, Slider, Switch } from '../fields';
 import { Icon } from '../icons';
 import { lightsOpen } from '../layout';
 
@@ -57,6 +57,17 @@ function Environment() {
           }}
         />
       </div>
+      {current === null && lightCamera.value && (
+        <>
+          <Switch
+            label="Turns with the camera"
+            title="As while the photographs were taken; off, it stays where the first of them had it"
+            value={settings.value.turn_light}
+            onChange={(value) => changeSettings({ turn_light: value })}
+          />
+          <p class="hint">These photographs were taken under light that stood still with the camera, as on a turntable. Other lights stand still with the object.</p>
+        </>
+      )}
       {elevation !== null && (
         <Slider
           label="Elevation"
