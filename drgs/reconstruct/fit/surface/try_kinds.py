@@ -25,7 +25,7 @@ from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_squares
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings, fit_surface
 from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, seen_twice, shade_places, steep_enough
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places, steep_enough
 from drgs.reconstruct.fit.surfel_parameters import leaves, logits_of_shares, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.scene.views import Views
@@ -134,6 +134,7 @@ def _error(views: Views, state: FitState, faces: Tensor, targets: list[ViewTarge
     surface, parameters = MovingSurface(views, faces, state), state.parameters
     normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
     materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
+    packed = packed_surface(normals, materials)
     light_of = surface.light_of(filter_environment(environment_table(parameters)))
     generator = torch.Generator().manual_seed(settings.seed)
     total, count = 0.0, 0
@@ -143,7 +144,7 @@ def _error(views: Views, state: FitState, faces: Tensor, targets: list[ViewTarge
         twice = seen_twice(target, solid, surface.tracer, generator)
         steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
         light = light_of(target)
-        first, second = (shade_places(seen[steep], target, surface.tracer, normals, materials, light, generator) for seen in twice)
+        first, second = (shade_places(seen[steep], target, surface.tracer, packed, light, generator) for seen in twice)
         photo = target.saturation.reshape(-1, 3)[twice[0].pixels[steep]]
         total += float(crossed_squares(first, second, photo).sum())
         count += len(photo)
