@@ -9,7 +9,8 @@ import copy
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import pairwise
@@ -159,8 +160,48 @@ def launch(kernel: Any, count: int, inputs: list, outputs: list, device: Any, sl
         part.set_param_at_index(0, first)
         part.launch()
 
-    for done in [thread_pool().submit(run, a, b) for a, b in pairwise(edges)]:
-        done.result()
+    share_out(run, edges)
+
+
+def share_out(work: Callable[[int, int], Any], edges: Sequence[int]) -> list:
+    """What work(first, last) returns between neighbouring edges, in their order: done by the calling thread and the pool's others.
+
+    Each takes the next part when it is done with one. Inside, launches run where they are.
+    """
+    left, results = deque(enumerate(pairwise(edges))), [None] * (len(edges) - 1)
+
+    def take() -> None:
+        while left:
+            try:
+                k, (first, last) = left.popleft()
+            except IndexError:  # another thread was quicker
+                return
+            results[k] = work(first, last)
+
+    others = [thread_pool().submit(take) for _ in range(min(thread_count(), len(results)) - 1)]
+    was_here, _here.pooled = in_thread_pool(), True
+    try:
+        take()
+    finally:
+        _here.pooled = was_here
+        for other in others:
+            if not other.cancel():
+                other.result()
+    return results
+
+
+def by_pool(work: Callable[[int, int], Any], edges: Sequence[int], device: torch.device) -> list:
+    """What work(first, last) returns between neighbouring edges, in their order, on the CPU each by one thread of the pool.
+
+    For work that is torch's: what it sums in one thread has other bits than in several, and here neither who is free nor how many cores there are
+    decides which it is.
+    """
+    if device.type != "cpu":
+        return [work(first, last) for first, last in pairwise(edges)]
+    if thread_count() == 1 or in_thread_pool():
+        with as_in_thread_pool():
+            return [work(first, last) for first, last in pairwise(edges)]
+    return [done.result() for done in [thread_pool().submit(work, first, last) for first, last in pairwise(edges)]]
 
 
 def device_from_name(name: str) -> torch.device:

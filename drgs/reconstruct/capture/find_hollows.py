@@ -28,11 +28,12 @@ from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, clean_mesh, extract_mesh
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
-from drgs.render.intersect.trace_rays import build_tracer, over_slices, trace_rays
+from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.camera import pixel_rays_world
 from drgs.scene.mesh import TriangleMesh, vertex_normals
 from drgs.scene.views import Views
+from drgs.warp_torch import by_pool
 
 SOLID = 0.99
 """Least coverage of a pixel whose ray is fitted."""
@@ -96,7 +97,7 @@ def find_hollows(
     grid = fit_radiance_grid(rays, colors, (low, high), _inside_of(outer), settings.grid, seed, report, should_stop)
     if grid is None:
         return None
-    seen = over_slices(len(targets), device, lambda k, _: _Seen.of(targets[k], outer, grid), 1)
+    seen = by_pool(lambda k, _: _Seen.of(targets[k], outer, grid), range(len(targets) + 1), device)
     deep = [DepthMap(view.target.camera, view.deep, view.target.mask) for view in seen]
     try:
         inner = _surface(*extract_mesh(deep, center, 1.03 * radius, settings.field_mesh))

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from drgs.warp_torch import as_in_thread_pool, in_thread_pool, thread_count, thread_pool
+from drgs.warp_torch import by_pool
 
 SLICES = 2
 """Parts on the CPU; elsewhere all is one. On two cores a step of the surface's fit takes 100 ms in 2 parts, 127 in 3, 122 in 4 and 149 in 6, and 145
@@ -36,12 +36,7 @@ def cost_in_slices(
     parts = slices or (SLICES if device.type == "cpu" else 1)
     edges = [count * k // parts for k in range(parts + 1)]
     seeds = torch.randint(1 << 62, (parts,), generator=generator).tolist()
-    work = [(cost, edges[k], edges[k + 1], inputs, seeds[k]) for k in range(parts)]
-    if device.type != "cpu" or thread_count() == 1 or in_thread_pool():
-        with as_in_thread_pool():
-            done = [_part(*one) for one in work]
-    else:
-        done = [waiting.result() for waiting in [thread_pool().submit(_part, *one) for one in work]]
+    done = by_pool(lambda k, _: _part(cost, edges[k], edges[k + 1], inputs, seeds[k]), range(parts + 1), device)
     gradients = tuple(torch.stack(one).sum(0) for one in zip(*(gradients for _, _, gradients in done), strict=True))
     value = torch.stack([value for value, _, _ in done]).sum(0)
     return _Known.apply(value, gradients, *inputs), torch.stack([other for _, other, _ in done]).sum(0)

@@ -18,11 +18,12 @@ from scipy.ndimage import map_coordinates
 from skimage.measure import find_contours
 from torch import Tensor
 
-from drgs.render.intersect.trace_rays import over_slices, trace_rays
+from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Hits
 from drgs.scene.camera import Camera, world_from_pixel
 from drgs.scene.views import Views
+from drgs.warp_torch import by_pool
 
 FARTHEST = 6
 """[pixels] beyond which an outline of the mesh and one of the mask are not the same."""
@@ -94,7 +95,7 @@ def mask_outlines(views: Views) -> list[MaskOutline | None]:
 def outline_residuals(tracer: AbstractTracer, cameras: tuple[Camera, ...], outlines: list[MaskOutline | None]) -> OutlineResiduals:
     """How far the mesh's outlines lie from the masks'."""
     views = [(camera, outline) for camera, outline in zip(cameras, outlines, strict=True) if outline is not None]
-    parts = over_slices(len(views), tracer.mesh.vertices.device, lambda k, _: _residuals_of_view(tracer, *views[k]), 1)
+    parts = by_pool(lambda k, _: _residuals_of_view(tracer, *views[k]), range(len(views) + 1), tracer.mesh.vertices.device)
     if not parts:
         nothing = tracer.mesh.vertices.new_zeros(0)
         return OutlineResiduals(nothing.new_zeros(0, 3).long(), *(nothing.new_zeros(0, *tail) for tail in ((3,), (), (3,), ())))

@@ -5,6 +5,7 @@ Knows nothing of shading. Which tracer answers follows the mesh's device: Embree
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from drgs.render.intersect.tracer_embree import EmbreeTracer
 from drgs.render.intersect.tracer_warp import WarpTracer
 from drgs.render.records import Hits
 from drgs.scene.mesh import TriangleMesh
-from drgs.warp_torch import in_thread_pool, thread_count, thread_pool
+from drgs.warp_torch import in_thread_pool, share_out, thread_count
 
 SLICE_RAYS = 65536
 """Rays of a CPU slice: long enough to hide Python, short enough to balance threads."""
@@ -53,7 +54,7 @@ def _check_numbers(mesh: TriangleMesh) -> None:
 
 
 def over_slices(
-    count: int, device: torch.device, work: Callable[[int, int], object], slice_length: int | None = None, shortest: int | None = None
+    count: int, device: torch.device, work: Callable[[int, int], Any], slice_length: int | None = None, shortest: int | None = None
 ) -> list:
     """work(first, last) for slices of range(count): over the thread pool on the CPU; one after the other elsewhere, and in the pool.
 
@@ -73,7 +74,7 @@ def over_slices(
             edges.append(edges[-1] + min(left, length, max(shortest, left // (2 * thread_count()))))
     if device.type != "cpu" or thread_count() == 1 or len(edges) == 2 or in_thread_pool():
         return [work(a, b) for a, b in pairwise(edges)]
-    return [done.result() for done in [thread_pool().submit(work, a, b) for a, b in pairwise(edges)]]
+    return share_out(work, edges)
 
 
 def trace_rays(origins: Tensor, directions: Tensor, tracer: AbstractTracer) -> Hits:

@@ -34,8 +34,8 @@ from drgs.reconstruct.fit.light.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
-from drgs.render.intersect.trace_rays import over_slices
 from drgs.render.intersect.tracer import AbstractTracer
+from drgs.warp_torch import by_pool
 
 FEWEST_VIEWS = 4
 DARK = 0.05
@@ -119,9 +119,8 @@ def view_sums(tracer: AbstractTracer, targets: list[ViewTarget], light_of: Light
     """Of the tracer's mesh, whose roughness is taken as known."""
     device = tracer.mesh.vertices.device
     # So many parts on any machine: sums must not depend on how many cores there are.
-    length = max(1, -(-len(targets) // VIEW_PARTS))
-    parts = over_slices(len(targets), device, lambda first, last: _sums_of(targets[first:last], tracer, light_of), length)
-    parts = parts or [_sums_of([], tracer, light_of)]
+    edges = [len(targets) * k // VIEW_PARTS for k in range(VIEW_PARTS + 1)]
+    parts = by_pool(lambda first, last: _sums_of(targets[first:last], tracer, light_of), edges, device)
     sums = torch.stack([part[0] for part in parts]).sum(0)
     pp, pe, pa, pb, ee, ea, eb, aa, ab, bb = sums.unbind()
     return ViewSums(pp, pe, pa, pb, ee, ea, eb, aa, ab, bb, torch.stack([part[1] for part in parts]).sum(0))

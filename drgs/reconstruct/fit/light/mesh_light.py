@@ -19,11 +19,12 @@ from drgs.reconstruct.fit.light.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.integrate.environment_table import build_environment_table
 from drgs.render.integrate.sample_rays import sample_rays
-from drgs.render.intersect.trace_rays import over_slices, trace_rays
+from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import SampleCounts, ShadingPoints
 from drgs.scene.environment import Environment, environment_radiance
 from drgs.scene.mesh import TriangleMesh
+from drgs.warp_torch import by_pool
 
 SHARE_LIFT = 4.0
 """Of the tracer's lift: rays from vertices must clear all faces around them."""
@@ -188,5 +189,5 @@ def irradiance_share(tracer: AbstractTracer, environment: Environment, light: Me
         arriving = sky * transmittance.view(count, rays, 1) + met.view(count, rays, 3) * weight
         return arriving.sum(1) / sky.sum(1).clamp(min=1e-6)
 
-    parts = over_slices(len(mesh.vertices), mesh.vertices.device, shares, SHARED_AT_ONCE)
+    parts = by_pool(shares, [*range(0, len(mesh.vertices), SHARED_AT_ONCE), len(mesh.vertices)], mesh.vertices.device)
     return torch.cat([torch.zeros_like(mesh.vertices[:0]), *parts]).clamp(0, BRIGHTEST_SHARE)

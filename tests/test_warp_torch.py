@@ -1,0 +1,63 @@
+"""Work that is shared out among threads: each part is done once, answers come in order, faults come through."""
+
+import threading
+
+import pytest
+import torch
+import warp as wp
+
+from drgs import warp_torch
+from drgs.warp_torch import in_thread_pool, launch, share_out, warp_array
+
+
+@pytest.fixture
+def three_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRGS_THREADS", "3")
+    monkeypatch.setattr(warp_torch, "_pool", None)  # the pool is made once, for the threads asked for then
+
+
+@pytest.mark.usefixtures("three_threads")
+def test_parts_are_done_once_by_several_threads_and_answered_in_order() -> None:
+    together, threads = threading.Barrier(3), set()
+
+    def work(first: int, last: int) -> tuple[int, int]:
+        assert in_thread_pool()
+        if first < 3:
+            together.wait(60)  # nobody passes before three threads are here
+        threads.add(threading.get_ident())
+        return first, last
+
+    edges = [0, 1, 2, 3, 7, 20]
+    assert share_out(work, edges) == [(0, 1), (1, 2), (2, 3), (3, 7), (7, 20)]
+    assert len(threads) == 3 and threading.get_ident() in threads and not in_thread_pool()
+
+
+@pytest.mark.usefixtures("three_threads")
+def test_a_fault_in_any_part_comes_through_and_the_next_work_is_done() -> None:
+    def work(first: int, last: int) -> int:
+        if first == 5:
+            raise ValueError(f"{first} to {last}")
+        return first
+
+    with pytest.raises(ValueError, match="5 to 6"):
+        share_out(work, list(range(9)))
+    assert not in_thread_pool() and share_out(work, [0, 1, 2]) == [0, 1]
+
+
+@wp.kernel
+def count_up(
+    first: int,
+    step: int,
+    # outputs
+    values: wp.array[int],
+):
+    i = first + wp.tid()
+    values[i] = values[i] + step * i
+
+
+@pytest.mark.usefixtures("three_threads")
+@pytest.mark.parametrize("count", [1, 2, 1001])
+def test_a_launch_over_threads_reaches_each_index_once(count: int) -> None:
+    values = torch.zeros(count, dtype=torch.int32)
+    launch(count_up, count, [3], [warp_array(values)], "cpu")
+    assert torch.equal(values, 3 * torch.arange(count, dtype=torch.int32))
