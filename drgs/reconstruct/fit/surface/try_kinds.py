@@ -4,7 +4,7 @@ Under such light what arrives at paint changes from view to view as well as what
 it, explains much of what the other one shows. So evidence under one light (metal_evidence) repeats what was believed when that light was
 fitted: on the teapot it calls all metal under a light that was fitted with metal, and all paint under one that was fitted with paint. Here each
 belief gets a light of its own: materials, normals and light follow the photographs for some steps with everything held to be of one kind; then
-evidence is asked under that light, for objects are made of both, and as many steps follow with what it says. The beginning that leaves
+evidence is asked under that light, for objects are made of both, what it is sure of begins anew, and as many steps follow. The beginning that leaves
 less error is kept, with its light; paint unless metal leaves clearly less (CLEARLY).
 
 In: the state of a fit on the mesh (fit_surface), photographs whose light turns. Out: that state, its surface where it was.
@@ -37,6 +37,8 @@ CLEARLY = 0.85
 function of where it faces, and paint a soft one: what soft ones explain nearly as well is paint. Drafts of a metal teapot and a painted bunny: 0.64 and 1.44."""
 BEGUN = 0.95
 """What metallic begins with, of its kind: at the very ends there is no gradient."""
+SURE = 0.5
+"""Of evidence, -1..1."""
 ALBEDO = (0.05, 0.95)
 """That a place may begin with."""
 
@@ -73,7 +75,7 @@ def try_kinds(
         for half in range(2):
             if half:
                 MovingSurface(views, faces, state).look_for_metal(targets, own.moves)
-                state = _state(state.parameters, own)
+                state = _state(as_evidence_says(_sums(views, state, faces, targets), state.parameters), own)
             before = (2 * number + half) * own.iterations
 
             def tell(r: FitReport, before: int = before) -> None:
@@ -110,6 +112,25 @@ def begun_as(kind: float, sums: ViewSums, parameters: dict[str, Tensor]) -> dict
     metallic = torch.full_like(parameters["metallic_logits"], BEGUN if kind else 1 - BEGUN)
     belief = torch.full_like(parameters["metal"], 2 * kind - 1)
     return parameters | {"albedo_logits": logits_of_shares(albedo), "metallic_logits": logits_of_shares(metallic), "metal": belief}
+
+
+@torch.no_grad()
+def as_evidence_says(sums: ViewSums, parameters: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The parameters with what evidence is sure of begun anew where it was of the other kind: by gradients it would be half of each for long.
+
+    Args:
+        sums: of view_sums.
+    """
+    evidence, metallic = parameters["metal"], torch.sigmoid(parameters["metallic_logits"])
+    changed = (evidence.abs() > SURE) & ((evidence > 0) != (metallic > 0.5))
+    metal, paint = (begun_as(kind, sums, parameters) for kind in KINDS)
+
+    def chosen(name: str) -> Tensor:
+        shape = (-1, *[1] * (parameters[name].ndim - 1))
+        begun = torch.where((evidence > 0).view(shape), metal[name], paint[name])
+        return torch.where(changed.view(shape), begun, parameters[name])
+
+    return parameters | {name: chosen(name) for name in ("albedo_logits", "metallic_logits")}
 
 
 def diffuse_albedo(sums: ViewSums) -> Float[Tensor, "vertex 3"]:

@@ -5,10 +5,11 @@ import dataclasses
 import pytest
 import torch
 
+from drgs.reconstruct.fit.evidence.metal_evidence import ViewSums
 from drgs.reconstruct.fit.fit_loop import FitReport
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings
-from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, iterations, try_kinds
+from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, as_evidence_says, iterations, try_kinds
 from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
@@ -66,6 +67,19 @@ def test_the_fit_ends_with_what_it_is_though_the_other_was_believed(metallic: fl
     shares = torch.sigmoid(found.parameters["metallic_logits"])[seen]
     assert float((shares - metallic).abs().mean()) < 0.2
     assert float(((2 * metallic - 1) * found.parameters["metal"] > 0)[seen].float().mean()) > 0.95
+
+
+def test_what_evidence_is_sure_of_begins_anew_where_it_was_of_the_other_kind_alone() -> None:
+    count = 4
+    ones = torch.ones(count, 3)
+    sums = ViewSums(ones, 0.3 * ones, 0.6 * ones, 0 * ones, ones, ones, 0 * ones, ones, 0 * ones, ones, torch.full((count,), 9.0))
+    shares = {"albedo": 0.2 * ones, "metallic": torch.tensor([0.1, 0.9, 0.1, 0.1])}
+    parameters = {f"{name}_logits": logits_of_shares(value) for name, value in shares.items()}
+    parameters["metal"] = torch.tensor([0.9, -0.9, 0.3, -0.9])  # sure of metal, sure of paint, unsure, known before
+    found = as_evidence_says(sums, parameters)
+    metallic, albedo = torch.sigmoid(found["metallic_logits"]), torch.sigmoid(found["albedo_logits"])
+    torch.testing.assert_close(metallic, torch.tensor([0.95, 0.05, 0.1, 0.1]))
+    torch.testing.assert_close(albedo[:, 0], torch.tensor([0.6, 0.3 - 0.04, 0.2, 0.2]))
 
 
 def test_told_to_stop_it_finds_nothing_and_steps_are_counted_over_both_beginnings() -> None:
