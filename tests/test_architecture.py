@@ -3,6 +3,7 @@ devices and dangers stay where they belong.
 """
 
 import ast
+import gc
 import re
 import subprocess
 import sys
@@ -53,7 +54,11 @@ PRODUCT = [name for name in PYTHON if name.startswith(("drgs/", "worker/", "serv
 
 @cache
 def syntax(name: str) -> ast.Module:
-    return ast.parse((ROOT / name).read_text(), name)
+    gc.disable()  # all that is made is kept: looking through it for garbage takes as long as making it
+    try:
+        return ast.parse((ROOT / name).read_text(), name)
+    finally:
+        gc.enable()
 
 
 @cache
@@ -339,8 +344,12 @@ def used_names(name: str) -> set[str]:
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and A_NAME.fullmatch(node.value):
             names = re.findall(r"\w+", node.value)
         found.update(name for name in names if name not in inside)
-        for child in ast.iter_child_nodes(node):
-            visit(child, inside)
+        # As ast.iter_child_nodes does, in half of the time; contexts and operators hold nothing.
+        for field in node._fields:
+            child = getattr(node, field, None)
+            for one in child if isinstance(child, list) else (child,):
+                if isinstance(one, ast.AST) and one._fields:
+                    visit(one, inside)
 
     visit(syntax(name), frozenset())
     return found

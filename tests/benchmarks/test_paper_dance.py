@@ -41,6 +41,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_capture_is_one_that_builds_read_and_holds_its_rig(scene: Path):
     views = load_views(scene, 48)
     assert len(views.cameras) == 3 and views.has_masks
@@ -64,6 +65,7 @@ def evidence(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneEvid
     return SceneEvidence(open_scene(scene), folder / "asset", CellFolder(folder / "out", "command"), EvidenceSettings(samples_per_pixel=64))
 
 
+@pytest.mark.slow
 def test_a_true_asset_dances_as_the_truth_and_only_lost_frames_are_drawn_again(evidence: SceneEvidence, monkeypatch: pytest.MonkeyPatch):
     document = figure_cells(evidence, [], ["dance", "strip", "laws"])
     assert set(document) == {"dance"}, "what needs a deformed truth is left out"
@@ -94,6 +96,7 @@ def test_a_true_asset_dances_as_the_truth_and_only_lost_frames_are_drawn_again(e
     assert again["dance"]["psnr"] == document["dance"]["psnr"]
 
 
+@pytest.mark.slow
 def test_the_light_turns_once_and_the_truth_moves_with_the_clip(evidence: SceneEvidence):
     facts = dances.rig_facts(evidence)
     assert facts is not None

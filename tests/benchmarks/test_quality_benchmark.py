@@ -111,7 +111,7 @@ def test_every_eighth_photograph_is_held_out(tmp_path: Path) -> None:
     (first, *_) = scene.cameras
     assert (first.width, first.height) == (36, 28) and float(first.intrinsics[0, 0]) == pytest.approx(45)
     whole = sphere_views()[0]
-    assert torch.allclose(first.camera_from_world.double(), torch.from_numpy(whole.camera_from_world), atol=1e-5)
+    assert torch.allclose(first.camera_from_world.double(), torch.tensor(whole.camera_from_world), atol=1e-5)
     with Image.open(folder / "test" / "r_000.png") as picture:
         alpha = np.asarray(picture)[..., 3] / 255
     assert alpha.sum() == pytest.approx(whole.rgba[..., 3].sum() / 255 / 4, rel=0.02)

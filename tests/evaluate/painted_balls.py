@@ -3,12 +3,13 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from tests.reconstruct.tiny_capture import camera_positions, look_at
+from tests.reconstruct.tiny_capture import camera_positions, look_at, save_png
 
 VIEWS = 20
 SIDE = 48
@@ -74,12 +75,18 @@ def pictures(
     return [take_picture(position, balls(number), paint, number) for number, position in enumerate(positions)]
 
 
+@cache
+def _good_pictures() -> Sequence[Picture]:
+    """Which most captures begin with, before something is spoiled in their files."""
+    return pictures()
+
+
 def write_capture(folder: Path, taken: Sequence[Picture] | None = None) -> Path:
     """NeRF-synthetic."""
     (folder / "train").mkdir(parents=True)
     frames = []
-    for picture in pictures() if taken is None else taken:
-        Image.fromarray(picture.rgba).save(folder / "train" / f"{picture.name}.png")
+    for picture in _good_pictures() if taken is None else taken:
+        save_png(picture.rgba, folder / "train" / f"{picture.name}.png")
         pose = picture.world_from_camera @ np.diag([1.0, -1, -1, 1])
         frames.append({"file_path": f"./train/{picture.name}", "transform_matrix": pose.tolist()})
     document = {"camera_angle_x": 2 * np.arctan(SIDE / 2 / FOCAL), "frames": frames}

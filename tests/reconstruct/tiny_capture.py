@@ -3,10 +3,12 @@
 Pictures are wider than high and the principal point is off centre, so that swapped axes and assumed centres show.
 """
 
+import io
 import json
 import pickle
 import struct
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +94,11 @@ def plane_from_pixels(lens: Lens, pixels: np.ndarray) -> np.ndarray:
 
 def sphere_views(count: int = VIEWS, square: bool = False, lens: Lens | None = None) -> list[TinyView]:
     """Views of the sphere. With `square`, intrinsics are FX, FX and the picture's middle, as camera_angle_x says."""
+    return [*_sphere_views(count, square, lens)]
+
+
+@cache  # some two hundred tests begin with the same few captures
+def _sphere_views(count: int, square: bool, lens: Lens | None) -> tuple[TinyView, ...]:
     fx, fy, cx, cy = (FX, FX, WIDTH / 2, HEIGHT / 2) if square else (FX, FY, CX, CY)
     lens = lens or Lens("PINHOLE", (fx, fy, cx, cy), WIDTH, HEIGHT)
     plane = plane_from_pixels(lens, np.stack(np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5), -1))
@@ -106,7 +113,22 @@ def sphere_views(count: int = VIEWS, square: bool = False, lens: Lens | None = N
         hit = ~np.isnan(distance)
         rgba = np.concatenate([np.where(hit[..., None], color_of_normal(np.clip(normal, -1, 1)), 0), 255 * hit[..., None]], -1)
         views.append(TinyView(f"r_{index:03d}", rgba.astype(np.uint8), pose))
-    return views
+    for view in views:
+        view.rgba.setflags(write=False)
+        view.camera_from_world.setflags(write=False)
+    return tuple(views)
+
+
+def save_png(pixels: np.ndarray, path: Path) -> None:
+    """Pixels (height, width) or (height, width, 3 or 4), uint8."""
+    path.write_bytes(_png(pixels.shape, pixels.tobytes()))
+
+
+@cache
+def _png(shape: tuple[int, ...], pixels: bytes) -> bytes:
+    packed = io.BytesIO()
+    Image.fromarray(np.frombuffer(pixels, np.uint8).reshape(shape)).save(packed, "PNG")
+    return packed.getvalue()
 
 
 def at_scale(views: list[TinyView], scale: float) -> list[TinyView]:
@@ -121,7 +143,7 @@ def write_nerf_synthetic(folder: Path, views: list[TinyView] | None = None, **do
     (folder / "train").mkdir(parents=True, exist_ok=True)
     frames = []
     for view in views:
-        Image.fromarray(view.rgba).save(folder / "train" / f"{view.name}.png")
+        save_png(view.rgba, folder / "train" / f"{view.name}.png")
         frames.append({"file_path": f"./train/{view.name}", "transform_matrix": view.world_from_opengl.tolist()})
     angle = 2 * np.arctan(0.5 * WIDTH / FX)
     (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames, **document}))
@@ -135,8 +157,8 @@ def write_nerfstudio(folder: Path, views: list[TinyView] | None = None, **docume
     (folder / "my_masks").mkdir(exist_ok=True)
     frames = []
     for index, view in enumerate(views):
-        Image.fromarray(view.rgba[..., :3]).save(folder / "images" / f"{view.name}.png")
-        Image.fromarray(view.rgba[..., 3]).save(folder / "my_masks" / f"{view.name}.png")
+        save_png(view.rgba[..., :3], folder / "images" / f"{view.name}.png")
+        save_png(view.rgba[..., 3], folder / "my_masks" / f"{view.name}.png")
         own = {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY} if index % 2 else {}
         frames.append({
             "file_path": f"images/{view.name}.png", "mask_path": f"my_masks/{view.name}.png",
@@ -178,8 +200,8 @@ def write_colmap(folder: Path, binary: bool, model: str = "PINHOLE", masks: str 
     points, colors = sphere_points()
     images_txt, images_bin = ["# comment"], struct.pack("<Q", len(views))
     for index, view in enumerate(views):
-        Image.fromarray(view.rgba[..., :3]).save(folder / "images" / f"{view.name}.png")
-        Image.fromarray(view.rgba[..., 3]).save(folder / "masks" / masks.replace("jpg", "png").format(name=view.name))
+        save_png(view.rgba[..., :3], folder / "images" / f"{view.name}.png")
+        save_png(view.rgba[..., 3], folder / "masks" / masks.replace("jpg", "png").format(name=view.name))
         quat, t = _quat_wxyz(view.camera_from_world[:3, :3]), view.camera_from_world[:3, 3]
         # Every second image has no 2D points: its second line is empty.
         observations = 2 * (index % 2)
@@ -213,7 +235,7 @@ def write_nero(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     intrinsics = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
     for index, view in enumerate(sphere_views()):
-        Image.fromarray(view.rgba[..., :3]).save(folder / f"{index}.png")
+        save_png(view.rgba[..., :3], folder / f"{index}.png")
         depth = np.where(view.rgba[..., 3] > 0, 3.0, 15.0) / 15 * 65535
         Image.fromarray(depth.astype(np.uint16)).save(folder / f"{index}-depth.png")
         (folder / f"{index}-camera.pkl").write_bytes(pickle.dumps([view.camera_from_world[:3].astype(np.float32), intrinsics]))

@@ -56,6 +56,12 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     assert redecoupled.parameters["built_preset"] == "draft" and redecoupled.dataset == service.settings.sample_capture.resolve()
 
 
+@pytest.fixture(scope="module")
+def with_asset(lasting_service: Service) -> Service:
+    lasting_service.add_asset(ASSET)
+    return lasting_service
+
+
 CAMERA = {"name": "a", "world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
 
 VIEW = {"eye": [0, -3, 1], "target": [0, 0, 0]}
@@ -100,10 +106,9 @@ VIEW = {"eye": [0, -3, 1], "target": [0, 0, 0]}
         (RENDER | {"limits": {"memory_bytes": 1}}, 422, "memory_bytes"),
     ],
 )
-def test_a_wrong_request_is_refused(service: Service, request_: dict, status: int, words: str) -> None:
-    service.add_asset(ASSET)
-    assert words in is_problem(service.client.post("/api/jobs", json=request_), status)
-    assert service.client.get("/api/jobs").json()["total"] == 0
+def test_a_wrong_request_is_refused(with_asset: Service, request_: dict, status: int, words: str) -> None:
+    assert words in is_problem(with_asset.client.post("/api/jobs", json=request_), status)
+    assert with_asset.client.get("/api/jobs").json()["total"] == 0
 
 
 def test_results_are_listed_downloaded_in_ranges_and_deleted_with_their_job(service: Service) -> None:
@@ -134,14 +139,13 @@ FAR = [[1, 0, 0, 1e30], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
 
 
 @pytest.mark.parametrize("matrix", [TILTED, MIRRORED, TWICE, FLAT, PROJECTIVE, FAR])
-def test_a_render_refuses_cameras_that_are_not_rigid(matrix: list, service: Service) -> None:
-    service.add_asset(ASSET)
-    response = service.client.post("/api/jobs", json=RENDER | {"cameras": [{"name": "a", "world_from_camera": matrix}]})
+def test_a_render_refuses_cameras_that_are_not_rigid(matrix: list, with_asset: Service) -> None:
+    response = with_asset.client.post("/api/jobs", json=RENDER | {"cameras": [{"name": "a", "world_from_camera": matrix}]})
     assert response.status_code == 422, response.text
     assert "world_from_camera" in response.json()["detail"] or "cameras" in response.json()["detail"]
     query = ",".join(str(number) for row in matrix for number in row)
-    session = service.client.post("/api/sessions", json={"asset": ASSET}).json()["id"]
-    assert service.client.get(f"/api/sessions/{session}/frame.jpg", params={"world_from_camera": query}).status_code == 422
+    session = with_asset.client.post("/api/sessions", json={"asset": ASSET}).json()["id"]
+    assert with_asset.client.get(f"/api/sessions/{session}/frame.jpg", params={"world_from_camera": query}).status_code == 422
 
 
 def test_a_capture_that_a_job_made_outlives_the_job(service: Service) -> None:

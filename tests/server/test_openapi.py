@@ -33,9 +33,9 @@ def validator(schema: dict, document: dict) -> Any:
     return jsonschema_rs.Draft202012Validator({**schema, "components": document["components"]}, validate_formats=True)
 
 
-@pytest.fixture
-def document(service: Service) -> dict:
-    return service.client.get("/api/openapi.json").json()
+@pytest.fixture(scope="module")
+def document(lasting_service: Service) -> dict:
+    return lasting_service.client.get("/api/openapi.json").json()
 
 
 def test_every_json_body_has_examples_and_its_schema_takes_them(document: dict) -> None:

@@ -68,11 +68,11 @@ def test_the_connection_outlives_an_error_of_the_server(tmp_path, monkeypatch: p
 
 
 @pytest.mark.parametrize("body", [{"edit": {"op": "x" * 1_000_000}}, {"edit": {"op": "material", "y" * 1_000_000: 1}}])
-def test_what_was_sent_is_not_sent_back_whole(body: dict, service: Service) -> None:
-    session = service.open_session()
-    response = service.client.post(f"/api/sessions/{session}/edits", json=body)
+def test_what_was_sent_is_not_sent_back_whole(body: dict, lasting_service: Service) -> None:
+    session = lasting_service.open_session()
+    response = lasting_service.client.post(f"/api/sessions/{session}/edits", json=body)
     assert response.status_code == 422 and len(response.json()["detail"]) < MOST
-    with service.client.websocket_connect(f"ws://127.0.0.1:8000/api/sessions/{session}/stream") as stream:
+    with lasting_service.client.websocket_connect(f"ws://127.0.0.1:8000/api/sessions/{session}/stream") as stream:
         stream.send_json({"type": "hello", "v": 1})
         while stream.receive_json()["type"] != "hello":
             pass
@@ -138,15 +138,15 @@ def texts(document: object, way: tuple = ()) -> Iterator[tuple]:
         ("PUT", "{session}/edits", {"edits": [{"op": "material", "select": {"weights_file": "x"}, "set": {"roughness": 1}}]}),
     ],
 )
-def test_no_string_of_a_body_is_too_odd_for_a_sentence(service: Service, method: str, path: str, body: dict) -> None:
-    address = path.format(session=f"/api/sessions/{service.open_session()}")
+def test_no_string_of_a_body_is_too_odd_for_a_sentence(lasting_service: Service, method: str, path: str, body: dict) -> None:
+    address = path.format(session=f"/api/sessions/{lasting_service.open_session()}")
     for bad, way in product(ODD_TEXTS, texts(body)):
         changed = copy.deepcopy(body)
         node = changed
         for key in way[:-1]:
             node = node[key]
         node[way[-1]] = bad
-        answer = service.client.request(method, address, content=json.dumps(changed), headers={"Content-Type": "application/json"})
+        answer = lasting_service.client.request(method, address, content=json.dumps(changed), headers={"Content-Type": "application/json"})
         assert answer.status_code in (201, 401, 403, 404, 422), (bad, way, answer.text)
         assert answer.status_code == 201 or answer.json()["detail"].endswith((".", "?", "!"))
 
@@ -154,24 +154,24 @@ def test_no_string_of_a_body_is_too_odd_for_a_sentence(service: Service, method:
 @pytest.mark.parametrize(
     "path", ["/api/assets?search=%00", "/api/assets/%00", "/api/sessions/a%00b", "/api/jobs/%00/log", "/api/weights/%00", "/%00"]
 )
-def test_an_address_with_nul_is_none(service: Service, path: str) -> None:
+def test_an_address_with_nul_is_none(lasting_service: Service, path: str) -> None:
     """Postgres raises at such text, and SQLite takes what stands before it: a search for it found everything."""
-    assert service.client.get(path).status_code == 400
+    assert lasting_service.client.get(path).status_code == 400
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO, errno.EMFILE])
 def test_trouble_of_the_disk_is_told_and_passes(
-    service: Service, monkeypatch: pytest.MonkeyPatch, number: int, caplog: pytest.LogCaptureFixture
+    lasting_service: Service, monkeypatch: pytest.MonkeyPatch, number: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(*_: object, **__: object) -> None:
         raise OSError(number, os.strerror(number), "/srv/secret/place")
 
     monkeypatch.setattr(tempfile, "mkdtemp", fail)
     answers = [
-        service.client.post("/api/weights", content=bytes(4)),
-        service.client.post("/api/assets", files={"file": ("a.obj", b"v")}),
-        service.client.post("/api/environments", files={"file": ("a.exr", b"v")}),
-        service.client.get(f"/api/sessions/{service.open_session()}/export?format=ply"),
+        lasting_service.client.post("/api/weights", content=bytes(4)),
+        lasting_service.client.post("/api/assets", files={"file": ("a.obj", b"v")}),
+        lasting_service.client.post("/api/environments", files={"file": ("a.exr", b"v")}),
+        lasting_service.client.get(f"/api/sessions/{lasting_service.open_session()}/export?format=ply"),
     ]
     for answer in answers:
         assert answer.status_code == 503 and "retry-after" in answer.headers, answer.text

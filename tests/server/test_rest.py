@@ -91,15 +91,15 @@ def test_the_same_idempotency_key_gives_the_same_job(service: Service) -> None:
         ("a.zip", zipped({"a": b"1"}), {"seed": "-3"}, "seed"),
     ],
 )
-def test_wrong_uploads_are_refused_and_leave_nothing(service: Service, name: str, data: bytes, fields: dict, words: str) -> None:
-    assert words in is_problem(submit(service, data, name, **fields), 422)
-    assert left_on_disk(service) == [] and service.client.get("/api/jobs").json()["total"] == 0
+def test_wrong_uploads_are_refused_and_leave_nothing(lasting_service: Service, name: str, data: bytes, fields: dict, words: str) -> None:
+    assert words in is_problem(submit(lasting_service, data, name, **fields), 422)
+    assert left_on_disk(lasting_service) == [] and lasting_service.client.get("/api/jobs").json()["total"] == 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"dataset": 3}', b'{"dataset": "sample", "shell": "rm"}', b"\xff"])
-def test_wrong_bodies_are_refused(service: Service, body: bytes) -> None:
-    is_problem(service.client.post("/api/jobs", content=body, headers={"content-type": "application/json"}), 422)
+def test_wrong_bodies_are_refused(lasting_service: Service, body: bytes) -> None:
+    is_problem(lasting_service.client.post("/api/jobs", content=body, headers={"content-type": "application/json"}), 422)
 
 
 def test_a_folder_below_an_allowed_root_is_taken(tmp_path: Path) -> None:
@@ -218,8 +218,8 @@ def test_a_folder_without_counts_is_no_asset(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("query", ["limit=0", "limit=100000", "offset=-1", "limit=x"])
-def test_pages_have_bounds(service: Service, query: str) -> None:
-    is_problem(service.client.get(f"/api/jobs?{query}"), 422)
+def test_pages_have_bounds(lasting_service: Service, query: str) -> None:
+    is_problem(lasting_service.client.get(f"/api/jobs?{query}"), 422)
 
 
 def test_unknown_calls_and_methods_are_problems(service: Service) -> None:

@@ -16,17 +16,17 @@ PATHS = ["/api/jobs", "/api/assets", "/api/environments", "/api/sessions", "/api
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", PATHS)
-def test_nothing_below_api_answers_without_the_token(service: Service, path: str) -> None:
-    response = service.anonymous.get(path)
+def test_nothing_below_api_answers_without_the_token(lasting_service: Service, path: str) -> None:
+    response = lasting_service.anonymous.get(path)
     assert response.status_code == 401
     assert response.headers["content-type"] == "application/problem+json"
     assert "token" in response.json()["detail"]
 
 
 @pytest.mark.parametrize("header", ["Bearer ", "Bearer nope", "Basic {token}", "{token}", "Bearer {token}x", "Bearer \u00fc"])
-def test_wrong_tokens_are_refused(service: Service, header: str) -> None:
-    value = header.format(token=service.token).encode("latin-1")
-    assert service.anonymous.get("/api/jobs", headers={"Authorization": value}).status_code == 401
+def test_wrong_tokens_are_refused(lasting_service: Service, header: str) -> None:
+    value = header.format(token=lasting_service.token).encode("latin-1")
+    assert lasting_service.anonymous.get("/api/jobs", headers={"Authorization": value}).status_code == 401
 
 
 def test_a_token_in_the_address_is_not_looked_at(service: Service) -> None:
@@ -50,25 +50,25 @@ def test_a_token_in_the_address_is_not_looked_at(service: Service) -> None:
         ),
     ],
 )
-def test_other_host_names_are_refused(service: Service, host: str) -> None:
+def test_other_host_names_are_refused(lasting_service: Service, host: str) -> None:
     for path in ("/", "/healthz", "/api/jobs"):
-        assert service.client.get(path, headers={"Host": host}).status_code == 400
+        assert lasting_service.client.get(path, headers={"Host": host}).status_code == 400
 
 
 @pytest.mark.parametrize("name", ["Host", "Origin", "Authorization"])
-def test_what_decides_who_may_ask_is_said_once(service: Service, name: str) -> None:
-    said = {"Host": "127.0.0.1:8000", "Origin": OURS, "Authorization": f"Bearer {service.token}"}
-    request = service.anonymous.build_request("GET", "/api/jobs", headers=said)
-    assert service.anonymous.send(request).status_code == 200
+def test_what_decides_who_may_ask_is_said_once(lasting_service: Service, name: str) -> None:
+    said = {"Host": "127.0.0.1:8000", "Origin": OURS, "Authorization": f"Bearer {lasting_service.token}"}
+    request = lasting_service.anonymous.build_request("GET", "/api/jobs", headers=said)
+    assert lasting_service.anonymous.send(request).status_code == 200
     for other in (said[name], "evil.example"):
         request.headers = type(request.headers)([*said.items(), (name, other)])
-        assert service.anonymous.send(request).status_code == 400
+        assert lasting_service.anonymous.send(request).status_code == 400
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("host", ["localhost", "localhost:8000", "127.0.0.1:9", "[::1]:8000", "[::1]"])
-def test_our_host_names_are_answered(service: Service, host: str) -> None:
-    assert service.client.get("/api/jobs", headers={"Host": host}).status_code == 200
+def test_our_host_names_are_answered(lasting_service: Service, host: str) -> None:
+    assert lasting_service.client.get("/api/jobs", headers={"Host": host}).status_code == 200
 
 
 def test_the_cookie_is_given_for_the_token_and_hidden_from_scripts(service: Service) -> None:
@@ -132,17 +132,17 @@ def test_large_bodies_are_refused_with_a_sentence_whether_their_size_was_said_or
 
 @pytest.mark.slow
 @pytest.mark.parametrize("asset", ["../../token", "..%2f..%2ftoken", "%2e%2e", "a/../../token", "/etc/passwd"])
-def test_ids_are_no_paths(service: Service, asset: str) -> None:
+def test_ids_are_no_paths(lasting_service: Service, asset: str) -> None:
     for name in ("", "/mesh.glb", "/thumb.jpg", "/export?format=zip"):
-        assert service.client.get(f"/api/assets/{asset}{name}").status_code in (404, 405)
+        assert lasting_service.client.get(f"/api/assets/{asset}{name}").status_code in (404, 405)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["../token", "..%2Ftoken", "token", ".hidden.exr", "a b.exr", "x" * 200 + ".exr"])
-def test_environment_names_are_no_paths(service: Service, name: str) -> None:
-    assert service.client.get(f"/api/environments/{name}").status_code == 404
+def test_environment_names_are_no_paths(lasting_service: Service, name: str) -> None:
+    assert lasting_service.client.get(f"/api/environments/{name}").status_code == 404
     edit = {"op": "environment", "file": name}
-    response = service.client.post(f"/api/sessions/{service.open_session()}/edits", json={"edit": edit})
+    response = lasting_service.client.post(f"/api/sessions/{lasting_service.open_session()}/edits", json={"edit": edit})
     assert response.status_code == 422 and "No environment" in response.json()["detail"]
 
 

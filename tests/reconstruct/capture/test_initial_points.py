@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from drgs.reconstruct.capture.initial_points import initial_points
+from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings, axes_meeting_point, visual_hull
 from drgs.scene.camera import Camera, scaled_camera
@@ -22,14 +22,18 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> Views:
     return load_views(tiny.write_nerf_synthetic(tmp_path_factory.mktemp("capture")))
 
 
+@pytest.fixture(scope="module")
+def points(sphere: Views) -> InitialPoints:
+    return initial_points(sphere, COUNT, seed=0)
+
+
 def _radii(points: torch.Tensor) -> np.ndarray:
     """Distance from the sphere's centre, in radii."""
     return np.linalg.norm(points.double().numpy() - tiny.SPHERE_CENTER, axis=1) / tiny.SPHERE_RADIUS
 
 
 @pytest.mark.slow
-def test_hull_points_lie_on_the_sphere_or_just_outside(sphere: Views) -> None:
-    points = initial_points(sphere, COUNT, seed=0)
+def test_hull_points_lie_on_the_sphere_or_just_outside(points: InitialPoints) -> None:
     assert points.origin == "hull"
     assert points.points_world.shape == (COUNT, 3)
     radii = _radii(points.points_world)
@@ -39,8 +43,7 @@ def test_hull_points_lie_on_the_sphere_or_just_outside(sphere: Views) -> None:
     assert radii.max() < 1.25
 
 
-def test_hull_normals_point_outward(sphere: Views) -> None:
-    points = initial_points(sphere, COUNT, seed=0)
+def test_hull_normals_point_outward(points: InitialPoints) -> None:
     radial = torch.nn.functional.normalize(points.points_world - torch.tensor(tiny.SPHERE_CENTER).float(), dim=1)
     cosines = (radial * points.normals_world).sum(1)
     torch.testing.assert_close(points.normals_world.norm(dim=1), torch.ones(COUNT))
@@ -48,14 +51,12 @@ def test_hull_normals_point_outward(sphere: Views) -> None:
     assert float((cosines > 0).float().mean()) > 0.999
 
 
-def test_the_bounding_sphere_is_that_of_the_object(sphere: Views) -> None:
-    points = initial_points(sphere, COUNT, seed=0)
+def test_the_bounding_sphere_is_that_of_the_object(points: InitialPoints) -> None:
     np.testing.assert_allclose(points.bounds_center.numpy(), tiny.SPHERE_CENTER, atol=0.05)
     assert tiny.SPHERE_RADIUS * 0.98 < points.bounds_radius < tiny.SPHERE_RADIUS * 1.25
 
 
-def test_points_take_the_color_painted_where_they_lie(sphere: Views) -> None:
-    points = initial_points(sphere, COUNT, seed=0)
+def test_points_take_the_color_painted_where_they_lie(points: InitialPoints) -> None:
     normal = points.points_world.double().numpy() - tiny.SPHERE_CENTER
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     painted = tiny.color_of_normal(normal) / 255
