@@ -46,8 +46,8 @@ WAITING = ("tests/benchmarks/", "tests/worker/", "tests/server/", "tests/test_wh
 """Tests that wait for processes that they start about as long as they compute."""
 
 
-LONG = "tests/reconstruct/"
-"""Files below it take up to most of a minute of a core: of those that compute they come first, lest one begun late keep the others waiting."""
+LONG = ("tests/reconstruct/", "tests/reference/", "tests/stress/", "tests/test_public_names.py")
+"""Single files take up to most of a minute of a core: of those that compute they come first, lest one begun late keep the others waiting."""
 
 
 def is_in_browser(nodeid: str) -> bool:
