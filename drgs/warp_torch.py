@@ -62,7 +62,7 @@ def in_thread_pool() -> bool:
 
 @contextmanager
 def as_in_thread_pool() -> Iterator[None]:
-    """For work that the pool would do, were there more than one thread: it is to have the same sums."""
+    """For work of the caller's that is the pool's: launches inside run where they are, with the pool's sums."""
     pooled, _here.pooled = in_thread_pool(), True
     try:
         yield
@@ -179,11 +179,10 @@ def share_out(work: Callable[[int, int], Any], edges: Sequence[int]) -> list:
             results[k] = work(first, last)
 
     others = [thread_pool().submit(take) for _ in range(min(thread_count(), len(results)) - 1)]
-    was_here, _here.pooled = in_thread_pool(), True
     try:
-        take()
+        with as_in_thread_pool():
+            take()
     finally:
-        _here.pooled = was_here
         for other in others:
             if not other.cancel():
                 other.result()
