@@ -18,6 +18,7 @@ from drgs.render.integrate.plan import at_rest, moving_counts
 from drgs.render.intersect.horizon import usable_horizons
 from drgs.render.intersect.ray_memory import RayMemory
 from drgs.render.intersect.trace_rays import over_slices
+from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.converge import MIN_PASSES, still_active
 from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshView, Tiles, with_seconds
 from drgs.render.progressive.frame_sums import add_estimate, copy_sums, no_sums
@@ -127,7 +128,7 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
     whole_first_pass = index == 0 and bool((chosen == state.tiles.covered).all())
     primary = _primary_points(state, chosen, index, whole_first_pass)
     traced = time.perf_counter()
-    _shade_and_add(state, primary, index, state.first_rays if whole_first_pass else None)
+    _shade_and_add(state, _tracer(state, index), primary, index, state.first_rays if whole_first_pass else None)
     if whole_first_pass and isinstance(state.view, MeshView):
         state = replace(state, view=MeshView(first_primary_points=primary))
     seconds = {"trace_primary": traced - started, "shade": time.perf_counter() - traced}
@@ -137,7 +138,7 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
 def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> FrameState:
     """Several passes over chosen tiles of a mesh, each thread with pixels of its own: nobody waits for the others between passes."""
     started = time.perf_counter()
-    camera, seed = state.inputs.camera, state.inputs.settings.seed
+    camera, seed, tracer = state.inputs.camera, state.inputs.settings.seed, _tracer(state, index)
     pixels = _pixels(state, chosen)
 
     def work(first: int, last: int) -> tuple[int, float, Tensor | None]:
@@ -146,9 +147,9 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
         for round_ in range(index, index + count, at_once):
             began = time.perf_counter()
             together = min(at_once, index + count - round_)
-            primary = trace_primary_points(state.traced.tracer, camera, seed, round_, pixels=pixels[first:last], passes=together)
+            primary = trace_primary_points(tracer, camera, seed, round_, pixels=pixels[first:last], passes=together)
             tracing += time.perf_counter() - began
-            _shade_and_add(state, primary, round_ if primary.round is None else primary.round, None)
+            _shade_and_add(state, tracer, primary, round_ if primary.round is None else primary.round, None)
             points += len(primary.points.pixel)
         return points, tracing, primary.starts.face
 
@@ -170,7 +171,13 @@ def _primary_points(state: FrameState, chosen: Tensor, index: int, whole_first_p
     if whole_first_pass and view.first_primary_points is not None:
         return view.first_primary_points
     seed, pixels = state.inputs.settings.seed, _pixels(state, chosen)
-    return trace_primary_points(state.traced.tracer, camera, seed, index, pixels=pixels)
+    return trace_primary_points(_tracer(state, index), camera, seed, index, pixels=pixels)
+
+
+def _tracer(state: FrameState, index: int) -> AbstractTracer:
+    """Of pass `index`. The first one does not wait for a second tree, which a shape that moves would need for every picture."""
+    tracer = state.traced.tracer
+    return tracer.swift if index > 0 and state.inputs.settings.skip else tracer
 
 
 def _pixels(state: FrameState, chosen: Tensor) -> Tensor:
@@ -185,11 +192,12 @@ def points_in_tiles(primary: PrimaryPoints, tiles: Tensor, width: int, first_pix
     return points_at(primary, torch.nonzero(tiles[tile_of_pixels(primary.points.pixel - first_pixel, width)]).squeeze(-1))
 
 
-def _shade_and_add(state: FrameState, primary: PrimaryPoints, index: int | Tensor, memory: RayMemory | None) -> None:
+def _shade_and_add(
+    state: FrameState, tracer: AbstractTracer, primary: PrimaryPoints, index: int | Tensor, memory: RayMemory | None
+) -> None:
     """Light of the points of pass `index`, or of several passes, added to the sums of their pixels."""
-    traced = state.traced
-    integrator = choose_integrator(traced.tracer)
-    light = integrator.shade(primary.points, primary.starts, traced.environment_light, _how(state), index, memory, _horizon(state))
+    integrator, light_there = choose_integrator(tracer), state.traced.environment_light
+    light = integrator.shade(primary.points, primary.starts, light_there, _how(state), index, memory, _horizon(state))
     add_estimate(state.sums, primary, light, state.inputs.first_pixel)
 
 
