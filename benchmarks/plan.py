@@ -34,12 +34,14 @@ from drgs.scene.camera import Camera
 from drgs.scene.load_environment import load_environment
 from drgs.scene.posed_scene import PosedScene, PrimarySurface
 
-EMPTY, STRATEGY, MATERIAL, HORIZON, DARK = (
+EMPTY, STRATEGY, MATERIAL, HORIZON, DARK, EDGES, PLACES = (
     "rays through empty tiles",
     "samples",
     "samples of strategies that",
     "tracing of rays",
     "light rays",
+    "tests that no ray",
+    "places of pixels",
 )
 """How the plan's skips begin."""
 
@@ -57,6 +59,10 @@ def switched_on(what: str, off: FrameState, on: FrameState) -> FrameState | None
     if what.startswith(HORIZON):
         known = replace(off, traced=replace(off.traced, tracer=horizons_known(off.inputs.scene)))
         return with_settings(known, skip=True, skip_error=on.inputs.settings.skip_error)
+    if what.startswith(EDGES):
+        return replace(off, plan=replace(off.plan, swift=True))
+    if what.startswith(PLACES):
+        return replace(off, plan=replace(off.plan, spread_places=True))
     if what == DARK or what.endswith(STRATEGY):
         return replace(off, plan=replace(off.plan, counts=on.plan.counts, bounces=on.plan.bounces))
     return None

@@ -57,8 +57,9 @@ def _mesh_coverage(tracer: AbstractTracer, camera: Camera) -> Array:
     coverage[middle.numpy()] = 1.0
     picture = coverage.reshape(camera.height, camera.width)
     edges = np.flatnonzero(maximum_filter(picture, 3) > minimum_filter(picture, 3))
-    pixels = torch.from_numpy(edges.astype(np.int32))
-    hits = trace_primary_points(tracer, camera, seed=0, pass_index=0, pixels=pixels, passes=RAYS_A_PIXEL).points.pixel.long()
+    pixels = torch.from_numpy(edges.astype(np.int32)).repeat(RAYS_A_PIXEL)
+    rounds = torch.arange(RAYS_A_PIXEL, dtype=torch.int32).repeat_interleave(len(edges))
+    hits = trace_primary_points(tracer, camera, seed=0, pass_index=0, pixels=pixels, rounds=rounds).points.pixel.long()
     coverage[edges] = torch.bincount(hits, minlength=len(coverage)).numpy()[edges] / RAYS_A_PIXEL
     return picture
 

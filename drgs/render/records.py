@@ -130,6 +130,10 @@ class RenderPlan:
     """A first pass by itself is shown while the camera moves (plan.PIXEL_MIDDLES, plan.FEWER_RAYS)."""
     kept_light: bool = False
     """It may read light that is kept on the mesh."""
+    swift: bool = False
+    """Rays behind a first pass take the tree that tests no edges (plan.SWIFT_RAYS)."""
+    spread_places: bool = False
+    """Passes look through more places of some pixels of a tile and fewer of others (spread_places.py)."""
 
 
 # ---- what the camera sees ------------------------------------------------------------------------------------------------
@@ -193,8 +197,8 @@ class PrimaryPoints:
     """Along the viewing axis [world units]."""
     barycentric: Float[Tensor, "point 2"] | None = None
     """In the starts' triangles, where the camera sees the mesh."""
-    round: Int[Tensor, "point"] | None = None
-    """int32; the pass of each point, where there are several."""
+    ray: Int[Tensor, "point"] | None = None
+    """Which of the listed camera rays found each point, where a list named their rounds."""
 
 
 # ---- what rays meet ------------------------------------------------------------------------------------------------------

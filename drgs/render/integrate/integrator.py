@@ -100,6 +100,7 @@ class AbstractIntegrator(ABC):
         known: SurfaceLight | None = None,
         order: Tensor | None = None,
         onto: ShadedPoints | None = None,
+        pool_rounds: Tensor | None = None,
     ) -> ShadedPoints:
         """Outgoing light of all points, or of some, one estimate of `settings.counts.total` rays each.
 
@@ -111,6 +112,7 @@ class AbstractIntegrator(ABC):
             known: what surfaces of the tracer's mesh send, read where a ray meets one; only with one bounce.
             order: (chosen,) int32, the points that are meant, without a memory; None: all, one after the other. The others stay 0, or
             onto: what is known of all points so far; the light of those that are meant is written into it.
+            pool_rounds: (point,) int32, the rounds whose pools samples choose from (environment_pool.py); None: their own.
         """
         assert (known is None or settings.bounces == 1) and (order is None or memory is None)
         device, rays_a_point = points.normal_world.device, settings.counts.total
@@ -120,11 +122,11 @@ class AbstractIntegrator(ABC):
         if ray_count == 0:
             return result
         rounds, first_round = (samples_round, 0) if isinstance(samples_round, Tensor) else (None, samples_round)
-        last_round = first_round if rounds is None else int(rounds.max())
-        lowest = first_round if rounds is None else int(rounds.min())
-        pools = candidate_pools(light, settings.candidates, settings.seed, lowest, last_round, device)
+        of_pools = rounds if pool_rounds is None else pool_rounds
+        lowest, highest = (first_round, first_round) if of_pools is None else (int(bound) for bound in of_pools.aminmax())
+        pools = candidate_pools(light, settings.candidates, settings.seed, lowest, highest, device)
         estimate = Estimate(
-            point_arrays(points, rounds, order),
+            point_arrays(points, rounds, order, pool_rounds),
             start_arrays(starts),
             ray_scene(light, self.tracer, horizon, pools, known),
             sample_set(settings.counts, settings.seed, first_round, settings.by_material, settings.candidates),

@@ -51,9 +51,14 @@ FEWER_RAYS = Skip(
     "the noise of a quarter of the rays where the camera saw nothing before; none at rest, where all rays are traced",
 )
 SWIFT_RAYS = Skip(
-    "tests that no light ray of a moving picture passes between triangles with a common edge",
+    "tests that no ray passes between triangles with a common edge",
     "Embree is a fifth faster without",
-    "a ray through an edge may be lost: of a million rays on each of three assets not one; none at rest, where all are tested",
+    "a ray through an edge may be lost: of a million rays on each of three assets not one; none in the first pass at rest, nor of a moving camera's own rays",
+)
+SPREAD_PLACES = Skip(
+    "places of pixels whose places agree",
+    "from the fifth pass on, passes look through other pixels nearby instead, whose places differ",
+    "exact in the mean, but for the share that a pixel has in what a whole row of tiles may spend",
 )
 KEPT_LIGHT = Skip(
     "diffuse rays of a moving picture",
@@ -143,6 +148,7 @@ def plan_frame(
     skip_error: float = 0.0,
     counts_given: bool = False,
     moving: bool = False,
+    spread_places: bool = False,
 ) -> RenderPlan:
     """The plan for a scene's light and a frame's settings.
 
@@ -153,6 +159,7 @@ def plan_frame(
         skip_error: share of the sky that rays may be spared without proof (RenderSettings).
         counts_given: `counts` are what somebody asked for by name: each of these samples stays one direction.
         moving: a first pass by itself is shown while the camera moves.
+        spread_places: passes may look through more places of some pixels than of others.
     """
     if not skip:
         return RenderPlan(counts, False, bounces, ())
@@ -185,19 +192,7 @@ def plan_frame(
         skips.append(
             Skip("samples of strategies that a point's material hardly needs", "they go to its other strategies", "exact in the mean")
         )
-    skips.append(
-        Skip(
-            "tracing of rays that leave above all the mesh has there",
-            "horizons of faces, the asset's or found as rays pay for them",
-            "exact",
-        )
-        if skip_error <= 0
-        else Skip(
-            "tracing of rays that leave above nearly all the mesh has there",
-            "horizons of faces, the asset's or found as rays pay for them",
-            f"at most {100 * skip_error:g} % of the cosine-weighted sky at a point taken for open",
-        )
-    )
+    skips += [_rays_above_horizons(skip_error), SWIFT_RAYS, *([SPREAD_PLACES] if spread_places else [])]
     candidates = 1
     if counts.environment > 0 and not counts_given and (spread := light_spread(environment)) < WORTH_CHOOSING:
         candidates = CANDIDATES
@@ -208,14 +203,22 @@ def plan_frame(
     kept_light = moving and facts is not None and facts.diffuse_share >= WORTH_KEEPING
     if moving:
         fewer = moving_counts(counts).total < counts.total
-        skips += [PIXEL_MIDDLES, SWIFT_RAYS, *([FEWER_RAYS] if fewer else []), *([KEPT_LIGHT] if kept_light else [])]
+        skips += [PIXEL_MIDDLES, *([FEWER_RAYS] if fewer else []), *([KEPT_LIGHT] if kept_light else [])]
         skips += [KEPT_HITS] if kept_light and bounces == 1 else []
-    return RenderPlan(counts, by_material, bounces, tuple(skips), candidates, moving, kept_light)
+    return RenderPlan(counts, by_material, bounces, tuple(skips), candidates, moving, kept_light, True, spread_places)
+
+
+def _rays_above_horizons(skip_error: float) -> Skip:
+    why = "horizons of faces, the asset's or found as rays pay for them"
+    if skip_error <= 0:
+        return Skip("tracing of rays that leave above all the mesh has there", why, "exact")
+    bound = f"at most {100 * skip_error:g} % of the cosine-weighted sky at a point taken for open"
+    return Skip("tracing of rays that leave above nearly all the mesh has there", why, bound)
 
 
 def at_rest(plan: RenderPlan) -> RenderPlan:
     """The same for passes that trace all their rays."""
-    skips = tuple(skip for skip in plan.skips if skip not in (PIXEL_MIDDLES, SWIFT_RAYS, FEWER_RAYS, KEPT_LIGHT, KEPT_HITS))
+    skips = tuple(skip for skip in plan.skips if skip not in (PIXEL_MIDDLES, FEWER_RAYS, KEPT_LIGHT, KEPT_HITS))
     return replace(plan, moving=False, kept_light=False, skips=skips)
 
 

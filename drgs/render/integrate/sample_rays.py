@@ -48,6 +48,8 @@ class PointArrays:
     pixel: wp.array[int]
     round: wp.array[int]
     """Each point's own rounds, added to SampleSet.round; empty where all are the same."""
+    pool: wp.array[int]
+    """The round whose pools each point's samples choose from; empty where that is the point's own (environment_pool.py)."""
     order: wp.array[int]
     """The points that are meant, one after the other; empty where all are (point_at)."""
 
@@ -141,6 +143,13 @@ def round_at(samples: SampleSet, points: PointArrays, point: int) -> int:
 
 
 @wp.func
+def pool_round_at(samples: SampleSet, points: PointArrays, point: int) -> int:
+    if points.pool.shape[0] > 0:
+        return points.pool[point]
+    return round_at(samples, points, point)
+
+
+@wp.func
 def strategy_of(split: wp.vec3i, samples_round: int, slot: int) -> wp.vec2i:
     """(strategy, index in its sequence) of a point's slot-th sample."""
     if slot < split[0]:
@@ -219,11 +228,14 @@ def sample_directions(
     weight[i] = w
 
 
-def point_arrays(points: ShadingPoints, rounds: torch.Tensor | None = None, order: torch.Tensor | None = None) -> Any:
+def point_arrays(
+    points: ShadingPoints, rounds: torch.Tensor | None = None, order: torch.Tensor | None = None, pools: torch.Tensor | None = None
+) -> Any:
     """The struct that kernels read; shares memory with the tensors.
 
     Args:
         rounds: (point,) int32, where points of several passes come together. order: (chosen,) int32, of some of them.
+        pools: (point,) int32, the round whose pools each takes, where that is not its own.
     """
     arrays = PointArrays()
     arrays.position = warp_array(points.position_world.float(), wp.vec3)
@@ -234,7 +246,7 @@ def point_arrays(points: ShadingPoints, rounds: torch.Tensor | None = None, orde
     arrays.metallic = warp_array(points.metallic.float())
     arrays.pixel = warp_array(points.pixel.int())
     none = points.pixel[:0].int()
-    arrays.round, arrays.order = warp_array(none if rounds is None else rounds), warp_array(none if order is None else order)
+    arrays.round, arrays.order, arrays.pool = (warp_array(none if values is None else values) for values in (rounds, order, pools))
     return arrays
 
 

@@ -18,7 +18,7 @@ const float* const normals = (const float*)mesh.normals.data;
 const float* const albedos = (const float*)mesh.albedo.data;
 alignas(64) float corner[3][11][16], uv_lane[2][16], arriving[3][16], carried[3][16];
 alignas(64) unsigned pixel_lane[16], index_lane[16], strategy_lane[16];
-int triangles[16], round_lane[16];
+int triangles[16], pool_lane[16];
 for (int lane = 0; lane < 16; ++lane) {
     const int path = base + min_int(lane, lanes - 1), triangle = from.face.data[path];
     triangles[lane] = triangle;
@@ -45,7 +45,7 @@ for (int lane = 0; lane < 16; ++lane) {
     split_at(samples, points, point, split);
     const int round = samples.round + (points.round.shape[0] > 0 ? points.round.data[point] : 0);
     strategy_of(split, round, ray % count, strategy_lane[lane], index_lane[lane]);
-    round_lane[lane] = round;
+    pool_lane[lane] = points.pool.shape[0] > 0 ? points.pool.data[point] : round;
     pixel_lane[lane] = (unsigned)points.pixel.data[point];
 }
 const v16 second = load16(uv_lane[0]), third = load16(uv_lane[1]), one = 1.0f - second - third;
@@ -156,7 +156,7 @@ if (chooses) {
     const Places places = places_of(lobes, outward, albedo, metallic);
     for (int lane = 0; lane < lanes; ++lane) {
         if (outside_lane[lane] == 0) continue;
-        const float* const block = pool_block(scene.pools, round_lane[lane], 1, block_lane[lane]);
+        const float* const block = pool_block(scene.pools, pool_lane[lane], 1, block_lane[lane]);
         const float shares[3] = {1.0f - share_lane[lane], share_lane[lane], candidates};
         const int chosen = choose_candidate(block, places, lane, shares, 0.0f, u_lane[lane], choice[7][lane]);
         for (int k = 0; k < 7 && chosen >= 0; ++k) choice[k][lane] = block[16 * k + chosen];

@@ -17,7 +17,7 @@ const float* const triangles = (const float*)starts.surface_normal.data;
 v16 normal_at[3], wo_at[3], triangle_at[3], albedo_at[3], split_there[3], roughness = v16(0.0f), metal = v16(0.0f);
 for (int k = 0; k < 3; ++k) normal_at[k] = wo_at[k] = triangle_at[k] = albedo_at[k] = split_there[k] = v16(0.0f);
 u16 pixel = u16(0u), index = u16(0u), strategy = u16(0u);
-int point_lane[16], round_lane[16];
+int point_lane[16], pool_lane[16];
 for (int lane = 0; lane < lanes;) {
     const int ray = first + base + lane, listed = ray / count, slot = ray - listed * count;
     const int point = points.order.shape[0] > 0 ? points.order.data[listed] : listed;
@@ -46,7 +46,7 @@ for (int lane = 0; lane < lanes;) {
     metal = select(here, v16(points.metallic.data[point]), metal);
     for (const int end = min_int(16, lane + count - slot); lane < end; ++lane) {
         point_lane[lane] = point;
-        round_lane[lane] = round;
+        pool_lane[lane] = points.pool.shape[0] > 0 ? points.pool.data[point] : round;
     }
 }
 const V3 n = {normal_at[0], normal_at[1], normal_at[2]}, triangle = {triangle_at[0], triangle_at[1], triangle_at[2]};
@@ -76,7 +76,7 @@ if (chooses && any(is_environment)) {
     const Places places = places_of(lobes, triangle, albedo_at, metal);
     for (int lane = 0; lane < lanes; ++lane) {
         if (choosing_lane[lane] == 0) continue;
-        const float* const block = pool_block(scene.pools, round_lane[lane], 0, block_lane[lane]);
+        const float* const block = pool_block(scene.pools, pool_lane[lane], 0, block_lane[lane]);
         const float shares[3] = {share_lane[0][lane], share_lane[1][lane], share_lane[2][lane]};
         // With the floor even where no bounces follow: the same rays with and without them say what they add.
         const int chosen = choose_candidate(block, places, lane, shares, 1.0f, u_lane[lane], choice[7][lane]);

@@ -24,7 +24,16 @@ from drgs.render.integrate.integrator import Estimate
 from drgs.render.integrate.path_arrays import PathArrays
 from drgs.render.integrate.random_warp import hash_combine, shuffle_index, sobol_2d
 from drgs.render.integrate.ray_scene import RayScene
-from drgs.render.integrate.sample_rays import PointArrays, SampleSet, point_at, round_at, split_at, strategy_of, strategy_seed
+from drgs.render.integrate.sample_rays import (
+    PointArrays,
+    SampleSet,
+    point_at,
+    pool_round_at,
+    round_at,
+    split_at,
+    strategy_of,
+    strategy_seed,
+)
 from drgs.render.integrate.surface_light import light_of_hit
 from drgs.render.intersect.mesh_surface import Surface, face_limit, far_along, surface_at
 from drgs.render.intersect.tracer import AbstractTracer
@@ -68,7 +77,7 @@ def specular_share(surface: Surface, n_dot_v: float) -> float:
 def direction_to_light(
     scene: RayScene,
     candidates: float,
-    samples_round: int,
+    pool_round: int,
     seed: wp.uint32,
     index: wp.uint32,
     u: wp.vec2,
@@ -81,7 +90,7 @@ def direction_to_light(
     if candidates == 1.0:
         wi = environment_direction(scene.light, u)
         return wp.vec4(wi[0], wi[1], wi[2], 1.0)
-    block = pool_place(samples_round - scene.pools.first_round, AT_SURFACES, block_of(seed, index))
+    block = pool_place(pool_round - scene.pools.first_round, AT_SURFACES, block_of(seed, index))
     shares = wp.vec3(1.0 - share, share, candidates)
     n = surface.normal
     choice = choose_candidate(scene.pools, block, shares, 0.0, u[0], wo, n, surface.face_normal, alpha, surface.albedo, surface.metallic)
@@ -124,8 +133,8 @@ def scatter_hits(
     count = samples.cosine + samples.ggx + samples.environment
     ray = int(paths.ray[i])
     point = point_at(points, first_point + ray // count)
-    round_ = round_at(samples, points, point)
-    strategy = strategy_of(split_at(samples, points, point), round_, ray % count)
+    pool_round = pool_round_at(samples, points, point)
+    strategy = strategy_of(split_at(samples, points, point), round_at(samples, points, point), ray % count)
     base = strategy_seed(samples, points.pixel[point], strategy[0])
     index = wp.uint32(strategy[1])
     seed_light = hash_combine(base, wp.uint32(16 + 4 * depth))
@@ -139,7 +148,7 @@ def scatter_hits(
     share = specular_share(surface, n_dot_v)
     carried = paths.throughput[i]
     candidates = wp.where(depth == 0, float(samples.candidates), 1.0)
-    to_light = direction_to_light(scene, candidates, round_, seed_light, index, u_light, share, surface, wo, alpha)
+    to_light = direction_to_light(scene, candidates, pool_round, seed_light, index, u_light, share, surface, wo, alpha)
     wi = wp.vec3(to_light[0], to_light[1], to_light[2])
     n_dot_l = wp.dot(n, wi)
     if n_dot_l > 0.0 and wp.dot(surface.face_normal, wi) > 0.0:

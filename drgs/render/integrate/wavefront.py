@@ -22,6 +22,7 @@ from drgs.render.integrate.sample_rays import (
     StartArrays,
     balance_weight,
     point_at,
+    pool_round_at,
     round_at,
     sampled_direction,
     split_at,
@@ -76,7 +77,8 @@ def start_rays(
         strategy = strategy_of(split, round_, slot)
         if samples.candidates > 1 and strategy[0] == 2:
             stream = strategy_seed(samples, points.pixel[point], 2)
-            at = pool_place(round_ - scene.pools.first_round, AT_POINTS, block_of(stream, wp.uint32(strategy[1])))
+            pool_round = pool_round_at(samples, points, point)
+            at = pool_place(pool_round - scene.pools.first_round, AT_POINTS, block_of(stream, wp.uint32(strategy[1])))
             shares = wp.vec3(float(split[0]), float(split[1]), float(split[2] * samples.candidates))
             floor = 1.0  # without bounces too: the same rays with and without them say what they add
             u = sobol_2d(wp.uint32(strategy[1]), stream)

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from drgs.render.progressive.frame_state import FrameState
+from drgs.render.progressive.frame_sums import DARK
 from drgs.render.visible.image_tiles import TILE, Window, tile_grid
 
-DARK = 0.01
-"""Squared luminance below which errors are absolute."""
 MIN_PASSES = 8
 """Fewer say too little about the variance."""
 

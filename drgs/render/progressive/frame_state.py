@@ -16,7 +16,7 @@ from drgs.render.progressive.invalidate import Part
 from drgs.render.progressive.kept_light.kept_light import KeptLight
 from drgs.render.progressive.moving_picture import MovingPicture
 from drgs.render.records import FrameInputs, GBuffer, History, PrimaryPoints, RenderPlan, Reprojected
-from drgs.render.visible.image_tiles import Window, spread_over_pixels, window_of_tiles
+from drgs.render.visible.image_tiles import Window, window_of_tiles
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +67,8 @@ class FrameState:
     view: GaussianView | MeshView
     tiles: Tiles
     sums: FrameSums
+    rates: Int[Tensor, "pixel"] | None
+    """int32, quarters of a place a pass that pixels have since the last look (spread_places.py); None: a place in each."""
     first_rays: RayMemory
     """What the first pass's rays met."""
     history: History | None
@@ -109,9 +111,9 @@ class FrameState:
         return self.window.crop(values.unflatten(0, (self.inputs.height, self.inputs.camera.width)))
 
     @property
-    def passes_in_window(self) -> Int[Tensor, "rows columns"]:
-        """Of each pixel's tile."""
-        return spread_over_pixels(self.tiles.passes, self.window)
+    def passes_in_window(self) -> Float[Tensor, "rows columns"]:
+        """Of each pixel."""
+        return self.in_window(self.sums.passes)
 
     @property
     def passes(self) -> int:

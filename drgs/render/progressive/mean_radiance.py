@@ -14,7 +14,7 @@ from drgs.render.progressive.frame_sums import FrameSums, SumArrays, sum_arrays
 from drgs.render.progressive.moving_picture import MovingPicture
 from drgs.render.progressive.reproject import blend_history, remember
 from drgs.render.records import DemodulatedLight, GBuffer, History, Radiance
-from drgs.render.visible.image_tiles import TILE, Window, tile_grid
+from drgs.render.visible.image_tiles import Window
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -28,8 +28,6 @@ class WindowPlace:
     row: int
     column: int
     image_width: int
-    tiles_across: int
-    """Of the image."""
 
 
 @wp.struct
@@ -50,20 +48,16 @@ class MeanMaps:
 def mean_over_passes(
     first: int,
     window: WindowPlace,
-    tile_passes: wp.array[wp.int64],
     sums: SumArrays,
     # outputs
     mean: MeanMaps,
 ):
-    """Variance: converge.mean_variance, of passes that found a surface."""
+    """Variance: converge.mean_variance, of places that found a surface."""
     i = first + wp.tid()
     y = i / window.width
     x = i - y * window.width
-    row = window.row + y
-    column = window.column + x
-    p = row * window.image_width + column
-    passes = float(tile_passes[(row / TILE) * window.tiles_across + column / TILE])
-    count = wp.max(passes, 1.0)
+    p = (window.row + y) * window.image_width + window.column + x
+    count = wp.max(sums.passes[p], 1.0)
     w = wp.max(sums.weight[p], 1.0)
     mean.diffuse[y, x] = sums.diffuse[p] / w
     mean.specular[y, x] = sums.specular[p] / w
@@ -72,7 +66,7 @@ def mean_over_passes(
         mean.indirect[y, x] = sums.indirect[p] / w
     within = sums.scatter[p]
     of_mean = within[0]
-    if passes > 1.0:
+    if count > 1.0:
         luminance = sums.luminance[p] / count
         of_mean = wp.max(sums.luminance_squared[p] / count - luminance * luminance, 0.0) / (count - 1.0)
     mean.variance[y, x] = of_mean * (count / w) * (count / w)
@@ -97,7 +91,7 @@ def mean_radiance(state: FrameState) -> Radiance:
     variance, visibility, diffuse_variance, specular_variance = (own.new_empty(height, width) for _ in range(4))
     indirect = None if state.sums.indirect is None else torch.empty_like(diffuse)
     radiance = Radiance(diffuse, specular, variance, visibility, state.samples, diffuse_variance, specular_variance, indirect)
-    inputs = [_window_place(state.window), warp_array(state.tiles.passes), sum_arrays(state.sums)]
+    inputs = [_window_place(state.window), sum_arrays(state.sums)]
     launch(mean_over_passes, height * width, inputs, [_mean_maps(radiance)], warp_device(own))
     if state.reprojected is not None:
         blend_history(radiance, state.reprojected, mean_gbuffer(state), own)
@@ -156,7 +150,7 @@ def frame_history(state: FrameState) -> History | None:
 
 def _own_samples(state: FrameState) -> Tensor:
     """(rows, columns, 2) behind the diffuse and the specular part of the frame's own mean."""
-    samples = (state.passes_in_window * state.rays_a_pass).float()
+    samples = state.passes_in_window * state.rays_a_pass
     return torch.stack([samples, samples], -1)
 
 
@@ -164,7 +158,6 @@ def _window_place(window: Window) -> Any:
     place = WindowPlace()
     place.row, place.column = window.rows.start, window.columns.start
     place.width, place.image_width = window.columns.stop - window.columns.start, window.width
-    place.tiles_across = tile_grid(window.width, window.height)[0]
     return place
 
 

@@ -27,6 +27,17 @@ from drgs.render.progressive.mean_radiance import frame_history, mean_gbuffer
 from drgs.render.progressive.moving_picture import moving_picture
 from drgs.render.progressive.reproject import reproject
 from drgs.render.progressive.see_middles import see_middles
+from drgs.render.progressive.spread_places import (
+    FIRST_LOOK,
+    ONE,
+    Looks,
+    count_places,
+    decide_rates,
+    is_look,
+    list_looks,
+    next_look,
+    places_between,
+)
 from drgs.render.records import PrimaryPoints
 from drgs.render.visible.image_tiles import pixels_of_tiles, tile_of_pixels, tiles_of_mesh
 from drgs.render.visible.points_at import points_at
@@ -59,8 +70,12 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
         # Tiles that rested while others went on catch up first, so that passes of one tile follow each other.
         index = int(state.tiles.passes[state.tiles.active].min())
         chosen = state.tiles.active & (state.tiles.passes == index)
+        if state.plan.spread_places and is_look(index):
+            rates = decide_rates(state.sums, state.rates, chosen, state.inputs.camera.width, state.inputs.height)
+            state = replace(state, rates=rates)
         count = _passes_at_once(state, chosen, index, passes)
-        state = _add_pass(state, chosen, index) if count == 1 else _add_passes(state, chosen, index, count)
+        one_by_one = count == 1 and (state.rates is None or index < FIRST_LOOK)
+        state = _add_pass(state, chosen, index) if one_by_one else _add_passes(state, chosen, index, count)
         state.tiles.passes[chosen] += count
         passes -= count
         if state.history is not None:
@@ -116,6 +131,8 @@ def _passes_at_once(state: FrameState, chosen: Tensor, index: int, passes: int) 
         return 1
     if state.inputs.settings.target_error is not None:
         passes = min(passes, max(MIN_PASSES, 1 << index.bit_length()) - index)  # the next look
+    if state.plan.spread_places:
+        passes = min(passes, next_look(index) - index)
     if state.plan.candidates > 1:
         passes = min(passes, ROUNDS_KEPT)  # so that all slices find the same pools
     behind = state.tiles.passes[state.tiles.active & ~chosen]
@@ -129,6 +146,7 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
     primary = _primary_points(state, chosen, index, whole_first_pass)
     traced = time.perf_counter()
     _shade_and_add(state, _tracer(state, index), primary, index, state.first_rays if whole_first_pass else None)
+    count_places(state.sums, _pixels(state, chosen).long() - state.inputs.first_pixel, None, index, index + 1)
     if whole_first_pass and isinstance(state.view, MeshView):
         state = replace(state, view=MeshView(first_primary_points=primary))
     seconds = {"trace_primary": traced - started, "shade": time.perf_counter() - traced}
@@ -140,22 +158,31 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
     started = time.perf_counter()
     camera, seed, tracer = state.inputs.camera, state.inputs.settings.seed, _tracer(state, index)
     pixels = _pixels(state, chosen)
+    here = pixels.long() - state.inputs.first_pixel
+    rates = None if index < FIRST_LOOK or state.rates is None else state.rates[here]
+    places = state.sums.passes[here].int()
 
     def work(first: int, last: int) -> tuple[int, float, Tensor | None]:
-        points, tracing, at_once = 0, 0.0, max(1, PIXELS_AT_ONCE // (last - first))
+        own, so_far = None if rates is None else rates[first:last], places[first:last]
+        a_pass = last - first if own is None else int(own.sum()) // ONE
+        points, tracing, at_once = 0, 0.0, max(1, PIXELS_AT_ONCE // max(1, a_pass))
         at_once = min(at_once, POOLS_AT_ONCE) if state.plan.candidates > 1 else at_once
         for round_ in range(index, index + count, at_once):
             began = time.perf_counter()
-            together = min(at_once, index + count - round_)
-            primary = trace_primary_points(tracer, camera, seed, round_, pixels=pixels[first:last], passes=together)
+            end = min(round_ + at_once, index + count)
+            looks = list_looks(pixels[first:last], round_, end, own, so_far)
+            if own is not None:
+                so_far = so_far + places_between(own, round_, end)
+            primary = trace_primary_points(tracer, camera, seed, round_, pixels=looks.pixels, rounds=looks.rounds)
             tracing += time.perf_counter() - began
-            _shade_and_add(state, tracer, primary, round_ if primary.round is None else primary.round, None)
+            _shade_and_add(state, tracer, primary, looks, None)
             points += len(primary.points.pixel)
         return points, tracing, primary.starts.face
 
     fewest, most = (slices * thread_count() for slices in SLICES_A_THREAD)
     slices = min(max(fewest, 2 * len(pixels) * count // PIXELS_AT_ONCE), most)
     done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // slices)))
+    count_places(state.sums, here, None if rates is None else state.rates, index, index + count)
     traced = sum(seconds for _, seconds, _ in done) / max(1, min(thread_count(), len(done)))
     seconds = {"trace_primary": traced, "shade": max(0.0, time.perf_counter() - started - traced)}
     starts = torch.cat([faces for *_, faces in done if faces is not None])
@@ -177,7 +204,7 @@ def _primary_points(state: FrameState, chosen: Tensor, index: int, whole_first_p
 def _tracer(state: FrameState, index: int) -> AbstractTracer:
     """Of pass `index`. The first one does not wait for a second tree, which a shape that moves would need for every picture."""
     tracer = state.traced.tracer
-    return tracer.swift if index > 0 and state.inputs.settings.skip else tracer
+    return tracer.swift if index > 0 and state.plan.swift else tracer
 
 
 def _pixels(state: FrameState, chosen: Tensor) -> Tensor:
@@ -193,11 +220,21 @@ def points_in_tiles(primary: PrimaryPoints, tiles: Tensor, width: int, first_pix
 
 
 def _shade_and_add(
-    state: FrameState, tracer: AbstractTracer, primary: PrimaryPoints, index: int | Tensor, memory: RayMemory | None
+    state: FrameState,
+    tracer: AbstractTracer,
+    primary: PrimaryPoints,
+    looks: int | Looks,
+    memory: RayMemory | None,
 ) -> None:
-    """Light of the points of pass `index`, or of several passes, added to the sums of their pixels."""
-    integrator, light_there = choose_integrator(tracer), state.traced.environment_light
-    light = integrator.shade(primary.points, primary.starts, light_there, _how(state), index, memory, _horizon(state))
+    """Light of the points of one pass, or of several passes' looks, added to the sums of their pixels."""
+    integrator, light_there, how = choose_integrator(tracer), state.traced.environment_light, _how(state)
+    rounds: int | Tensor
+    if isinstance(looks, int):
+        rounds, pools = looks, None
+    else:
+        assert primary.ray is not None
+        rounds, pools = looks.rounds[primary.ray], looks.passes[primary.ray]
+    light = integrator.shade(primary.points, primary.starts, light_there, how, rounds, memory, _horizon(state), pool_rounds=pools)
     add_estimate(state.sums, primary, light, state.inputs.first_pixel)
 
 

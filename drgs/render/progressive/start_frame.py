@@ -78,6 +78,7 @@ def start_frame(
         view=view,
         tiles=Tiles(covered=covered, passes=torch.zeros_like(covered, dtype=torch.int64), active=covered.clone()),
         sums=no_sums(camera.width * inputs.height, inputs.primary == "mesh", settings.split_indirect, covered.device),
+        rates=None,
         first_rays=_first_rays(inputs, reuse),
         history=history,
         reprojected=None,
@@ -182,6 +183,7 @@ def _spend_samples(inputs: FrameInputs, empty_tiles: int, tiles: int, reuse: Reu
         settings.skip_error,
         counts_given=settings.counts is not None,
         moving=_is_moving(inputs, reuse),
+        spread_places=inputs.primary == "mesh" and settings.counts is None and scene.mesh.vertices.device.type == "cpu",
     )
 
 

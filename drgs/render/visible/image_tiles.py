@@ -88,13 +88,6 @@ def window_of_tiles(tiles: Tensor, width: int, height: int, top: int = 0) -> Win
     )
 
 
-def spread_over_pixels(of_tiles: Tensor, window: Window) -> Tensor:
-    """(rows, columns) of a window: the value of each pixel's tile (tile,)."""
-    across, down = tile_grid(window.width, window.height)
-    wide = of_tiles.view(down, across)[window.tiles].repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
-    return wide[: window.rows.stop - window.rows.start, : window.columns.stop - window.columns.start]
-
-
 def tile_grid(width: int, height: int) -> tuple[int, int]:
     """Tiles across and down.
 

@@ -12,6 +12,6 @@ def points_at(primary: PrimaryPoints, here: Tensor) -> PrimaryPoints:
     points = ShadingPoints(**{name: values[here] for name, values in vars(primary.points).items()})
     starts = primary.starts
     face = None if starts.face is None else starts.face[here]
-    barycentric, rounds = (None if values is None else values[here] for values in (primary.barycentric, primary.round))
+    barycentric, rays = (None if values is None else values[here] for values in (primary.barycentric, primary.ray))
     chosen = RayStarts(starts.origin_world[here], starts.surface_normal_world[here], face)
-    return replace(primary, points=points, starts=chosen, depth=primary.depth[here], barycentric=barycentric, round=rounds)
+    return replace(primary, points=points, starts=chosen, depth=primary.depth[here], barycentric=barycentric, ray=rays)

@@ -34,7 +34,7 @@ def primary_rays(
     world_from_camera: wp.mat33,
     center: wp.vec3,
     pixels: wp.array[int],
-    pixel_count: int,
+    rounds: wp.array[int],
     image_width: int,
     seed: wp.uint32,
     index: wp.uint32,
@@ -44,10 +44,13 @@ def primary_rays(
     direction: wp.array[wp.vec3],
 ):
     i = first + wp.tid()
-    pixel = pixels[i % pixel_count]
+    pixel = pixels[i]
+    number = index
+    if rounds.shape[0] > 0:
+        number = wp.uint32(rounds[i])
     x = pixel % image_width
     y = pixel // image_width
-    u = sobol_2d(index + wp.uint32(i / pixel_count), hash_combine(hash_combine(seed, wp.uint32(pixel)), wp.uint32(PRIMARY_STREAM)))
+    u = sobol_2d(number, hash_combine(hash_combine(seed, wp.uint32(pixel)), wp.uint32(PRIMARY_STREAM)))
     place = wp.vec3(float(x) + 0.5 + jitter * (u[0] - 0.5), float(y) + 0.5 + jitter * (u[1] - 0.5), 1.0)
     origin[i] = center
     direction[i] = wp.normalize(world_from_camera * (camera_from_pixel * place))
@@ -87,7 +90,7 @@ def surface_points(
     points.albedo[i] = surface.albedo
     points.roughness[i] = surface.roughness
     points.metallic[i] = surface.metallic
-    points.pixel[i] = pixels[r % pixels.shape[0]]
+    points.pixel[i] = pixels[r]
     starts.surface_normal[i] = surface.face_normal
     starts.origin[i] = surface.position + mesh.lift * surface.face_normal
     depth[i] = wp.dot(surface.position - center, view_axis)
@@ -103,26 +106,33 @@ def camera_rotations(camera: Camera) -> tuple[wp.mat33, wp.mat33]:
 
 
 def trace_primary_points(
-    tracer: AbstractTracer, camera: Camera, seed: int, pass_index: int, jitter: bool = True, pixels: Tensor | None = None, passes: int = 1
+    tracer: AbstractTracer,
+    camera: Camera,
+    seed: int,
+    pass_index: int,
+    jitter: bool = True,
+    pixels: Tensor | None = None,
+    rounds: Tensor | None = None,
 ) -> PrimaryPoints:
-    """One ray a pass through each pixel that may see the mesh.
+    """One ray through each pixel that may see the mesh, or through those that are listed.
 
     Args:
         jitter: False sends it through the pixel's centre.
-        pixels: (pixel,) int32, ascending; None: of all tiles that the mesh may be seen in.
-        passes: from `pass_index` on; points come pass after pass, `round` tells which.
+        pixels: (ray,) int32; None: of all tiles that the mesh may be seen in.
+        rounds: (ray,) int32, which of its pixel's places each looks through; None: place `pass_index` of all.
     """
     mesh, device = tracer.mesh, tracer.mesh.vertices.device
     if pixels is None:
         pixels = pixels_of_tiles(tiles_of_mesh(mesh, camera), camera.width, camera.height)
-    ray_count = passes * len(pixels)
+    ray_count = len(pixels)
     origin, direction = torch.empty(ray_count, 3, device=device), torch.empty(ray_count, 3, device=device)
     center, view_axis = wp.vec3(*camera.center_world.tolist()), wp.vec3(*camera.camera_from_world[2, :3].tolist())
     pixel_array = warp_array(pixels)
     launch(
         primary_rays,
         ray_count,
-        [*camera_rotations(camera), center, pixel_array, len(pixels), camera.width, wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
+        [*camera_rotations(camera), center, pixel_array, warp_array(pixels[:0] if rounds is None else rounds), camera.width,
+         wp.uint32(seed & 0xFFFFFFFF), wp.uint32(pass_index), float(jitter)],
         [warp_array(origin, wp.vec3), warp_array(direction, wp.vec3)],
         warp_device(origin),
     )  # fmt: skip
@@ -141,8 +151,7 @@ def trace_primary_points(
         [point_arrays(points), start_arrays(starts), warp_array(depth)],
         warp_device(origin),
     )  # fmt: skip
-    rounds = None if passes == 1 else (pass_index + ray // max(1, len(pixels))).int()
-    return PrimaryPoints(points, starts, depth, hits.barycentric[ray], rounds)
+    return PrimaryPoints(points, starts, depth, hits.barycentric[ray], None if rounds is None else ray)
 
 
 def trace_primary(

@@ -179,7 +179,7 @@ def test_kept_light_is_asked_where_enough_of_the_surface_is_diffuse(painted: flo
 def test_a_triangle_smaller_than_a_pixel_is_in_no_empty_tile() -> None:
     mesh = sphere_mesh(2, radius=0.02)
     frames = [
-        render_frame(PosedScene(None, mesh, constant_sky()), front_camera(64), RenderSettings(256, skip=skip)) for skip in (True, False)
+        render_frame(PosedScene(None, mesh, constant_sky()), front_camera(64), RenderSettings(16, skip=skip)) for skip in (True, False)
     ]
     assert "rays through empty tiles" in [skip["what"] for skip in frames[0].metadata["skipped"]]
     assert float(frames[0].gbuffer.coverage.sum()) > 0

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from drgs.render.film.resolve_frame import resolve_frame
-from drgs.render.integrate.plan import FEWER_RAYS, KEPT_LIGHT, PIXEL_MIDDLES, SWIFT_RAYS, moving_counts
+from drgs.render.integrate.plan import FEWER_RAYS, KEPT_LIGHT, PIXEL_MIDDLES, moving_counts
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.progressive.frame_state import FrameState
 from drgs.render.progressive.mean_radiance import moving_radiance
@@ -26,7 +26,7 @@ from tests.render.closed_form_scenes import front_camera, on_device, sphere_mesh
 
 SETTINGS = RenderSettings(samples_per_pass=16, denoise="svgf", keep_light=True)
 METAL = two_spheres(roughness=0.4, metallic=1.0)
-LEFT_OUT = {PIXEL_MIDDLES, SWIFT_RAYS, FEWER_RAYS, KEPT_LIGHT}
+LEFT_OUT = {PIXEL_MIDDLES, FEWER_RAYS, KEPT_LIGHT}
 
 
 def scene_of(mesh: TriangleMesh = METAL) -> PosedScene:
@@ -78,11 +78,11 @@ def test_what_a_moving_picture_leaves_out_is_named_and_a_first_picture_leaves_no
     scene, path = scene_of(), cameras(3)
     first, moving = moved_through(scene, path[:1]), moved_through(scene, path)
     assert not first.is_moving and not LEFT_OUT & set(first.plan.skips)
-    assert moving.is_moving and LEFT_OUT & set(moving.plan.skips) == {PIXEL_MIDDLES, SWIFT_RAYS, FEWER_RAYS}
+    assert moving.is_moving and LEFT_OUT & set(moving.plan.skips) == {PIXEL_MIDDLES, FEWER_RAYS}
     named = [skip["what"] for skip in resolve_frame(moving).metadata["skipped"]]
     assert PIXEL_MIDDLES.what in named and FEWER_RAYS.what in named
     few = moved_through(scene, path, dataclasses.replace(SETTINGS, samples_per_pass=4))
-    assert few.is_moving and LEFT_OUT & set(few.plan.skips) == {PIXEL_MIDDLES, SWIFT_RAYS}
+    assert few.is_moving and LEFT_OUT & set(few.plan.skips) == {PIXEL_MIDDLES}
 
 
 def test_a_moving_picture_sees_what_lies_in_the_middle_of_each_pixel() -> None:

@@ -1,0 +1,141 @@
+"""Where passes look: more often through pixels whose places differ, less often through those whose places agree.
+
+In: sums so far. Out: rates, and from them the camera rays of a pass. A pass costs about what it would cost without; which pixels it goes to is decided
+anew when passes have doubled, of each row of tiles by itself, so that a picture does not depend on its bands.
+
+What a pixel's own places have found has no part in how many it gets, or the mean would not stay exact: bright finds would be followed by more places than
+dark ones. Its neighbours decide, whose places know nothing of its own.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from drgs.render.progressive.frame_sums import DARK, FrameSums
+from drgs.render.visible.image_tiles import TILE, tile_grid
+
+FIRST_LOOK = 4
+"""Passes before rates are decided first; fewer say too little. Every rate has whole places in as many."""
+ONE = 4
+"""Rates are in quarters of a place a pass."""
+LEAST, MOST = 2, 32
+"""Rates are powers of two."""
+EMPTY_COST = 0.25
+"""Of a place that shows nothing, where one that shows a surface costs 1."""
+ROUNDS = 6
+"""Of the search for a row's scale, each of which corrects what rounding to powers of two has left."""
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """Camera rays of several passes, pass after pass."""
+
+    pixels: Int[Tensor, "ray"]
+    """int32, in the image."""
+    rounds: Int[Tensor, "ray"]
+    """int32, which of its pixel's places each looks through."""
+    passes: Int[Tensor, "ray"]
+    """int32, of which pass it is."""
+
+
+def is_look(index: int) -> bool:
+    """Whether rates are decided before pass `index`."""
+    return index >= FIRST_LOOK and index & (index - 1) == 0
+
+
+def next_look(index: int) -> int:
+    """The first pass behind `index` before which rates are decided."""
+    return max(FIRST_LOOK, 1 << index.bit_length())
+
+
+def last_look(index: int) -> int:
+    """The last one before which they were."""
+    return 1 << (index.bit_length() - 1)
+
+
+def decide_rates(sums: FrameSums, rates: Tensor | None, tiles: Tensor, width: int, height: int) -> Tensor:
+    """(pixel,) int32 rates of chosen tiles (tile,) bool after the sums so far; the others keep theirs.
+
+    Args:
+        rates: so far; None: a place of each pixel a pass.
+        width, height: of the frame [pixels].
+    """
+    if rates is None:
+        rates = torch.full_like(sums.passes, ONE, dtype=torch.int32)
+    across, down = tile_grid(width, height)
+
+    def rows(values: Tensor) -> Tensor:
+        """(row of tiles, row, column); 0 below the image."""
+        return torch.nn.functional.pad(values.view(height, width), (0, 0, 0, -height % TILE)).view(down, TILE, width)
+
+    chosen = tiles.view(down, 1, across).repeat_interleave(TILE, 2)[..., :width].expand(down, TILE, width)
+    count = rows(sums.passes).clamp(min=1)
+    mean = rows(sums.luminance) / count
+    variance = (rows(sums.luminance_squared) / count - mean * mean).clamp(min=0) * count / (count - 1).clamp(min=1)
+    found = rates_of_rows(mean, variance, rows(sums.weight) / count, chosen)
+    return torch.where(chosen, found, rows(rates)).view(-1, width)[:height].reshape(-1).contiguous()
+
+
+def rates_of_rows(mean: Tensor, variance: Tensor, covered: Tensor, chosen: Tensor) -> Tensor:
+    """(row of tiles, row, column) int32 rates in quarters. Least error for a row's cost: in proportion to a place's scatter over the root of its cost.
+
+    Args:
+        mean: (row of tiles, row, column) luminance. variance: of one place's. covered: share of the places that show a surface.
+        chosen: the pixels that share the cost.
+    """
+    # An error counts relative to what a pixel shows, which its neighbours only guess: where one of them is dark, it may be.
+    error = _of_neighbours(variance) * _of_neighbours(1.0 / (mean * mean + DARK))
+    cost = (EMPTY_COST + (1.0 - EMPTY_COST) * _of_neighbours(covered)) * chosen
+    wanted = torch.sqrt(error / cost.clamp(min=EMPTY_COST))
+    budget = cost.sum((1, 2), keepdim=True)
+    scale = budget / (cost * wanted).sum((1, 2), keepdim=True).clamp(min=1e-30)
+    for _ in range(ROUNDS):
+        scale = scale * budget / (cost * _powers_of_two(scale * wanted)).sum((1, 2), keepdim=True).clamp(min=1e-30)
+    rates = (ONE * _powers_of_two(scale * wanted)).int()
+    return torch.where((wanted * chosen > 0).any(2, keepdim=True).any(1, keepdim=True), rates, ONE)
+
+
+def _of_neighbours(values: Tensor) -> Tensor:
+    """Mean of the eight pixels around each one, as far as they lie in its row of tiles."""
+    sums = torch.nn.functional.avg_pool2d(values[:, None], 3, 1, 1, divisor_override=1)[:, 0] - values
+    count = torch.nn.functional.avg_pool2d(torch.ones_like(values[:1, None]), 3, 1, 1, divisor_override=1)[:, 0] - 1.0
+    return (sums / count.clamp(min=1)).clamp(min=0)
+
+
+def _powers_of_two(rates: Tensor) -> Tensor:
+    """The nearest that are allowed, of places a pass."""
+    return torch.exp2(torch.log2(rates.clamp(LEAST / ONE, MOST / ONE)).round())
+
+
+def places_between(rates: Tensor, first: int, last: int) -> Tensor:
+    """How many places pixels of these rates look through in the passes from `first` on, before `last`; no look lies between."""
+    begin = last_look(first)
+    return rates * (last - begin) // ONE - rates * (first - begin) // ONE
+
+
+def list_looks(pixels: Tensor, first: int, last: int, rates: Tensor | None, places: Tensor | None) -> Looks:
+    """The camera rays of the passes from `first` on, before `last`, through some pixels (pixel,) int32.
+
+    Args:
+        rates, places: (pixel,) int32 of these pixels, `places` before pass `first`; None: one place of each a pass.
+    """
+    parts = []
+    for index in range(first, last):
+        if rates is None or places is None:
+            parts.append((pixels, torch.full_like(pixels, index)))
+        else:
+            count = places_between(rates, index, index + 1).long()
+            begin = torch.cumsum(count, 0) - count
+            of_ray = torch.repeat_interleave(torch.arange(len(pixels)), count)
+            number = torch.arange(len(of_ray)) - begin[of_ray]
+            before = places + places_between(rates, first, index) if index > first else places
+            parts.append((pixels[of_ray], (before[of_ray] + number).int()))
+    passes = [torch.full_like(rounds, first + k) for k, (_, rounds) in enumerate(parts)]
+    return Looks(torch.cat([listed for listed, _ in parts]), torch.cat([rounds for _, rounds in parts]), torch.cat(passes))
+
+
+def count_places(sums: FrameSums, pixels: Tensor, rates: Tensor | None, first: int, last: int) -> None:
+    """Book the places of the passes from `first` on, before `last`, of pixels (pixel,) int64 of the frame, in place."""
+    sums.passes[pixels] += last - first if rates is None else places_between(rates[pixels], first, last)
