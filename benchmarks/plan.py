@@ -40,7 +40,7 @@ EMPTY, STRATEGY, MATERIAL, HORIZON, DARK, EDGES, PLACES = (
     "samples of strategies that",
     "tracing of rays",
     "light rays",
-    "tests that no ray",
+    "tests that no light ray",
     "places of pixels",
 )
 """How the plan's skips begin."""

@@ -131,7 +131,7 @@ class RenderPlan:
     kept_light: bool = False
     """It may read light that is kept on the mesh."""
     swift: bool = False
-    """Rays behind a first pass take the tree that tests no edges (plan.SWIFT_RAYS)."""
+    """Light rays behind a first pass take the tree that tests no edges (plan.SWIFT_RAYS)."""
     spread_places: bool = False
     """Passes look through more places of some pixels of a tile and fewer of others (spread_places.py)."""
 

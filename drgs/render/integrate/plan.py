@@ -51,9 +51,9 @@ FEWER_RAYS = Skip(
     "the noise of a quarter of the rays where the camera saw nothing before; none at rest, where all rays are traced",
 )
 SWIFT_RAYS = Skip(
-    "tests that no ray passes between triangles with a common edge",
+    "tests that no light ray passes between triangles with a common edge",
     "Embree is a fifth faster without",
-    "a ray through an edge may be lost: of a million rays on each of three assets not one; none in the first pass at rest, nor of a moving camera's own rays",
+    "a ray through an edge may be lost: of a million rays on each of three assets not one; none in the first pass at rest",
 )
 SPREAD_PLACES = Skip(
     "places of pixels whose places agree",

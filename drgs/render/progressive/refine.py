@@ -145,7 +145,7 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
     whole_first_pass = index == 0 and bool((chosen == state.tiles.covered).all())
     primary = _primary_points(state, chosen, index, whole_first_pass)
     traced = time.perf_counter()
-    _shade_and_add(state, _tracer(state, index), primary, index, state.first_rays if whole_first_pass else None)
+    _shade_and_add(state, _light_tracer(state, index), primary, index, state.first_rays if whole_first_pass else None)
     count_places(state.sums, _pixels(state, chosen).long() - state.inputs.first_pixel, None, index, index + 1)
     if whole_first_pass and isinstance(state.view, MeshView):
         state = replace(state, view=MeshView(first_primary_points=primary))
@@ -156,7 +156,7 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
 def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> FrameState:
     """Several passes over chosen tiles of a mesh, each thread with pixels of its own: nobody waits for the others between passes."""
     started = time.perf_counter()
-    camera, seed, tracer = state.inputs.camera, state.inputs.settings.seed, _tracer(state, index)
+    camera, seed, tracer = state.inputs.camera, state.inputs.settings.seed, _light_tracer(state, index)
     pixels = _pixels(state, chosen)
     here = pixels.long() - state.inputs.first_pixel
     rates = None if index < FIRST_LOOK or state.rates is None else state.rates[here]
@@ -173,7 +173,7 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
             looks = list_looks(pixels[first:last], round_, end, own, so_far)
             if own is not None:
                 so_far = so_far + places_between(own, round_, end)
-            primary = trace_primary_points(tracer, camera, seed, round_, pixels=looks.pixels, rounds=looks.rounds)
+            primary = trace_primary_points(state.traced.tracer, camera, seed, round_, pixels=looks.pixels, rounds=looks.rounds)
             tracing += time.perf_counter() - began
             _shade_and_add(state, tracer, primary, looks, None)
             points += len(primary.points.pixel)
@@ -198,11 +198,11 @@ def _primary_points(state: FrameState, chosen: Tensor, index: int, whole_first_p
     if whole_first_pass and view.first_primary_points is not None:
         return view.first_primary_points
     seed, pixels = state.inputs.settings.seed, _pixels(state, chosen)
-    return trace_primary_points(_tracer(state, index), camera, seed, index, pixels=pixels)
+    return trace_primary_points(state.traced.tracer, camera, seed, index, pixels=pixels)
 
 
-def _tracer(state: FrameState, index: int) -> AbstractTracer:
-    """Of pass `index`. The first one does not wait for a second tree, which a shape that moves would need for every picture."""
+def _light_tracer(state: FrameState, index: int) -> AbstractTracer:
+    """Of the light rays of pass `index`. The first one does not wait for a second tree, which a shape that moves would need for every picture."""
     tracer = state.traced.tracer
     return tracer.swift if index > 0 and state.plan.swift else tracer
 
