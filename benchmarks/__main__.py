@@ -4,6 +4,8 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+from drgs.openmp import spin_briefly
+
 HERE = Path(__file__).parent
 MODULES = {path.stem: path.stem for path in HERE.glob("*.py") if not path.stem.startswith("_")}
 MODULES |= {path.parent.name: f"{path.parent.name}.command" for path in HERE.glob("*/command.py")}
@@ -22,6 +24,7 @@ def main(arguments: list[str]) -> None:
         return
     if arguments[0] not in NAMES:
         raise ValueError(f"there is no benchmark {arguments[0]!r}; expected one of {', '.join(NAMES)}")
+    spin_briefly()  # as `drgs` does
     import_module(f"benchmarks.{MODULES[arguments[0]]}").main(arguments[1:])
 
 

@@ -30,7 +30,7 @@ ROUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """Camera rays of several passes, pass after pass."""
+    """Camera rays of several passes; of a pixel, pass after pass."""
 
     pixels: Int[Tensor, "ray"]
     """int32, in the image."""
@@ -116,24 +116,22 @@ def places_between(rates: Tensor, first: int, last: int) -> Tensor:
 
 
 def list_looks(pixels: Tensor, first: int, last: int, rates: Tensor | None, places: Tensor | None) -> Looks:
-    """The camera rays of the passes from `first` on, before `last`, through some pixels (pixel,) int32.
+    """The camera rays of the passes from `first` on, before `last`, through some pixels (pixel,) int32; no look lies between.
 
     Args:
         rates, places: (pixel,) int32 of these pixels, `places` before pass `first`; None: one place of each a pass.
     """
-    parts = []
-    for index in range(first, last):
-        if rates is None or places is None:
-            parts.append((pixels, torch.full_like(pixels, index)))
-        else:
-            count = places_between(rates, index, index + 1).long()
-            begin = torch.cumsum(count, 0) - count
-            of_ray = torch.repeat_interleave(torch.arange(len(pixels)), count)
-            number = torch.arange(len(of_ray)) - begin[of_ray]
-            before = places + places_between(rates, first, index) if index > first else places
-            parts.append((pixels[of_ray], (before[of_ray] + number).int()))
-    passes = [torch.full_like(rounds, first + k) for k, (_, rounds) in enumerate(parts)]
-    return Looks(torch.cat([listed for listed, _ in parts]), torch.cat([rounds for _, rounds in parts]), torch.cat(passes))
+    if rates is None or places is None:
+        passes = torch.arange(first, last, dtype=torch.int32, device=pixels.device).repeat_interleave(len(pixels))
+        return Looks(pixels.repeat(last - first), passes, passes)
+    count = places_between(rates, first, last).long()
+    of_ray = torch.repeat_interleave(torch.arange(len(pixels)), count)
+    number = torch.arange(len(of_ray)) - (torch.cumsum(count, 0) - count)[of_ray]
+    rate, begin = rates[of_ray], last_look(first)
+    # Place k behind a look comes in the first pass in which rate / ONE times the passes since that look reaches k.
+    kth = rate * (first - begin) // ONE + number.int() + 1
+    passes = begin - 1 + (ONE * kth + rate - 1) // rate
+    return Looks(pixels[of_ray], places[of_ray] + number.int(), passes)
 
 
 def count_places(sums: FrameSums, pixels: Tensor, rates: Tensor | None, first: int, last: int) -> None:
