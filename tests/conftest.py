@@ -5,12 +5,29 @@ there is none instead of passing by doing nothing.
 """
 
 import gc
+import os
 from collections.abc import Generator
 from typing import Any
 
 import pytest
 
-from tests.shape_checks import check_imports_of
+
+def load_blas_of_one_thread() -> None:
+    """NumPy's and SciPy's, which ask for their threads' number when they are loaded; what tests start is not told."""
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    import numpy.linalg
+    import scipy.linalg
+
+    assert numpy.linalg and scipy.linalg
+    del os.environ["OPENBLAS_NUM_THREADS"]
+
+
+# For each of the processes that share the tests, of which there are more than cores: after each product of matrices the others of its threads would look
+# for more on another core for 20 milliseconds.
+if "PYTEST_XDIST_WORKER" in os.environ and "OPENBLAS_NUM_THREADS" not in os.environ:
+    load_blas_of_one_thread()
+
+from tests.shape_checks import check_imports_of  # noqa: E402
 
 # Until all is imported and collected: what comes then stays, and looking through it for garbage takes a quarter of the time that it takes.
 gc.disable()

@@ -7,12 +7,12 @@ import sys
 
 import pytest
 
-from drgs.openmp import ASLEEP, SPINS, sleep_at_once, spin_briefly
+from drgs.openmp import ASLEEP, BLAS_ASLEEP, SPINS, sleep_at_once, spin_briefly
 
 
 @pytest.fixture(autouse=True)
 def nothing_set(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OPENBLAS_THREAD_TIMEOUT"):
         monkeypatch.setenv(name, "")  # so that what a test sets is undone
         monkeypatch.delenv(name)
 
@@ -22,6 +22,7 @@ def test_a_worker_does_not_keep_its_servers_choice() -> None:
     assert os.environ["GOMP_SPINCOUNT"] == ASLEEP
     spin_briefly()
     assert os.environ["GOMP_SPINCOUNT"] == SPINS
+    assert os.environ["OPENBLAS_THREAD_TIMEOUT"] == BLAS_ASLEEP
 
 
 @pytest.mark.parametrize(("name", "value"), [("OMP_WAIT_POLICY", "active"), ("GOMP_SPINCOUNT", "77")])
