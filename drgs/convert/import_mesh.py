@@ -32,6 +32,7 @@ from drgs.convert.sample_textures import Textures
 from drgs.exchange.gltf_accessors import open_gltf
 from drgs.exchange.ply import parse_ply, triangles_from_faces
 from drgs.maths.color import linear_from_srgb
+from drgs.maths.unique_rows import unique_rows
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
 from drgs.scene.asset import Asset
 from drgs.scene.environment import Environment
@@ -291,7 +292,8 @@ def _join_seams(part: _Part) -> _Part:
     low, high = part.vertices.min(0), part.vertices.max(0)
     places = (part.vertices - low) / ((high - low).max() or 1.0)  # in sizes of the part, so that its unit does not matter
     keys = places if part.normals is None else np.concatenate([places, part.normals], -1)
-    _, first, inverse = np.unique(np.round(keys.astype(np.float32), 6), axis=0, return_index=True, return_inverse=True)
+    inverse = unique_rows(torch.from_numpy(np.round(keys.astype(np.float32), 6)))[1].numpy()
+    first = np.unique(inverse, return_index=True)[1]
     order = np.argsort(first)  # keep the file's order
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
+from drgs.maths.unique_rows import unique_rows
 from drgs.scene.mesh import TriangleMesh
 
 AGGRESSIVENESS = 5
@@ -22,8 +23,8 @@ def shrink_mesh(mesh: TriangleMesh, most_faces: int) -> TriangleMesh:
         return mesh
     points = mesh.vertices.double().numpy()
     low, extent = points.min(0), max(float(np.ptp(points, axis=0).max()), 1e-12)
-    joined, place_of = np.unique(points, axis=0, return_inverse=True)
-    corners = place_of.reshape(-1)[mesh.faces.numpy()]
+    joined, place_of = (found.numpy() for found in unique_rows(torch.from_numpy(points)))
+    corners = place_of[mesh.faces.numpy()]
     # In a box of length 1: the library takes small areas for none.
     simple, faces = fast_simplification.simplify(
         ((joined - low) / extent).astype(np.float32), corners.astype(np.int32), target_count=most_faces, agg=AGGRESSIVENESS

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from drgs.maths.constants import UNBOUNDED
+from drgs.maths.unique_rows import unique_rows
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -111,8 +112,7 @@ def welded(vertices: Float[Tensor, "vertex 3"]) -> Int[ndarray, "vertex"]:
     """(vertex,) a number for each place: vertices at one place have one number."""
     where = vertices.double().cpu().numpy()
     extent = float(np.ptp(where, axis=0).max()) or 1.0
-    _, place = np.unique(np.round((where - where.min(0)) / (extent * 1e-6)).astype(np.int64), axis=0, return_inverse=True)
-    return place.reshape(-1)
+    return unique_rows(torch.from_numpy(np.round((where - where.min(0)) / (extent * 1e-6)).astype(np.int64)))[1].numpy()
 
 
 def _areas(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> Float[Tensor, "face"]:

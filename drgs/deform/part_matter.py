@@ -17,6 +17,7 @@ from torch import Tensor
 
 from drgs.deform.clip import Parted
 from drgs.deform.mpm.records import LAWS, Model
+from drgs.maths.unique_rows import unique_rows
 
 MOST_GRAINS = 50_000
 """Of a frame. With more particles every second, third, ... stands for its neighbours, and is as large as they together."""
@@ -211,5 +212,5 @@ def _covers(tree: cKDTree, vertices: NDArray, faces: NDArray, spacing: float) ->
             steps = np.array([(i, j, side - i - j) for i in range(side + 1) for j in range(side + 1 - i)]) / side
             own = tree.query(np.einsum("sc,fcx->fsx", steps, corners[chosen]))[1]
         pairs.append(np.stack([np.broadcast_to(chosen[:, None], own.shape), own], -1).reshape(-1, 2))
-    found = np.unique(np.concatenate(pairs), axis=0) if pairs else np.zeros((0, 2), np.int64)
+    found = unique_rows(torch.from_numpy(np.concatenate(pairs)))[0].numpy() if pairs else np.zeros((0, 2), np.int64)
     return found[:, 0], found[:, 1]

@@ -11,6 +11,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from drgs.maths.unique_rows import unique_rows
 from drgs.reconstruct.geometry.extract_mesh.records import MeshSettings
 
 TAUBIN_SHRINK, TAUBIN_GROW = 0.5, -0.53
@@ -120,8 +121,8 @@ def drop_degenerate(
     distinct = (triangles != np.roll(triangles, -1, 1)).all(1)
     triangles = triangles[distinct]
     # Two faces on the same three vertices enclose nothing: drop both, and what is left stays closed.
-    _, inverse, counts = np.unique(np.sort(triangles, 1), axis=0, return_inverse=True, return_counts=True)
-    return used_only(points, triangles[counts[inverse.reshape(-1)] == 1])
+    number = unique_rows(torch.from_numpy(np.sort(triangles, 1)))[1].numpy()
+    return used_only(points, triangles[np.bincount(number)[number] == 1])
 
 
 def used_only(
