@@ -134,12 +134,15 @@ MIDDLE_COLOR = """() => {
 
 
 def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], seconds: float = PATIENCE_SECONDS) -> Any:
-    """The first true answer of `condition`; fails, naming `what`, after that many seconds."""
-    deadline = time.monotonic() + seconds
+    """The first true answer of `condition`; fails, naming `what`, after that many seconds.
+
+    Who waits long asks more seldom: an answer takes the page, its driver and the test milliseconds each, which builds that are waited for want."""
+    begun = time.monotonic()
+    deadline = begun + seconds
     while not (answer := condition()):
         if time.monotonic() > deadline:
             pytest.fail(f"waited {seconds:g} s for {what() if callable(what) else what}")
-        time.sleep(0.05)
+        time.sleep(min(max(0.05, (time.monotonic() - begun) / 20), 0.5))
     return answer
 
 
