@@ -122,6 +122,30 @@ def test_photographs_lie_exactly_over_what_the_page_shows_from_their_cameras(cap
     wait_until(lambda: np.abs(captured.settled_picture() - before).mean() < 2, "the camera where it was")
 
 
+def test_on_a_phone_a_photograph_has_the_page_to_itself_below_the_bar_of_views(captured: Viewer) -> None:
+    page = captured.page
+    window = page.viewport_size
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.get_by_role("switch", name="Photographs, from their own cameras").click()  # which is gone then
+    page.wait_for_selector(".photograph[data-shown=true]")
+
+    def places() -> list[dict[str, float]]:
+        return [page.locator(which).bounding_box() for which in (".view-bar", ".photograph", ".hud")]
+
+    def apart() -> bool:
+        bar, picture, line = places()
+        return bar["y"] >= 44 and bar["y"] + bar["height"] <= picture["y"] + 1 and picture["y"] + picture["height"] <= line["y"] + 1
+
+    try:
+        expect(page.locator(".panel")).to_have_count(0)
+        wait_until(apart, lambda: f"bar, photograph and state one below the other: {places()}", 20)
+        assert places()[1]["width"] > 0.6 * 390
+        page.get_by_role("button", name="Leave the view").click()
+    finally:
+        page.set_viewport_size(window)
+        page.get_by_role("button", name="Inspector", exact=True).click()
+
+
 def test_a_photograph_fits_between_the_panels_and_fades_by_its_slider(captured: Viewer, photographs: list[np.ndarray]) -> None:
     captured.page.get_by_role("switch", name="Photographs, from their own cameras").check()
     captured.page.wait_for_selector(".photograph[data-shown=true]")

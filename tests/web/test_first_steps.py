@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, WebSocketRoute, expect
 
@@ -93,6 +94,33 @@ def test_on_a_phone_the_panels_leave_the_page_to_an_asset_that_was_opened(page: 
     to_library.click()
     to_inspector.click()
     expect(inspector).to_have_count(0)
+
+    # The object keeps its size and moves as what is free does; the line below the picture is whole.
+    line = shown.locator(".hud")
+    assert line.evaluate("line => line.scrollWidth <= line.clientWidth")
+    low, height = rows_of_the_ball(page)
+    to_inspector.click()
+    higher = (line.bounding_box()["y"] - inspector.bounding_box()["y"]) / 2
+    assert higher > 100
+    wait_until(
+        lambda: abs(low - rows_of_the_ball(page)[0] - higher) < NEARLY,
+        lambda: f"the ball above: {low}, {higher}, {rows_of_the_ball(page)}",
+        30,
+    )
+    assert abs(rows_of_the_ball(page)[1] - height) < NEARLY
+    to_inspector.click()
+    wait_until(lambda: abs(rows_of_the_ball(page)[0] - low) < NEARLY, lambda: f"the ball where it was: {low}, {rows_of_the_ball(page)}", 30)
+
+
+NEARLY = 16.0
+"""CSS pixels of the phone's 844."""
+
+
+def rows_of_the_ball(viewer: Viewer) -> tuple[float, float]:
+    """Where its colours begin, and how far down they go [CSS pixels]."""
+    picture = viewer.settled_picture()
+    rows = np.flatnonzero(((picture.max(-1) - picture.min(-1)) > 60).any(1)) * (PHONE["height"] / len(picture))
+    return float(rows[0]), float(rows[-1] - rows[0])
 
 
 def test_on_a_larger_screen_panels_stay_beside_an_asset_that_was_opened(page: Viewer, ball_asset: str) -> None:

@@ -132,10 +132,12 @@ def test_a_variant_is_kept_named_and_put_in_force_by_the_strip(ball: Viewer) -> 
     wait_until(lambda: [edit["name"] for edit in ball.edits() if edit["op"] == "variant"] == ["Gilt"], "the new name")
     expect(page.locator(".variants img")).to_have_count(2)
     plain, gilt = (
-        np.asarray(Image.open(io.BytesIO(picture.screenshot())).convert("RGB"), float).mean((0, 1))
-        for picture in page.locator(".variants img").all()
+        np.asarray(Image.open(io.BytesIO(picture.screenshot())).convert("RGB"), float) for picture in page.locator(".variants img").all()
     )
-    assert np.abs(plain - gilt).max() > 8, (plain, gilt)
+    assert np.abs(plain - gilt).mean((0, 1)).max() > 8
+    # The object itself: its red and its green third are there as captured, and all of it is gold.
+    red, green = ([(picture[..., one] > picture[..., other] + 40).mean() for picture in (plain, gilt)] for one, other in ((0, 1), (1, 0)))
+    assert red[0] > 0.1 and green[0] > 0.01 and green[1] == 0, (red, green)
     page.get_by_role("button", name="Apply captured materials").click()
     assert [edit["op"] for edit in ball.wait_for_edits(1)] == ["variant"]
     assert np.abs(np.subtract(ball.settled_color(), captured)).max() < TOO_SMALL_TO_SEE

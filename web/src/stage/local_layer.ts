@@ -10,7 +10,7 @@ import { capturedEnvironmentThumbnail, light } from '../edit/light';
 import { materialThumbnails, namedMaterials } from '../edit/material/presets';
 import { flash, selectionWeights } from '../edit/material/selection';
 import { materials } from '../edit/material/values';
-import { variantMeans, variantThumbnails } from '../edit/material/variants';
+import { variantMaterials, variantThumbnails } from '../edit/material/variants';
 import { mesh } from '../edit/mesh';
 import { pinWeights } from '../edit/shape/pins';
 import { shapeTool } from '../edit/shape/shape_tools';
@@ -23,6 +23,7 @@ import { before, localPicture, wireframe } from './switches';
 import * as api from '../session/api';
 
 const MATERIAL_PIXELS = 72;
+const VARIANT_PIXELS = 148;
 const SKY_PIXELS = 160;
 /** How long a selection shows, in two pulses. */
 const FLASH_MS = 1400;
@@ -161,7 +162,10 @@ export class LocalLayer {
       this.dirty = true;
     });
     effect(() => {
-      if (namedMaterials.value && variantMeans.value && mesh.value) this.drawMaterials();
+      if (namedMaterials.value && mesh.value) this.drawMaterials();
+    });
+    effect(() => {
+      if (variantMaterials.value) this.drawVariants();
     });
     effect(() => {
       const asset = openedAsset.value;
@@ -199,15 +203,23 @@ export class LocalLayer {
     }
     this.lit = this.dirty = true;
     this.drawMaterials();
+    this.drawVariants();
   }
 
   /** Thumbnails of materials under the present light. */
   private drawMaterials(): void {
     if (!this.picture || !this.lit) return;
-    const named = namedMaterials.value;
-    const pictures = this.picture.drawMaterials([...named, ...variantMeans.value], MATERIAL_PIXELS);
-    materialThumbnails.value = pictures.slice(0, named.length);
-    variantThumbnails.value = pictures.slice(named.length);
+    materialThumbnails.value = this.picture.drawMaterials(namedMaterials.value, MATERIAL_PIXELS);
     this.resize();
+  }
+
+  /** Thumbnails of the object in its variants, under the same. */
+  private drawVariants(): void {
+    const worn = variantMaterials.value;
+    if (worn.length === 0) variantThumbnails.value = [];
+    else if (this.picture && this.lit) {
+      variantThumbnails.value = this.picture.drawVariants(worn, VARIANT_PIXELS);
+      this.resize();
+    }
   }
 }

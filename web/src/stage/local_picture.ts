@@ -45,7 +45,7 @@ import { blurEnvironment, BLURRED_HEIGHT } from './blur_environment';
 import { lightTurn } from './camera/light_turn';
 import { drawsInSoftware, filterEnvironment } from './filter_environment';
 import { loadMesh, restGeometry } from './mesh_file';
-import { drawEnvironment, drawMaterials } from './thumbnails';
+import { drawEnvironment, drawMaterials, drawVariants } from './thumbnails';
 import { makeVertexMaterial, type HighlightUniforms } from './vertex_material';
 
 /** Of the mesh's edges: seen on black and on white. */
@@ -286,6 +286,13 @@ export class LocalPicture {
   drawMaterials(materials: MaterialMean[], side: number): string[] {
     this.ensureLight();
     return drawMaterials(this.renderer, this.scene.environment, materials, side);
+  }
+
+  /** Pictures of the object in each of these materials, likewise. */
+  drawVariants(worn: VertexMaterials[], side: number): string[] {
+    if (!this.rest) return [];
+    this.ensureLight();
+    return drawVariants(this.renderer, this.scene.environment, this.rest, worn, side);
   }
 
   /** Picture of the present environment; null where its texels cannot be read. */

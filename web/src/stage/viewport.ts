@@ -17,6 +17,7 @@ import { holdFrames, listen, openedAsset, sendCamera, session, settings } from '
 import { aimNow, aimOf, viewNow, viewOf, wantedAim, type View } from '../session/view';
 import { FlyControls } from './camera/fly_controls';
 import { frameBox } from './camera/framing';
+import { freeArea } from './camera/free_area';
 import { LookThrough } from './camera/look_through';
 import { screenPixelRatio } from './dynamic_resolution';
 import { Gizmo } from './gizmo';
@@ -44,6 +45,8 @@ export class Viewport {
   private readonly bounds = new Sphere(new Vector3(), 1);
   /** From the object to where the first picture is taken from. */
   private homeDirection: Vector3 | null = null;
+  /** How far down the middle of what no panel covers was when the object was last moved there [CSS pixels]. */
+  private freeMiddle = 0;
   /** The asset that was framed when it was opened. */
   private framedAsset = '';
   private readonly fly: FlyControls;
@@ -98,6 +101,17 @@ export class Viewport {
     if (this.homeDirection) this.showAll(this.homeDirection, true);
   }
 
+  /** Move the object to the middle of what is free now, as large as it is: on a phone panels take half of the picture, and give it back. */
+  keepClear(): void {
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    if (viewNumber.value !== null || !height) return; // a view of the capture keeps clear by itself
+    const { y } = freeArea(width, height);
+    const perPixel = (2 * this.controls.distance * Math.tan((this.camera.fov * Math.PI) / 360)) / height;
+    const offset = this.controls.getFocalOffset(new Vector3());
+    void this.controls.setFocalOffset(offset.x, offset.y - (y - this.freeMiddle) * perPixel, offset.z, true);
+    this.freeMiddle = y;
+  }
+
   /** The traced picture as PNG; null while there is none. */
   still(): Promise<Blob | null> {
     return this.traced.still();
@@ -111,6 +125,7 @@ export class Viewport {
     const { eye, center, focalOffset } = frameBox(this.box, direction, this.camera, { width, height });
     void this.controls.setLookAt(eye.x, eye.y, eye.z, center.x, center.y, center.z, smooth);
     void this.controls.setFocalOffset(focalOffset.x, focalOffset.y, 0, smooth);
+    this.freeMiddle = freeArea(width, height).y;
   }
 
   /** The camera is the controls' again, where it was before it looked through a view of the capture. */
@@ -173,6 +188,7 @@ export class Viewport {
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.local.resize();
+    this.freeMiddle = freeArea(width, height).y;
   };
 
   // ---- from the server ---------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ import { Hud } from './Hud';
 import { download } from './download';
 import { Icon } from './icons';
 import { Inspector } from './inspector/Inspector';
-import { helpOpen, inspectorShown, libraryOpen, theme, toggleInspector } from './layout';
+import { atView, helpOpen, inspectorShown, libraryOpen, onPhone, theme, toggleInspector } from './layout';
 import { CaptureDialog } from './library/CaptureDialog';
 import { Library, takeFiles } from './library/Library';
 import { LightsDialog } from './LightsDialog';
@@ -85,6 +85,11 @@ export function App() {
   useEffect(() => {
     document.documentElement.dataset.theme = theme.value;
   }, [theme.value]);
+
+  const covered = `${inspectorShown.value} ${libraryOpen.value} ${atView.value}`;
+  useEffect(() => {
+    if (onPhone.value) viewport.current?.keepClear();
+  }, [covered]);
 
   return (
     <>

@@ -36,12 +36,12 @@ export function Hud() {
               Sample {now.spp}/{now.spp_target}
             </span>
           )}
-          <span>
+          <span class="hud-size">
             {now.width}×{now.height}
             {scale}
           </span>
           <span>{now.frames_per_second.toFixed(now.frames_per_second < 10 ? 1 : 0)} fps</span>
-          <span>{now.render_ms.toFixed(0)} ms</span>
+          <span class="hud-cost">{now.render_ms.toFixed(0)} ms</span>
           {now.notes.length > 0 && (
             <span class="hud-notes" title={now.notes.join('\n')}>
               {now.notes.length === 1 ? now.notes[0] : `${now.notes.length} skips`}

@@ -1,6 +1,7 @@
 /** How the page is laid out: theme, open panels, the inspector's tab. */
 
 import { computed, effect, signal } from '@preact/signals';
+import { viewNumber } from '../capture/photographs';
 import { shapeToolsShown } from '../edit/shape/shape_tools';
 import { preference } from '../session/preferences';
 import { openedAsset } from '../session/session';
@@ -21,6 +22,12 @@ export function foldPanels(): void {
 }
 effect(() => {
   if (openedAsset.value !== null) foldPanels();
+});
+
+/** Whether the camera is held at a view of the capture, whose middle is the window's: on a phone panels would lie over its photograph. */
+export const atView = computed(() => viewNumber.value !== null);
+effect(() => {
+  if (atView.value) foldPanels();
 });
 
 /** Whether it is in sight: on a phone the library stands in its place. */

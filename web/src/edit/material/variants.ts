@@ -9,8 +9,8 @@ import { commitDraft, edits, reviseEdits } from '../../session/edit_log';
 import { notify } from '../../session/notices';
 import type { Edit, MaterialEdit, VariantEdit } from '../../session/protocol.gen';
 import { newKey } from '../gestures';
-import { mesh } from '../mesh';
-import { applyMaterials, meanMaterial, type MaterialMean } from './apply_materials';
+import { mesh, type VertexMaterials } from '../mesh';
+import { applyMaterials } from './apply_materials';
 
 /** What the strip calls the object without material edits; no variant is called so, nor as files call what is shown. */
 export const AS_CAPTURED = 'As captured';
@@ -28,18 +28,17 @@ export function variantsOf(now: Edit[]): Variant[] {
 const isMaterial = (edit: Edit): edit is MaterialEdit => edit.op === 'material';
 const keeps = (name: string) => (edit: Edit) => edit.op === 'variant' && edit.name === name;
 
-/** As text, which stays the same while other edits change: means of all variants are no work for every move of a slider. */
+/** As text, which stays the same while other edits change: pictures of all variants are no work for every move of a slider. */
 const written = computed(() => JSON.stringify(variantsOf(edits.value)));
 export const variants = computed(() => JSON.parse(written.value) as Variant[]);
 
-/** The mean material of each, without `mesh` none; the first is the object as captured. */
-export const variantMeans = computed<MaterialMean[]>(() => {
+/** What each is made of, without `mesh` none; the first is the object as captured. */
+export const variantMaterials = computed<VertexMaterials[]>(() => {
   const now = mesh.value;
   if (!now || variants.value.length === 0) return [];
-  const everywhere = new Float32Array(now.materials.roughness.length).fill(1);
-  return [[], ...variants.value.map(({ edits: worn }) => worn)].flatMap((worn) => meanMaterial(applyMaterials(now, worn), everywhere) ?? []);
+  return [now.materials, ...variants.value.map(({ edits: worn }) => applyMaterials(now, worn))];
 });
-/** Pictures of `variantMeans`, drawn with those of the presets. */
+/** Pictures of the object in `variantMaterials`, drawn with those of the presets. */
 export const variantThumbnails = signal<string[]>([]);
 
 /** Name of the one whose edits are in force; null where it is none of them. */

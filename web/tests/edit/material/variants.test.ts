@@ -1,5 +1,5 @@
 import { expect, it, vi } from 'vitest';
-import { addVariant, applyVariant, AS_CAPTURED, removeVariant, renameVariant, variantMeans, variants, variantShown, variantsOf } from '../../../src/edit/material/variants';
+import { addVariant, applyVariant, AS_CAPTURED, removeVariant, renameVariant, variantMaterials, variants, variantShown, variantsOf } from '../../../src/edit/material/variants';
 import { mesh } from '../../../src/edit/mesh';
 import { difference } from '../../../src/session/edit_list';
 import { attachStream, draft, log, resetLog } from '../../../src/session/edit_log';
@@ -56,11 +56,13 @@ it.each(['Two', '', ' ', 'a/b', AS_CAPTURED, 'As shown'])('the name %j is refuse
   notices.value = [];
 });
 
-it('means are of the whole object, the captured one first', () => {
+it('each is worn by every vertex, the captured materials come first', () => {
   mesh.value = strip();
-  inForce(rough(0.3), variant('Matt', rough(0.9)), variant('White', { ...rough(0), set: { albedo: [1, 1, 1] } }));
-  expect(variantMeans.value.map(({ roughness }) => Number(roughness.toFixed(3)))).toEqual([0.5, 0.9, 0.5]);
-  expect(variantMeans.value.map(({ albedo }) => Number(albedo[0].toFixed(3)))).toEqual([0.333, 0.333, 1]);
+  const black: MaterialEdit = { op: 'material', select: { box: { minimum: [3.5, -1, -1], maximum: [9, 2, 1] } }, set: { albedo: [0, 0, 0] }, mode: 'absolute' };
+  inForce(rough(0.3), variant('Matt', rough(0.9)), variant('Black', black));
+  const reds = variantMaterials.value.map(({ albedo }) => Array.from({ length: 6 }, (_, i) => albedo[3 * i]));
+  expect(reds).toEqual([[0, 0, 0, 0, 1, 1], [0, 0, 0, 0, 1, 1], [0, 0, 0, 0, 0, 0]]);
+  expect(variantMaterials.value.map(({ roughness }) => Number(roughness[0]!.toFixed(3)))).toEqual([0.5, 0.9, 0.5]);
 });
 
 it('a variant that leaves out what another says is another one, and defaults of the server are none', () => {

@@ -39,6 +39,7 @@ it.each([
   ['1280x720 with the library alone', { width: 1280, height: 720 }, DESKTOP, { left: 296, right: 1280, top: 44, bottom: 680 }],
   ['an upright tablet', { width: 768, height: 1024 }, { '.topbar': { bottom: 44 }, '.inspector': { left: 472 }, '.hud': { top: 984 } }, { left: 0, right: 472, top: 44, bottom: 984 }],
   ['a phone, whose panels lie below', { width: 390, height: 844 }, { '.topbar': { bottom: 44 }, '.panel': { top: 460 } }, { left: 0, right: 390, top: 44, bottom: 460 }],
+  ['a phone with the bar of views over the picture', { width: 390, height: 844 }, { '.topbar': { bottom: 44 }, '.view-bar': { top: 52, bottom: 90 }, '.panel': { top: 460 } }, { left: 0, right: 390, top: 90, bottom: 460 }],
   ['a bare 4K window', { width: 3840, height: 2160 }, {}, { left: 0, right: 3840, top: 0, bottom: 2160 }],
 ])('the whole object is in the free part of %s, from every side, and fills it', (_, window, covered, free) => {
   panels(covered);
