@@ -7,20 +7,24 @@ In: the bytes of an EXR, and of each GLB or USDZ with a camera. Out: RGBA as on 
 import base64
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import UInt8
+import torch
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import Image
 from playwright.sync_api import Browser, Route
+
+from drgs.maths.color import linear_from_srgb, srgb_from_linear
 
 ROOT = Path(__file__).resolve().parents[2]
 THREE = ROOT / "web" / "node_modules" / "three"
 PAGE = ROOT / "benchmarks" / "three_page.html"
 WAIT_MS = 120_000
+FINE = 4
 
 Map = Literal["aoMap", "normalMap"]
 """A texture, as three.js calls it, that a picture may do without."""
@@ -79,6 +83,15 @@ class ThreePage:
         del self._answers[path]
         data = self._page.evaluate("window.picture")
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGBA"))
+
+    def fine_picture(self, file: bytes, suffix: str, seen: SeenByThree) -> Float[ndarray, "height width 4"]:
+        """As `picture`, 0..255, of pixels that are means of FINE times as many each way, as ours are of many rays: three.js looks through the middle
+        of each, and makes surfaces rougher the more their normals turn from one to the next."""
+        finer = replace(seen, width=FINE * seen.width, height=FINE * seen.height)
+        drawn = torch.from_numpy(self.picture(file, suffix, finer).astype(np.float32) / 255)
+        linear = torch.cat([linear_from_srgb(drawn[..., :3]), drawn[..., 3:]], -1)
+        mean = linear.reshape(seen.height, FINE, seen.width, FINE, 4).mean((1, 3))
+        return 255 * torch.cat([srgb_from_linear(mean[..., :3]), mean[..., 3:]], -1).double().numpy()
 
     def close(self) -> None:
         self._page.close()
