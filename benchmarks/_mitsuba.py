@@ -1,35 +1,46 @@
-"""Mitsuba's path tracer on the scenes of the integrator benchmark, for comparing time and error in the same run.
+"""Mitsuba's path tracer: on the scenes of the integrator benchmark, for comparing time and error in the same run; and as a witness that is not ours.
 
 The project's BRDF is none of Mitsuba's, so it is written here as a Mitsuba plugin: the formulas of drgs/maths/brdf.py, sampled as Mitsuba
 samples its own (one lobe chosen by its share of the energy: visible GGX normals or the cosine). Dr.Jit compiles it together with
 Mitsuba's integrator; nothing of ours runs. Light is sampled by Mitsuba's environment map, both combined by its path integrator.
+A witness (`mitsuba_picture`) has Mitsuba's own principled BSDF instead, as the benchmark's scenes have.
 
 Needs `pip install mitsuba==3.9.1`, LLVM 19 and DRJIT_LIBLLVM_PATH (docs/performance.md).
 """
 
 import time
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from drgs.maths.color_numpy import srgb_from_linear
 from drgs.maths.constants import F0, MIN_ROUGHNESS
 from drgs.scene.camera import Camera, opengl_from_camera
 from drgs.scene.mesh import TriangleMesh
+
+Brdf = Literal["ours", "principled"]
 
 
 class MitsubaScene:
     """A mesh under an environment, seen by one camera. Final."""
 
-    def __init__(self, mesh: TriangleMesh, environment: np.ndarray, camera: Camera, bounces: int) -> None:
+    def __init__(
+        self, mesh: TriangleMesh, environment: np.ndarray, camera: Camera, bounces: int, turn_degrees: float = 0.0, brdf: Brdf = "ours"
+    ) -> None:
         """
+        Args:
+            turn_degrees: of the light, counter-clockwise seen from above.
+
         Raises:
             ValueError: Mitsuba or its LLVM variant is not there.
         """
         self._mi = mi = _mitsuba()
-        _register_brdf(mi)
+        if brdf == "ours":
+            _register_brdf(mi)
         size = camera.width
         world_from_camera = opengl_from_camera(camera).numpy() @ np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba looks along +z, x to the left
         y_up = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # of Mitsuba's environment maps
+        turn = mi.ScalarTransform4f().rotate([0, 0, 1], turn_degrees)
         fov_x = 2 * np.degrees(np.arctan(0.5 * size / float(camera.intrinsics[0, 0])))
         film = {
             "type": "hdrfilm", "width": size, "height": camera.height, "pixel_format": "rgba",
@@ -43,16 +54,29 @@ class MitsubaScene:
                     "type": "perspective", "fov": float(fov_x), "fov_axis": "x", "to_world": mi.ScalarTransform4f(world_from_camera),
                     "film": film, "sampler": {"type": "independent"},
                 },
-                "light": {"type": "envmap", "bitmap": mi.Bitmap(environment.astype(np.float32)), "to_world": mi.ScalarTransform4f(y_up)},
-                "object": _mitsuba_mesh(mi, mesh),
+                "light": {"type": "envmap", "bitmap": mi.Bitmap(environment.astype(np.float32)), "to_world": turn @ mi.ScalarTransform4f(y_up)},
+                "object": _mitsuba_mesh(mi, mesh, brdf),
             }
         )  # fmt: skip
 
     def render(self, samples: int, seed: int) -> tuple[np.ndarray, float, float]:
         """(height, width, 3) premultiplied linear picture, wall seconds, seconds summed over threads."""
         started, cpu_started = time.perf_counter(), time.process_time()
-        picture = np.array(self._mi.render(self._scene, spp=samples, seed=seed))
+        picture = self.render_rgba(samples, seed)
         return picture[..., :3], time.perf_counter() - started, time.process_time() - cpu_started
+
+    def render_rgba(self, samples: int, seed: int) -> np.ndarray:
+        """(height, width, 4) premultiplied linear colour, and coverage."""
+        return np.array(self._mi.render(self._scene, spp=samples, seed=seed))
+
+
+def mitsuba_picture(
+    mesh: TriangleMesh, environment: np.ndarray, camera: Camera, samples: int, bounces: int, turn_degrees: float = 0.0
+) -> np.ndarray:
+    """(height, width, 4) straight alpha, sRGB, 0..1: a witness of which nothing but the mesh and its materials is ours."""
+    picture = MitsubaScene(mesh, environment, camera, bounces, turn_degrees, "principled").render_rgba(samples, 0).astype(np.float64)
+    alpha = picture[..., 3:].clip(0, 1)
+    return np.concatenate([srgb_from_linear((picture[..., :3] / np.maximum(alpha, 1e-9)).clip(0, 1)), alpha], -1)
 
 
 def _mitsuba() -> Any:
@@ -69,9 +93,9 @@ def _mitsuba() -> Any:
     return mi
 
 
-def _mitsuba_mesh(mi: Any, mesh: TriangleMesh) -> Any:
+def _mitsuba_mesh(mi: Any, mesh: TriangleMesh, brdf: Brdf) -> Any:
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict({"type": "drgs_brdf"})
+    properties["bsdf"] = mi.load_dict({"type": "drgs_brdf"} if brdf == "ours" else _principled())
     result = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
     parameters = mi.traverse(result)
     parameters["vertex_positions"] = mi.Float(mesh.vertices.numpy().ravel())
@@ -81,6 +105,13 @@ def _mitsuba_mesh(mi: Any, mesh: TriangleMesh) -> Any:
     for name, values in (("albedo", mesh.albedo), ("roughness", mesh.roughness), ("metallic", mesh.metallic)):
         result.add_attribute(f"vertex_{name}", 3 if values.dim() == 2 else 1, values.numpy().ravel())
     return result
+
+
+def _principled() -> dict[str, Any]:
+    """Mitsuba's own, of the mesh's materials; its specular 0.5 is F0 = 0.04."""
+    textures = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
+    named = {name: {"type": "mesh_attribute", "name": f"vertex_{attribute}"} for name, attribute in textures.items()}
+    return {"type": "principled", "specular": 0.5, **named}
 
 
 def _register_brdf(mi: Any) -> None:

@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
@@ -47,6 +49,7 @@ from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
 from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.asset import Asset
+from drgs.scene.camera import Camera
 from drgs.scene.edits import DeformEdit, Edit, parse_edits
 from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.posed_scene import PosedScene
@@ -142,16 +145,26 @@ def static_table(dataset: Path, work: Path, preset_name: str, iterations: int, d
 
 def figures_of_fit(parameters: dict[str, Tensor], dataset: Path, radius: float) -> dict:
     """PSNR and SSIM on white over the capture's test views."""
-    pairs = []
-    with torch.no_grad():
-        tables = filter_environment(environment_table(parameters))
-        for camera in load_cameras(dataset / "transforms_test.json"):
-            maps = render_stage_one(parameters, tables, camera.to(parameters["centers"].device), near_plane(radius), 3)
-            rgba = torch.cat([srgb_from_linear(maps.radiance_linear).clamp(0, 1), maps.coverage.clamp(0, 1)[..., None]], -1)
-            with Image.open(dataset / "test" / f"{camera.name}.png") as picture:
-                pairs.append((rgba.double().cpu().numpy(), np.asarray(picture.convert("RGBA"), np.float64) / 255))
+    pairs, tables = [], tables_of_fit(parameters)
+    for camera in load_cameras(dataset / "transforms_test.json"):
+        with Image.open(dataset / "test" / f"{camera.name}.png") as picture:
+            pairs.append((picture_of_fit(parameters, tables, camera, radius), np.asarray(picture.convert("RGBA"), np.float64) / 255))
     figures = picture_figures(pairs)
     return {name: round(figures[name], 4) for name in ("psnr", "ssim")}
+
+
+@torch.no_grad()
+def tables_of_fit(parameters: dict[str, Tensor]) -> Float[Tensor, "texel 3"]:
+    """Of its light."""
+    return filter_environment(environment_table(parameters))
+
+
+@torch.no_grad()
+def picture_of_fit(parameters: dict[str, Tensor], tables: Float[Tensor, "texel 3"], camera: Camera, radius: float) -> NDArray[np.float64]:
+    """(height, width, 4) straight alpha, sRGB, 0..1, as the fit draws it."""
+    maps = render_stage_one(parameters, tables, camera.to(parameters["centers"].device), near_plane(radius), 3)
+    rgba = torch.cat([srgb_from_linear(maps.radiance_linear).clamp(0, 1), maps.coverage.clamp(0, 1)[..., None]], -1)
+    return rgba.double().cpu().numpy()
 
 
 def deform_table(dataset: Path, work: Path, preset: str, samples: int, all_lights: bool, device: str) -> dict:

@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from benchmarks._mitsuba import mitsuba_picture
 from benchmarks.measures.bench_scene import Array, BenchScene, open_scene, read_true_mesh, training_cameras
 from benchmarks.measures.embossed_urn import embossed_urn
 from benchmarks.measures.swap_parts import swapped_picture
@@ -36,6 +37,7 @@ from drgs.scene.environment import turned_environment
 from drgs.scene.load_environment import load_environment
 from drgs.scene.mesh import TriangleMesh
 
+Renderer = Literal["ours", "mitsuba"]
 BOUNCES = 4
 TEST_RAYS = 2
 """Rays of a test picture, for one of a photograph."""
@@ -103,6 +105,7 @@ def draw(
     folder: Path,
     samples: int,
     turn: Callable[[Camera], Float[Tensor, "3 3"]] | None = None,
+    renderer: Renderer = "ours",
 ) -> None:
     """RGBA pictures of the cameras' names into `folder`.
 
@@ -113,7 +116,10 @@ def draw(
     still = load_environment(light)
     for camera in cameras:
         environment = still if turn is None else turned_environment(still, turn(camera))
-        picture = swapped_picture(tracer, tracer, environment, camera, samples, BOUNCES)
+        if renderer == "mitsuba":
+            picture = mitsuba_picture(tracer.mesh, environment.radiance.numpy(), camera, samples, BOUNCES)
+        else:
+            picture = swapped_picture(tracer, tracer, environment, camera, samples, BOUNCES)
         Image.fromarray((255 * picture + 0.5).astype(np.uint8)).save(folder / f"{Path(camera.name).name}.png")
 
 
@@ -129,6 +135,7 @@ class Drawing:
     """Of the scene's photographs and test views, one in so many."""
     side: int | None = None
     """Of a picture [pixels]; None: as the scene's."""
+    renderer: Renderer = "ours"
 
 
 def draw_scene(
@@ -165,7 +172,7 @@ def draw_scene(
     for camera in tests:
         (out / "test").mkdir(exist_ok=True)
         np.savez_compressed(out / "test" / f"{Path(camera.name).name}_aov.npz", aov=true_maps(tracer, camera).astype(np.float16))
-    draw(tracer, tests[::2], new_light, out / "relight" / new_light.stem, TEST_RAYS * drawing.samples)
+    draw(tracer, tests[::2], new_light, out / "relight" / new_light.stem, TEST_RAYS * drawing.samples, None, drawing.renderer)
     draw_photographs(tracer, photographs, tests, light, out, drawing)
 
 
@@ -174,8 +181,8 @@ def draw_photographs(
 ) -> None:
     """Photographs and test views under their light, which is upright before the first photograph's camera if it turns."""
     turn = turns_with(photographs[0]) if drawing.turned else None
-    draw(tracer, tests, light, out / "test", TEST_RAYS * drawing.samples, turn)
-    draw(tracer, sorted(photographs, key=lambda camera: camera.name), light, out / "train", drawing.samples, turn)
+    draw(tracer, tests, light, out / "test", TEST_RAYS * drawing.samples, turn, drawing.renderer)
+    draw(tracer, sorted(photographs, key=lambda camera: camera.name), light, out / "train", drawing.samples, turn, drawing.renderer)
 
 
 def drawn_cameras(scene: BenchScene, drawing: Drawing) -> tuple[list[Camera], list[Camera]]:

@@ -5,8 +5,8 @@
 For each scene: an asset (built, or that of --assets), every way bound to it (variants/), test views at rest, deformed views under the light of the
 photographs and under a new one, time and memory, and figures. OUT gets index.html, paper.md and their pictures in images/paper; cells/ has what is finished,
 one file a cell, so that a killed run goes on. The scene `character` is ours: made, rigged and photographed on the spot (benchmarks/paper/character),
-and danced by its skeleton (figure dance). --only takes ways ({ways}), parts ({parts})
-and single figures ({figures}). --quick: drafts, few Gaussians, few rays, every second test view.
+and danced by its skeleton (figures dance, dance_ways); with --mitsuba that renderer takes the photographs and draws the truth of the dance. --only takes ways ({ways}), parts ({parts})
+and single figures ({figures}). --quick: drafts, few Gaussians, few rays, every second test view, every fourth frame of a dance.
 """
 
 import argparse
@@ -29,7 +29,9 @@ from benchmarks.paper.variants import VARIANTS
 from drgs.reconstruct.presets import PRESETS
 
 PARTS = ("static", "deformed", "figures")
-QUICK = EvidenceSettings(samples_per_pixel=32, budget=20_000, bake=BakeSettings(rounds=0), test_every=2)
+QUICK = EvidenceSettings(samples_per_pixel=32, budget=20_000, bake=BakeSettings(rounds=0), test_every=2, dance_every=4)
+QUICK_PHOTOGRAPH_RAYS = 32
+"""A pixel, of the character."""
 
 
 def main(arguments: list[str]) -> None:
@@ -47,6 +49,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--spp", type=int, help="rays a pixel of ways that trace them")
     parser.add_argument("--budget", type=int, help="Gaussians of ways that put them on faces of their own")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of builds")
+    parser.add_argument(
+        "--mitsuba", action="store_true", help="the character's photographs and its true dance by Mitsuba (benchmarks/_mitsuba.py)"
+    )
     parser.add_argument("--finished", action="store_true", help="make nothing: write the pages of what is finished")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
@@ -59,7 +64,9 @@ def main(arguments: list[str]) -> None:
         scene = open_scene(folder)
         return SceneEvidence(scene, asset_of(given, folder, scene.name), cells, settings)
 
-    folders = [scene_folder(folder, cells) for folder in given.scenes]
+    capture = CaptureSettings(samples=QUICK_PHOTOGRAPH_RAYS if given.quick else CaptureSettings.samples)
+    capture = replace(capture, renderer="mitsuba" if given.mitsuba else "ours")
+    folders = [scene_folder(folder, cells, capture) for folder in given.scenes]
     # Each scene's evidence anew for each part: what one has read is not another's memory.
     document = {open_scene(folder).name: scene_tables(evidence(folder), variants, parts) for folder in folders}
     wanted = [name for name in FIGURES if name in parts or "figures" in parts]
@@ -85,7 +92,7 @@ def settings_of(given: argparse.Namespace) -> EvidenceSettings:
     return settings
 
 
-def scene_folder(given: Path, cells: CellFolder) -> Path:
+def scene_folder(given: Path, cells: CellFolder, settings: CaptureSettings) -> Path:
     """The folder itself; for the character's name, where no folder has it, OUT/scenes/character, which is made.
 
     Raises:
@@ -93,7 +100,7 @@ def scene_folder(given: Path, cells: CellFolder) -> Path:
     """
     if given != Path(NAME) or given.is_dir():
         return given
-    folder, settings = cells.folder / "scenes" / NAME, CaptureSettings()
+    folder = cells.folder / "scenes" / NAME
 
     def make() -> dict:
         photograph(folder, settings)

@@ -3,7 +3,7 @@
 In: the evidence of a scene that says by which file it is rigged (character/photograph.py). Out: a strip, a film, a curve of errors over the clip, and a cell
 for each frame, so that a killed run goes on where it was. Ours is the built asset with two edits, as a user gives them: the light, turned, and the pose of
 the file's animation at a time, which the asset's own mesh follows (docs/rigs.md). The truth is the file's mesh, skinned as glTF says, with its own
-materials, normals from its moved triangles. Our renderer draws both; lights and rays are the same but in number.
+materials, normals from its moved triangles, drawn by who took the photographs: our renderer, where lights and rays are the same but in number, or Mitsuba.
 """
 
 import hashlib
@@ -17,8 +17,9 @@ import igl
 import numpy as np
 import torch
 
+from benchmarks._mitsuba import mitsuba_picture
 from benchmarks._plot import Curve, linear_svg
-from benchmarks.draw_scene import BOUNCES
+from benchmarks.draw_scene import BOUNCES, Renderer
 from benchmarks.measures.bench_scene import read_light, read_rgba
 from benchmarks.paper.cells import write_whole
 from benchmarks.paper.films import FPS, write_film
@@ -67,6 +68,8 @@ class RigFacts:
     clip: str
     light: str
     """Name of the environment that turns."""
+    renderer: Renderer = "ours"
+    """Who took the photographs and draws the truth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +109,26 @@ class Dance:
         """The last of the animation, which is the first, is left out."""
         return round(self.animation.duration * FPS)
 
+    @property
+    def places(self) -> range:
+        """Those that are drawn."""
+        return range(0, self.frames, self.evidence.settings.dance_every)
+
+    @property
+    def held(self) -> range:
+        """Those that are drawn standing as well."""
+        return range(0, self.frames, HELD_EVERY)
+
     def degrees(self, place: int) -> float:
         """How far the light is turned: once around in all."""
         return 360 * place / self.frames
 
-    def picture_path(self, kind: Kind, whose: Owner, place: int) -> Path:
+    def picture_path(self, kind: Kind, whose: str, place: int) -> Path:
         return self.evidence.cells.folder / "pictures" / self.evidence.scene.name / kind / whose / f"{place:03d}.png"
 
-    def read_pair(self, kind: Kind, place: int) -> Pair:
+    def read_pair(self, kind: Kind, place: int, whose: str = "ours") -> Pair:
         """(height, width, 4) each, as 8-bit files hold them."""
-        return read_rgba(self.picture_path(kind, "ours", place)), read_rgba(self.picture_path(kind, "truth", place))
+        return read_rgba(self.picture_path(kind, whose, place)), read_rgba(self.picture_path(kind, "truth", place))
 
 
 def rig_facts(evidence: SceneEvidence) -> RigFacts | None:
@@ -138,40 +151,41 @@ def dance(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) 
     facts = rig_facts(evidence)
     assert facts is not None
     shown = Dance(evidence, facts)
-    places = range(shown.frames)
-    held = [place for place in places if place % HELD_EVERY == 0]
+    places, held = shown.places, shown.held
     off = [frame_cell(shown, place)["surface_off"] for place in places]
     pictures = {kind: Pictures(shown, kind, light_scale([shown.read_pair(kind, place) for place in held])) for kind in KINDS}
-    dancing = [scored(*pictures["dancing"].on_white(place)) for place in places]
+    dancing = {place: scored(*pictures["dancing"].on_white(place)) for place in places}
     standing = [scored(*pictures["standing"].on_white(place)) for place in held]
     write_pictures(pictures["dancing"], dancing, path)
     curves = [
-        Curve("dancing", [(place / FPS, score.psnr) for place, score in zip(places, dancing, strict=True)]),
+        Curve("dancing", [(place / FPS, score.psnr) for place, score in dancing.items()]),
         Curve("standing", [(place / FPS, score.psnr) for place, score in zip(held, standing, strict=True)]),
     ]
     plot = linear_svg(curves, f"{facts.clip} under {facts.light}, which turns once", "seconds", "PSNR [dB]")
     write_whole(path.with_suffix(".svg"), plot.encode())
     figures = {
-        "PSNR, mean of all frames": float(np.mean([score.psnr for score in dancing])),
-        "worst frame": min(score.psnr for score in dancing),
+        "PSNR, mean of all frames": float(np.mean([score.psnr for score in dancing.values()])),
+        "worst frame": min(score.psnr for score in dancing.values()),
         "mean standing under the same lights": float(np.mean([score.psnr for score in standing])),
-        "SSIM, mean of all frames": float(np.mean([score.ssim for score in dancing])),
+        "SSIM, mean of all frames": float(np.mean([score.ssim for score in dancing.values()])),
         "mean standing": float(np.mean([score.ssim for score in standing])),
         "vertices off the true surface, in per cent of its height, at rest": off[0],
         "mean of all frames": float(np.mean(off)),
         "largest": max(off),
     }
-    caption = (
-        f"{facts.clip} of {shown.frames} frames under {facts.light} (new light), which turns once around; our own renderer drew the truth"
-    )
+    drawn_by = "Mitsuba took the photographs and drew" if facts.renderer == "mitsuba" else "our own renderer drew"
+    caption = f"{facts.clip} of {len(places)} frames under {facts.light} (new light), which turns once around; {drawn_by} the truth"
     told = {"caption": caption, "figures": figures, "film_shows": f"truth, ours, {DIFFERENCE_GAIN:g} times their difference"}
-    return told | {"psnr": [round(score.psnr, 3) for score in dancing], "ssim": [round(score.ssim, 4) for score in dancing]}
+    return told | {
+        "psnr": [round(score.psnr, 3) for score in dancing.values()],
+        "ssim": [round(score.ssim, 4) for score in dancing.values()],
+    }
 
 
 def frame_cell(shown: Dance, place: int) -> dict:
     """A frame's pictures, in files; and how far our vertices are from the true surface."""
     evidence = shown.evidence
-    kinds = KINDS if place % HELD_EVERY == 0 else KINDS[:1]
+    kinds = KINDS if place in shown.held else KINDS[:1]
     files = [shown.picture_path(kind, whose, place) for kind in kinds for whose in OWNERS]
 
     def make() -> dict:
@@ -180,7 +194,7 @@ def frame_cell(shown: Dance, place: int) -> dict:
             ours, truth = posed_pair(shown, kind, place)
             rays = evidence.settings.samples_per_pixel
             draw(ours, shown.camera, RenderSettings(rays, bounces=STILL_BOUNCES), shown.picture_path(kind, "ours", place))
-            draw(truth, shown.camera, RenderSettings(TRUTH_RAYS * rays, bounces=BOUNCES), shown.picture_path(kind, "truth", place))
+            draw_truth(shown, truth, TRUTH_RAYS * rays, shown.picture_path(kind, "truth", place))
             off[kind] = surface_off(ours.mesh, truth.mesh)
         return {"surface_off": off["dancing"]}
 
@@ -220,18 +234,31 @@ def draw(scene: PosedScene, camera: Camera, settings: RenderSettings, path: Path
     part.replace(path)
 
 
+def draw_truth(shown: Dance, scene: PosedScene, rays: int, path: Path) -> None:
+    """By who took the photographs."""
+    if shown.facts.renderer == "ours":
+        draw(scene, shown.camera, RenderSettings(rays, bounces=BOUNCES), path)
+        return
+    light, degrees = scene.environment.radiance.numpy(), scene.environment_rotation_degrees
+    picture = torch.from_numpy(mitsuba_picture(scene.mesh, light, shown.camera, rays, BOUNCES, degrees))
+    part = path.with_name(f"{path.stem}.part.png")
+    write_picture(picture, part)
+    part.replace(path)
+
+
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Of all frames of a kind, ours after one factor a channel, since nobody can tell dark paint from dim light."""
+    """Of all frames of a kind, drawn after one factor a channel, since nobody can tell dark paint from dim light."""
 
     shown: Dance
     kind: Kind
     scale: Array
     """(3,)"""
+    whose: str = "ours"
 
     def on_white(self, place: int) -> Pair:
         """(height, width, 3) each."""
-        ours, truth = self.shown.read_pair(self.kind, place)
+        ours, truth = self.shown.read_pair(self.kind, place, self.whose)
         color = srgb_from_linear(np.clip(linear_from_srgb(ours[..., :3]) * self.scale, 0, 1))
         return on_white(np.concatenate([color, ours[..., 3:]], -1)), on_white(truth)
 
@@ -249,9 +276,9 @@ def scored(ours: Array, truth: Array) -> FrameScore:
     return FrameScore(psnr(ours, truth), ssim(ours, truth))
 
 
-def write_pictures(pictures: Pictures, scores: list[FrameScore], path: Path) -> None:
-    """The strip and the film."""
-    frames = (pictures.shown.read_pair(pictures.kind, place) for place in range(len(scores)))
+def write_pictures(pictures: Pictures, scores: dict[int, FrameScore], path: Path) -> None:
+    """The strip, and the film, which shows each frame for as long as it stands for."""
+    frames = (pictures.shown.read_pair(pictures.kind, place) for place in scores)
     # One at a time: all of them together would be a gigabyte.
     window = object_window([reduce(np.maximum, (picture[..., 3].copy() for pair in frames for picture in pair))])
 
@@ -261,6 +288,8 @@ def write_pictures(pictures: Pictures, scores: list[FrameScore], path: Path) -> 
         named = ((f"truth, {place / FPS:.2f} s", truth), (f"ours, {scores[place].psnr:.1f} dB", ours))
         return [*named, (f"{DIFFERENCE_GAIN:g} x difference", difference)]
 
-    columns = [titled(place) for place in STRIP if place < len(scores)]
+    every = pictures.shown.places.step
+    columns = [titled(place // every * every) for place in STRIP if place < pictures.shown.frames]
     sheet([[column[row] for column in columns] for row in range(3)], path)
-    write_film((film_picture([titled(place)]) for place in range(len(scores))), path.with_suffix(".mp4"), back=False)
+    film = (picture for place in scores for picture in every * [film_picture([titled(place)])])
+    write_film(film, path.with_suffix(".mp4"), back=False)

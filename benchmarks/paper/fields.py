@@ -10,8 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drgs.deform.drive_mesh import drive_points, vertex_gradients
 from drgs.deform.maps import evaluate_map
+from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
 from drgs.scene.edits import DeformEdit, parse_edits
+from drgs.scene.mesh import TriangleMesh
 
 Field = Callable[[Tensor], tuple[Tensor, Tensor]]
 
@@ -30,6 +33,16 @@ def field_of_map(analytic: dict) -> Field:
     (edit,) = parse_edits([{"op": "deform", "map": analytic}])
     assert isinstance(edit, DeformEdit) and edit.map is not None
     return partial(evaluate_map, edit.map)
+
+
+def field_of_moved_mesh(rest: TriangleMesh, moved: Float[Tensor, "vertex 3"]) -> Field:
+    """Near a mesh whose vertices moved: points keep their place relative to the closest one of its surface at rest, as our own surfels do."""
+    gradients = vertex_gradients(rest.vertices, moved, rest.faces)
+
+    def move(points: Tensor) -> tuple[Tensor, Tensor]:
+        return drive_points(rest.vertices, moved, rest.faces, gradients, bind_gaussians(points, rest), points)
+
+    return move
 
 
 def rigid_field(rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]) -> Field:

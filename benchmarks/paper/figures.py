@@ -6,7 +6,7 @@ of the first camera that has a deformed truth.
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +17,21 @@ from torch import Tensor
 from benchmarks.measures.bench_scene import has_true_maps, read_light, read_rgba, read_true_maps
 from benchmarks.measures.peak_memory import measured
 from benchmarks.paper.cells import NotMade
+from benchmarks.paper.danced_ways import dance_ways
 from benchmarks.paper.dances import asked_of_dance, dance, rig_facts
+from benchmarks.paper.fields import field_of_map
 from benchmarks.paper.films import shares, write_film
 from benchmarks.paper.laws import laws, rgba_of
+from benchmarks.paper.poor_mesh import checkpoints, poor_mesh
 from benchmarks.paper.sheets import Array, halved, object_window, sheet
 from benchmarks.paper.tables import SceneEvidence
 from benchmarks.paper.variant import AbstractVariant
+from benchmarks.paper.wires import with_wires
 from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.metrics import normal_error_degrees, on_white, psnr
 from drgs.maths.color_numpy import srgb_from_linear
 from drgs.maths.constants import STILL_BOUNCES
+from drgs.reconstruct.geometry.mesh_from_gaussians import reduced_mesh
 from drgs.render.records import Frame, RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.camera import Camera
@@ -47,6 +52,8 @@ FALL = {"time": 0.4, "speed": 1.5}
 """When the pictures of matter are taken [s], and how fast the object arrives [world units/s]."""
 PARTICLES_SHARE = 1 / 12
 """Of the budget: how many particles the falling object has."""
+WIRE_FACES = 3000
+"""Of the mesh whose edges are drawn over pictures."""
 AMOUNTS = {"rate": 0.0, "curvature": 0.0, "factor": 1.0}
 """Of maps, and their value at rest."""
 STRIP = (0, 8, 12, 16, 24)
@@ -68,11 +75,23 @@ def deformed(evidence: SceneEvidence, variants: list[AbstractVariant], path: Pat
     for variant in variants:
         file = evidence.pictures(variant) / folder / f"{name}.png"
         drawn.append((variant.title, read_rgba(file)))
-    window = object_window([picture[..., 3] for _, picture in drawn])
-    cut = [(title, on_white(picture)[window]) for title, picture in drawn]
+    at_rest = read_rgba(evidence.scene.folder / "test" / f"{name}.png")
+    window = object_window([picture[..., 3] for _, picture in [("", at_rest), *drawn]])
+    white = [(title, on_white(picture)) for title, picture in drawn]
+    cut = [(title, picture[window]) for title, picture in [*wired(evidence, folder.parent.name, on_white(at_rest), white[0][1]), *white]]
     middle = -(-len(cut) // 2)
     sheet([row for row in (cut[:middle], cut[middle:]) if row], path)
     return {"caption": f"{folder.parent.name} under {folder.name}" + (" (new light)" if new_light else " (light of the photographs)")}
+
+
+def wired(evidence: SceneEvidence, deformation: str, at_rest: Array, deformed: Array) -> list[tuple[str, Array]]:
+    """The truth at rest and deformed, with the edges of our mesh, thinned out, over it."""
+    mesh, camera = evidence.subject.asset.mesh, camera_of(evidence)
+    radius = 0.5 * float((mesh.vertices.amax(0) - mesh.vertices.amin(0)).norm())
+    thinned = reduced_mesh(mesh, WIRE_FACES, radius)
+    moved = replace(thinned, vertices=field_of_map(evidence.deformations[deformation])(thinned.vertices)[0].contiguous())
+    pictures = (("at rest, our mesh over it", at_rest, thinned), ("deformed, our mesh over it", deformed, moved))
+    return [(title, with_wires(picture, wires, camera)) for title, picture, wires in pictures]
 
 
 def materials(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path) -> dict:
@@ -228,15 +247,18 @@ FIGURES: dict[str, tuple[Figure, bool]] = {
     "comparison_relit": (lambda evidence, variants, path: deformed(evidence, variants, path, True), False),
     "materials": (materials, False),
     "inter_reflection": (inter_reflection, False),
+    "poor_mesh": (poor_mesh, False),
     "normals_and_light": (normals_and_light, True),
     "material_maps": (material_maps, True),
     "strip": (strip, False),
     "matter": (matter, False),
     "laws": (laws, False),
     "dance": (dance, False),
+    "dance_ways": (dance_ways, False),
 }
 """By name, and whether the figure needs the scene's true maps."""
 COMPARISONS = ("comparison", "comparison_relit")
+DANCES = ("dance", "dance_ways")
 BESIDE = {"strip": {"film": ".mp4"}, "laws": {"film": ".mp4"}, "dance": {"film": ".mp4", "curve": ".svg"}}
 """What figures write beside their picture, and its suffix."""
 
@@ -256,8 +278,8 @@ def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant], wante
                 told, cost = measured(lambda: figure(evidence, variants, path))
             return told | named | {"cost": asdict(cost)}
 
-        asked = evidence.asked | ({"ways": [variant.name for variant in variants]} if name in COMPARISONS else {})
-        asked = asked_of_dance(evidence) if name == "dance" else asked
+        asked = asked_of_dance(evidence) if name in DANCES else evidence.asked
+        asked = asked | ({"ways": [variant.name for variant in variants]} if name in (*COMPARISONS, "dance_ways") else {})
         with suppress(NotMade):
             found[name] = evidence.cells.cell(f"{evidence.scene.name}-figure-{name}", asked, make, list(files.values()))
     return found
@@ -265,8 +287,10 @@ def figure_cells(evidence: SceneEvidence, variants: list[AbstractVariant], wante
 
 def has_truth_for(evidence: SceneEvidence, name: str) -> bool:
     """Whether the scene has what a figure is about."""
-    if name == "dance":
+    if name in DANCES:
         return rig_facts(evidence) is not None
+    if name == "poor_mesh":
+        return all(file.is_file() for file in checkpoints(evidence))
     if not evidence.truths() or (FIGURES[name][1] and not (has_true_maps(evidence.scene) and evidence.scene.training_light)):
         return False
     if name == "strip":

@@ -22,11 +22,10 @@ Figures of the paper itself are of other scenes and of other code, and are not b
 """
 MISSING = """## What is not here yet
 - LPIPS: its weights come with no package that we install; PSNR and SSIM only.
-- Deformed truth is of analytic maps (bend, twist), drawn by Mitsuba, and of one character that is our own, drawn by our renderer: photographs and truth of
-  its dance are no independent witness of how light is computed, only of what capturing, building and moving lose. The other ways are not danced.
-- What is simulated is shown, and of sand it is said how far its picture is from balls of its particles' volume; no truth of a real fall is there. Wire
-  frames over Fig. 3 are missing.
-- Learnable offset and opacity (Fig. 9) are a table of their own: `python -m benchmarks binding` ([results](../benchmarks/README.md)).
+- Deformed truth is of analytic maps (bend, twist, stretch), drawn by Mitsuba, and of one character that is our own. With `--mitsuba` its photographs and the
+  truth of its dance are Mitsuba's; without, our renderer draws both, and is no witness of how light is computed.
+- What is simulated is shown, and of sand it is said how far its picture is from balls of its particles' volume; no truth of a real fall is there.
+- Wire frames (Fig. 3) are of our mesh, thinned out, over the truth; the other ways' meshes are ours with fewer faces.
 - The other systems' geometry is ours, which is generous to them, and their barycentrics, scales, offsets and opacities are not learned through pictures, which
   is not. Harmonics are solved by least squares, not by tens of thousands of steps.
 """
@@ -175,9 +174,9 @@ def figures(document: dict) -> str:
             told = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in cell.get("figures", {}).items())
             film = f"[Film: {cell.get('film_shows', 'there and back')}]({cell['film']})\n" if "film" in cell else ""
             curve = f"![Error of each frame]({cell['curve']})\n" if "curve" in cell else ""
-            parts.append(
-                f"### {scene}: {cell['caption']}\n![{scene}: {cell['caption']}]({cell['picture']})\n{film}{curve}{told + '. ' if told else ''}{made_by(cell)}\n"
-            )
+            table = f"\n{markdown_table(cell['rows'], list(cell['rows'][0]))}\n\n" if "rows" in cell else ""
+            shown = f"![{scene}: {cell['caption']}]({cell['picture']})\n{film}{curve}{table}"
+            parts.append(f"### {scene}: {cell['caption']}\n{shown}{told + '. ' if told else ''}{made_by(cell)}\n")
     return "\n".join(["## Figures", *parts]) if parts else ""
 
 

@@ -39,6 +39,8 @@ class EvidenceSettings:
     bake: BakeSettings = field(default_factory=BakeSettings)
     test_every: int = 1
     """Only every so many-th test view is drawn at rest."""
+    dance_every: int = 1
+    """Only every so many-th frame of a dance is drawn; a divisor of dances.HELD_EVERY."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,17 +52,32 @@ def drive_surfels(
         variant: paper: Eq. 8 of drgs2026 as printed. Centres move by the mean of the corners' displacements, so the offset along the
             normal does not turn; rotations and stretches of the corners are averaged as matrices, then Eq. 7. For comparison.
     """
-    corners = faces.long()[binding.face.long()]
-    weights = binding.barycentric[..., None]
     if variant == "paper":
+        corners = faces.long()[binding.face.long()]
+        weights = binding.barycentric[..., None]
         rotation, stretch = _polar(gradients)
         blended = (rotation[corners] * weights[..., None]).sum(1)
         lengths = torch.linalg.eigvalsh((stretch[corners] * weights[..., None]).sum(1).double()).abs().to(tangents.dtype)  # ascending
         scale = torch.stack([lengths[:, 1], lengths[:, 0]], -1)
         return centers + ((moved - vertices)[corners] * weights).sum(1), blended @ tangents * scale[:, None]
+    places, gradient = drive_points(vertices, moved, faces, gradients, binding, centers)
+    return places, carry_tangents(tangents, gradient)
+
+
+def drive_points(
+    vertices: Float[Tensor, "vertex 3"],
+    moved: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    gradients: Float[Tensor, "vertex 3 3"],
+    binding: Binding,
+    points: Float[Tensor, "point 3"],
+) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3 3"]]:
+    """Moved points and F there, of points bound to the mesh."""
+    corners = faces.long()[binding.face.long()]
+    weights = binding.barycentric[..., None]
     gradient = (gradients[corners] * weights[..., None]).sum(1)
     foot, foot_moved = (vertices[corners] * weights).sum(1), (moved[corners] * weights).sum(1)
-    return foot_moved + (gradient @ (centers - foot)[..., None]).squeeze(-1), carry_tangents(tangents, gradient)
+    return foot_moved + (gradient @ (points - foot)[..., None]).squeeze(-1), gradient
 
 
 def _polar(gradients: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:

@@ -19,11 +19,15 @@ from benchmarks.paper.character.photograph import FILE, CaptureSettings, photogr
 from benchmarks.paper.character.rigged_glb import CLIP
 from benchmarks.paper.command import asset_of, scene_folder
 from benchmarks.paper.figures import figure_cells
+from benchmarks.paper.harmonics import BakeSettings
 from benchmarks.paper.tables import EvidenceSettings, SceneEvidence
+from benchmarks.paper.variants import VARIANTS
 from drgs.convert.import_mesh import import_mesh
 from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.geometry.face_surfels import surfels_on_faces_of
 from drgs.scene.asset import save_asset
-from drgs.scene.camera import opengl_from_camera
+from drgs.scene.camera import Camera, opengl_from_camera
+from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedScene
 
 CELL = 0.028
@@ -48,7 +52,7 @@ def test_the_capture_is_one_that_builds_read_and_holds_its_rig(scene: Path):
     assert sorted(entry.name for entry in scene.parent.iterdir()) == ["character"], "nothing half made stays"
     assert not (scene / "of another run").exists()
     facts = json.loads((scene / "scene.json").read_text())
-    assert facts["rig"] == {"file": FILE, "clip": CLIP, "light": facts["relight"][0]}
+    assert facts["rig"] == {"file": FILE, "clip": CLIP, "light": facts["relight"][0], "renderer": "ours"}
     opened = open_scene(scene)
     assert opened.name == "character" and opened.new_lights == (facts["relight"][0],)
     first = opengl_from_camera(opened.cameras[0]).numpy()
@@ -97,6 +101,49 @@ def test_a_true_asset_dances_as_the_truth_and_only_lost_frames_are_drawn_again(e
 
 
 @pytest.mark.slow
+def test_other_ways_dance_with_the_skeleton_and_only_lost_ones_are_drawn_again(evidence: SceneEvidence, monkeypatch: pytest.MonkeyPatch):
+    """In the picture each is where the truth is."""
+    ways = [VARIANTS["sugar"], VARIANTS["gsp"], VARIANTS["ours_mesh"]]
+    gaussians, binding = surfels_on_faces_of(evidence.subject.asset.mesh)
+    few = replace(evidence.settings, budget=3000, bake=BakeSettings(rounds=0), dance_every=4)
+    clothed = replace(evidence.subject.asset, gaussians=gaussians, binding=binding, primary="mesh")
+    save_asset(clothed, evidence.asset_path.parent / "clothed")
+    quick = SceneEvidence(evidence.scene, evidence.asset_path.parent / "clothed", evidence.cells, few)
+    told = figure_cells(quick, ways, ["dance_ways"])["dance_ways"]
+    assert [row["way"] for row in told["rows"]] == ["SuGaR", "GSP", "ours (M)"]
+    assert float(told["rows"][-1]["PSNR"]) > max(float(row["PSNR"]) for row in told["rows"][:-1])
+    facts = dances.rig_facts(quick)
+    assert facts is not None
+    shown = dances.Dance(quick, facts)
+    for way in ("sugar", "gsp"):
+        drawn, truth = (picture[..., 3] > 0.5 for picture in shown.read_pair("dancing", 0, way))
+        # Limbs are three pixels wide here, and Gaussians reach a part of one farther.
+        assert (drawn & truth).sum() > 0.7 * (drawn | truth).sum()
+    monkeypatch.setattr(VARIANTS["gsp"], "pose", None)
+    (quick.cells.folder / "cells" / "character-figure-dance_ways.json").unlink()  # killed while it was made
+    shown.picture_path("dancing", "sugar", 0).unlink()
+    assert figure_cells(quick, ways, ["dance_ways"])["dance_ways"]["rows"] == told["rows"]
+    assert shown.picture_path("dancing", "sugar", 0).is_file()
+
+
+@pytest.mark.slow
+def test_who_took_the_photographs_draws_the_truth(evidence: SceneEvidence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+
+    def witness(mesh: TriangleMesh, light: np.ndarray, camera: Camera, samples: int, bounces: int, degrees: float) -> np.ndarray:
+        asked.append((samples, degrees))
+        return np.full((camera.height, camera.width, 4), 0.5)
+
+    monkeypatch.setattr(dances, "mitsuba_picture", witness)
+    facts = dances.rig_facts(evidence)
+    assert facts is not None
+    shown = dances.Dance(evidence, replace(facts, renderer="mitsuba"))
+    _, truth = dances.posed_pair(shown, "dancing", 3)
+    dances.draw_truth(shown, truth, 256, tmp_path / "003.png")
+    assert asked == [(256, 180.0)] and np.asarray(Image.open(tmp_path / "003.png")).max() == 128
+
+
+@pytest.mark.slow
 def test_the_light_turns_once_and_the_truth_moves_with_the_clip(evidence: SceneEvidence):
     facts = dances.rig_facts(evidence)
     assert facts is not None
@@ -119,12 +166,12 @@ def test_the_name_of_the_character_is_a_scene_that_is_made_once(tmp_path: Path, 
         (folder / "scene.json").write_text("{}")
 
     monkeypatch.setattr("benchmarks.paper.command.photograph", draw)
-    cells = CellFolder(tmp_path, "command")
+    cells, settings = CellFolder(tmp_path, "command"), CaptureSettings()
     with pytest.raises(ValueError, match="expected a finished capture of the character"):
-        scene_folder(Path("character"), replace(cells, finished_only=True))
-    assert [scene_folder(Path("character"), cells) for _ in range(2)] == 2 * [tmp_path / "scenes" / "character"]
+        scene_folder(Path("character"), replace(cells, finished_only=True), settings)
+    assert [scene_folder(Path("character"), cells, settings) for _ in range(2)] == 2 * [tmp_path / "scenes" / "character"]
     assert made == [tmp_path / "scenes" / "character"]
-    assert scene_folder(tmp_path / "character", cells) == tmp_path / "character", "a folder of that name is itself"
+    assert scene_folder(tmp_path / "character", cells, settings) == tmp_path / "character", "a folder of that name is itself"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import trimesh
 from torch import Tensor
 
 from benchmarks.paper.face_splats import THIRDS, areas, edge_frames, splats_on_faces
-from benchmarks.paper.fields import at_rest, field_of_map, rigid_field
+from benchmarks.paper.fields import at_rest, field_of_map, field_of_moved_mesh, rigid_field
 from benchmarks.paper.harmonics import BakeSettings, bake_harmonics, even_colors, harmonic_colors
 from benchmarks.paper.splats import covariances, directions_at_rest, draw, moved_splats
 from benchmarks.paper.variant import Bound, FaceAnchors, Subject, bound_of_tensors, own_gaussians
@@ -92,6 +92,14 @@ def test_rigid_motion_with_camera_and_light_leaves_the_picture_as_it_was(name: s
         difference = (a - b).abs().amax(-1)
         assert difference.median() < 1e-5 and difference.mean() < 2e-5
         assert difference.max() < MIN_ALPHA, "where rounding decides, a Gaussian at the least opacity is drawn or not"
+
+
+def test_points_near_a_mesh_follow_it_as_one_when_it_moves_rigidly():
+    rest, points = subject().asset.mesh, bound("gsp")["centers"] * 1.05
+    rigid = rigid_field(UPRIGHT, SHIFT)
+    places, gradients = field_of_moved_mesh(rest, rigid(rest.vertices)[0])(points)
+    wanted, turn = rigid(points)
+    assert torch.allclose(places, wanted, atol=1e-5) and torch.allclose(gradients, turn, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["ours_particles", "ours_mesh", "ours_gaussians"])

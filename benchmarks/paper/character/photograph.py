@@ -1,7 +1,8 @@
 """A capture of the character at rest: photographs under one light, test views under that and another, and the rig that it dances by.
 
 In: a folder, and how much is spent. Out: the layout of the scenes in shared/bench (draw_scene writes it), with character.glb, and in scene.json which
-animation, under which light, is to be shown. Our own renderer draws everything. Lights are those of examples/environments, painted by formulas as well.
+animation, under which light, is to be shown, and who drew it: our own renderer, or Mitsuba, of which nothing is ours. Lights are those of
+examples/environments, painted by formulas as well.
 """
 
 import json
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.draw_scene import Drawing, draw_scene
+from benchmarks.draw_scene import Drawing, Renderer, draw_scene
 from benchmarks.paper.character.rigged_glb import CELL, CLIP, write_character
 from drgs.convert.import_mesh import import_mesh
 
@@ -48,6 +49,7 @@ class CaptureSettings:
     cell: float = CELL
     """Of the grid that the body is modelled with [world units]."""
     views: int = TRAINING_VIEWS
+    renderer: Renderer = "ours"
 
 
 def photograph(out: Path, settings: CaptureSettings) -> None:
@@ -65,9 +67,11 @@ def photograph(out: Path, settings: CaptureSettings) -> None:
         write_character(Path(folder) / FILE, settings.cell)
         light, new_light = (ENVIRONMENTS / f"{name}.exr" for name in (LIGHT, NEW_LIGHT))
         # The very mesh that whoever imports the file gets.
-        draw_scene(stage, made, None, light, new_light, Drawing(settings.samples), import_mesh(Path(folder) / FILE).mesh)
+        drawing = Drawing(settings.samples, renderer=settings.renderer)
+        draw_scene(stage, made, None, light, new_light, drawing, import_mesh(Path(folder) / FILE).mesh)
         shutil.copy(Path(folder) / FILE, made)
-        facts = json.loads((made / "scene.json").read_text()) | {"rig": {"file": FILE, "clip": CLIP, "light": NEW_LIGHT}}
+        rig = {"file": FILE, "clip": CLIP, "light": NEW_LIGHT, "renderer": settings.renderer}
+        facts = json.loads((made / "scene.json").read_text()) | {"rig": rig}
         (made / "scene.json").write_text(json.dumps(facts))
         if out.exists():
             shutil.rmtree(out)
