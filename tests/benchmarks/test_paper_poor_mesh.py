@@ -9,18 +9,19 @@ import pytest
 import torch
 from PIL import Image
 
+from benchmarks.binding import prepare
 from benchmarks.measures.bench_scene import open_scene
 from benchmarks.paper import poor_mesh
 from benchmarks.paper.cells import CellFolder
 from benchmarks.paper.figures import figure_cells
 from benchmarks.paper.tables import EvidenceSettings, SceneEvidence
-from drgs.reconstruct.build_asset import BuildSettings, build_asset
 from drgs.reconstruct.presets import PRESETS
+from drgs.scene.asset import Asset, save_asset
 from drgs.scene.mesh import TriangleMesh
 from tests.benchmarks.test_quality_benchmark import sphere_shape
 from tests.reconstruct.test_build_asset import TINY
 from tests.reconstruct.tiny_capture import sphere_views, write_nerf_synthetic
-from tests.render.closed_form_scenes import mesh_of
+from tests.render.closed_form_scenes import constant_sky, mesh_of
 
 
 def test_vertices_move_along_their_normals_by_so_many_radii():
@@ -37,16 +38,18 @@ def test_vertices_move_along_their_normals_by_so_many_radii():
 def test_the_figure_has_a_row_for_each_and_is_left_out_where_no_build_left_its_checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(PRESETS, "draft", replace(TINY, points=300, fit=replace(TINY.fit, iterations=2)))
     monkeypatch.setattr(poor_mesh, "ITERATIONS", 1)
+    (tmp_path / "mesh.build").mkdir()
     capture = write_nerf_synthetic(tmp_path / "capture", sphere_views(6, square=True))
     frames = json.loads((capture / "transforms_train.json").read_text())
     frames["frames"] = frames["frames"][:2]
     (capture / "transforms_test.json").write_text(json.dumps(frames).replace("train/", "test/"))
     shutil.copytree(capture / "train", capture / "test")
-    build_asset(capture, tmp_path / "asset", BuildSettings(preset="draft", device="cpu"))
-    evidence = SceneEvidence(open_scene(capture), tmp_path / "asset", CellFolder(tmp_path / "out", "command"), EvidenceSettings())
+    prepare(capture, tmp_path, "draft", "cpu")
+    save_asset(Asset(None, mesh_of(sphere_shape(0.5), 0.5, 0.5, 0.0), None, constant_sky(1.0), primary="mesh"), tmp_path / "particles")
+    evidence = SceneEvidence(open_scene(capture), tmp_path / "particles", CellFolder(tmp_path / "out", "command"), EvidenceSettings())
     told = figure_cells(evidence, [], ["poor_mesh"])["poor_mesh"]
     assert [row["on a poor mesh"] for row in told["rows"]] == list(poor_mesh.LEARNED.values())
     assert all(float(row["PSNR"]) > 3 for row in told["rows"])
     assert Image.open(tmp_path / "out" / told["picture"]).size[0] > 100
-    (tmp_path / "asset.build" / "stage1.safetensors").unlink()
+    (tmp_path / "particles.build" / "stage1.safetensors").unlink()
     assert not figure_cells(evidence, [], ["poor_mesh"])
