@@ -48,7 +48,8 @@ def page(document: dict, variants: list[AbstractVariant]) -> str:
         ("Time and memory", "bind", cost_rows(document, variants)),
     ):
         if rows:
-            parts.append(f"## {title}\n{NOTES[title]}\n\n{markdown_table(rows, list(rows[0]))}\n\n{made_of(document, kind)}\n")
+            columns = list(dict.fromkeys(column for row in rows for column in row))
+            parts.append(f"## {title}\n{NOTES[title]}\n\n{markdown_table(rows, columns)}\n\n{made_of(document, kind)}\n")
     parts += [honesty(document, variants), figures(document), MISSING]
     return "\n".join(part for part in parts if part)
 
@@ -93,8 +94,10 @@ def deformed_rows(document: dict, variants: list[AbstractVariant], new_light: bo
 
 
 def score_rows(scores: dict[str, dict[str, dict]], variants: list[AbstractVariant], key: str) -> list[dict[str, object]]:
-    """A row a way: PSNR and SSIM of each scene, and the means."""
+    """A row a way: PSNR and SSIM of each scene, and the means over those that every way has."""
     rows = []
+    shown = [variant.name for variant in variants if any(variant.name in by_way for by_way in scores.values())]
+    shared = [scene for scene, by_way in scores.items() if all(name in by_way for name in shown)]
     for variant in variants:
         own = {scene: by_way[variant.name] for scene, by_way in scores.items() if variant.name in by_way}
         if not own:
@@ -102,9 +105,9 @@ def score_rows(scores: dict[str, dict[str, dict]], variants: list[AbstractVarian
         row: dict[str, object] = {"way": variant.title}
         for scene, figures in own.items():
             row |= {f"{scene} PSNR": f"{figures[key]:.2f}", f"{scene} SSIM": f"{figures['ssim']:.3f}"}
-        if len(own) > 1:
-            row["mean PSNR"] = f"{np.mean([figures[key] for figures in own.values()]):.2f}"
-            row["mean SSIM"] = f"{np.mean([figures['ssim'] for figures in own.values()]):.3f}"
+        if len(shared) > 1:
+            row["mean PSNR"] = f"{np.mean([own[scene][key] for scene in shared]):.2f}"
+            row["mean SSIM"] = f"{np.mean([own[scene]['ssim'] for scene in shared]):.3f}"
         rows.append(row)
     return rows
 

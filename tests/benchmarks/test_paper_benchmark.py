@@ -14,7 +14,7 @@ from benchmarks.paper.cells import CellFolder
 from benchmarks.paper.command import repeated
 from benchmarks.paper.figures import STRIP
 from benchmarks.paper.films import FPS, WAY_THERE, shares, write_film
-from benchmarks.paper.pages import honesty
+from benchmarks.paper.pages import honesty, score_rows
 from benchmarks.paper.variants import VARIANTS
 from drgs.exchange.exr import encode_environment
 from drgs.reconstruct.capture.load_views import load_cameras
@@ -154,6 +154,18 @@ def test_the_page_says_where_another_way_is_better():
     assert "Gaussians seen is **behind** GSP by 1.00 dB" in honesty({"ball": cells(30, 28)}, ways)
     assert "ahead of the best other (GSP) by 2.00 dB" in honesty({"ball": cells(30, 28)}, ways)
     assert "**behind** GSP by 1.00 dB" in honesty({"ball": cells(30, 31)}, ways)
+
+
+def test_means_are_over_the_scenes_that_every_way_has():
+    ball, cube = {"psnr": 30.0, "ssim": 0.9}, {"psnr": 20.0, "ssim": 0.7}
+    scores = {
+        "ball": {"gsp": ball, "ours_mesh": ball},
+        "cube": {"gsp": ball, "ours_mesh": cube},
+        "man": {"ours_mesh": {"psnr": 50.0, "ssim": 1.0}},
+    }
+    ours, gsp = score_rows(scores, [VARIANTS["ours_mesh"], VARIANTS["gsp"]], "psnr")
+    assert (ours["mean PSNR"], gsp["mean PSNR"], ours["mean SSIM"]) == ("25.00", "30.00", "0.800")
+    assert "man PSNR" in ours and "man PSNR" not in gsp
 
 
 def test_commands_for_readers_name_no_folder_of_this_machine():
