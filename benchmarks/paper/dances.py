@@ -3,7 +3,7 @@
 In: the evidence of a scene that says by which file it is rigged (character/photograph.py). Out: a strip, a film, a curve of errors over the clip, and a cell
 for each frame, so that a killed run goes on where it was. Ours is the built asset with two edits, as a user gives them: the light, turned, and the pose of
 the file's animation at a time, which the asset's own mesh follows (docs/rigs.md). The truth is the file's mesh, skinned as glTF says, with its own
-materials, normals from its moved triangles, drawn by who took the photographs: our renderer, where lights and rays are the same but in number, or Mitsuba.
+materials, normals from its moved triangles, drawn by who took the photographs: our renderer, where lights and rays are the same but in number and the filter after ours, or Mitsuba.
 """
 
 import hashlib
@@ -25,6 +25,7 @@ from benchmarks.paper.cells import write_whole
 from benchmarks.paper.films import FPS, write_film
 from benchmarks.paper.sheets import Array, film_picture, object_window, sheet
 from benchmarks.paper.tables import SceneEvidence, write_picture
+from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant
 from drgs.convert.import_mesh import import_mesh
 from drgs.deform.pose_scene import pose_scene
@@ -34,7 +35,6 @@ from drgs.evaluate.metrics import light_scale, on_white, psnr, ssim
 from drgs.exchange.gltf_rig import read_gltf_rig
 from drgs.exchange.rig import Rig, RigAnimation
 from drgs.maths.color_numpy import linear_from_srgb, srgb_from_linear
-from drgs.maths.constants import STILL_BOUNCES
 from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.camera import Camera
@@ -193,7 +193,7 @@ def frame_cell(shown: Dance, place: int) -> dict:
         for kind in kinds:
             ours, truth = posed_pair(shown, kind, place)
             rays = evidence.settings.samples_per_pixel
-            draw(ours, shown.camera, RenderSettings(rays, bounces=STILL_BOUNCES), shown.picture_path(kind, "ours", place))
+            draw(ours, shown.camera, traced_settings(rays), shown.picture_path(kind, "ours", place))
             draw_truth(shown, truth, TRUTH_RAYS * rays, shown.picture_path(kind, "truth", place))
             off[kind] = surface_off(ours.mesh, truth.mesh)
         return {"surface_off": off["dancing"]}

@@ -25,6 +25,7 @@ from benchmarks.paper.laws import laws, rgba_of
 from benchmarks.paper.poor_mesh import checkpoints, poor_mesh
 from benchmarks.paper.sheets import Array, halved, object_window, sheet
 from benchmarks.paper.tables import SceneEvidence
+from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant
 from benchmarks.paper.wires import with_wires
 from drgs.deform.pose_scene import pose_scene
@@ -32,7 +33,7 @@ from drgs.evaluate.metrics import normal_error_degrees, on_white, psnr
 from drgs.maths.color_numpy import srgb_from_linear
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.reconstruct.geometry.mesh_from_gaussians import reduced_mesh
-from drgs.render.records import Frame, RenderSettings
+from drgs.render.records import Frame
 from drgs.render.render_frame import render_frame
 from drgs.scene.camera import Camera
 from drgs.scene.edits import parse_edits
@@ -210,7 +211,7 @@ def camera_of(evidence: SceneEvidence) -> Camera:
 
 def frame_of(evidence: SceneEvidence, edits: list[dict], bounces: int = STILL_BOUNCES) -> Frame:
     """Ours as the asset prefers to be seen."""
-    settings = RenderSettings(samples_per_pixel=evidence.settings.samples_per_pixel, bounces=bounces)
+    settings = traced_settings(evidence.settings.samples_per_pixel, bounces)
     return render_frame(pose_scene(evidence.subject.asset, parse_edits(edits)), camera_of(evidence), settings)
 
 

@@ -56,7 +56,7 @@ def page(document: dict, variants: list[AbstractVariant]) -> str:
 
 NOTABLE = 0.05
 """[dB] below which two of our own ways count as equal."""
-WHY_SSIM = "Computed from the tables. Rays leave noise, which SSIM counts on even surfaces and which drawn colours do not have; more rays (`--spp`) take it away."
+WHY_SSIM = "Computed from the tables. What noise rays leave is filtered (SVGF), as in the paper; drawn colours have none. More rays (`--spp`) leave less."
 NOTES = {
     "Static views": "Test views at rest under the light of the photographs: PSNR and SSIM.",
     "Deformed, light of the photographs": "The true object deformed by a known map, rendered by Mitsuba under the light of the photographs.",

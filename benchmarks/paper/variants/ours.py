@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 
 from benchmarks.paper.fields import Field, at_rest
+from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant, Draw, Subject
 from drgs.deform.carry_gaussians import carry_normals, carry_tangents
 from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.fill_particles import FillSettings, fill_particles
 from drgs.deform.gmls import GmlsSettings, build_weights, interpolate
-from drgs.maths.constants import STILL_BOUNCES
 from drgs.render.intersect.trace_rays import build_tracer
-from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
@@ -61,7 +60,7 @@ class OursVariant(AbstractVariant):
 
     def pose(self, subject: Subject, bound: dict[str, Tensor], field: Field, light: Environment | None) -> Draw:
         scene = self.scene(subject, bound, field, light)
-        settings = RenderSettings(samples_per_pixel=subject.samples_per_pixel, bounces=STILL_BOUNCES)
+        settings = traced_settings(subject.samples_per_pixel)
         tracer = build_tracer(scene.mesh)
 
         def draw(camera: Camera) -> Tensor:
