@@ -29,12 +29,14 @@ from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant
 from benchmarks.paper.wires import with_wires
 from drgs.deform.pose_scene import pose_scene
+from drgs.deform.simulation_scene import make_material, parse_simulation_scene
 from drgs.evaluate.metrics import normal_error_degrees, on_white, psnr
 from drgs.maths.color_numpy import srgb_from_linear
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.reconstruct.geometry.mesh_from_gaussians import reduced_mesh
 from drgs.render.records import Frame
 from drgs.render.render_frame import render_frame
+from drgs.scene.asset import Asset
 from drgs.scene.camera import Camera
 from drgs.scene.edits import parse_edits
 
@@ -47,8 +49,13 @@ EDITS: dict[str, list[dict]] = {
     "gold, rough": [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.9, 0.6, 0.2], "metallic": 1.0, "roughness": 0.5}}],
     "red paint": [{"op": "material", "select": {"all": True}, "set": {"albedo": [0.6, 0.05, 0.05], "metallic": 0.0, "roughness": 0.3}}],
 }
-MATTERS = ("jelly", "rubber", "clay", "sand")
-"""Presets, softest first: E is 10 rho g L of jelly and 100 of the others."""
+MATTERS: dict[str, tuple[str, float | None]] = {
+    "jelly, E": ("jelly", None),
+    "jelly, 10 E": ("jelly", 10.0),
+    "clay": ("clay", None),
+    "sand": ("sand", None),
+}
+"""Presets by the name in the figure, softest first, and how many times as stiff. E of jelly is 10 rho g L."""
 FALL = {"time": 0.4, "speed": 1.5}
 """When the pictures of matter are taken [s], and how fast the object arrives [world units/s]."""
 PARTICLES_SHARE = 1 / 12
@@ -191,11 +198,24 @@ def matter(evidence: SceneEvidence, variants: list[AbstractVariant], path: Path)
     """drgs2026, Fig. 5: the same fall with soft and with stiff matter; beside it clay, which stays bent, and sand."""
     particles = max(int(PARTICLES_SHARE * evidence.settings.budget), 1)
     drawn = [("at rest", picture_of(evidence, []))]
-    for preset in MATTERS:
-        scene = {"matter": {"preset": preset}, "velocity": [0, 0, -FALL["speed"]], "particles": particles, "duration": FALL["time"]}
-        drawn.append((preset, picture_of(evidence, [{"op": "simulate", "scene": scene, "time": FALL["time"]}])))
+    for title, (preset, times) in MATTERS.items():
+        stiffer = {} if times is None else {"young_modulus": times * young_modulus(evidence.subject.asset, preset)}
+        scene = {
+            "matter": {"preset": preset, **stiffer},
+            "velocity": [0, 0, -FALL["speed"]],
+            "particles": particles,
+            "duration": FALL["time"],
+        }
+        drawn.append((title, picture_of(evidence, [{"op": "simulate", "scene": scene, "time": FALL["time"]}])))
     sheet([drawn], path)
     return {"caption": f"{FALL['time']:g} s after meeting the floor at {FALL['speed']:g} units/s, {particles} particles"}
+
+
+def young_modulus(asset: Asset, preset: str) -> float:
+    """Of an object of this size [Pa]."""
+    low, high = asset.mesh.vertices.amin(0), asset.mesh.vertices.amax(0)
+    matter = parse_simulation_scene({"matter": {"preset": preset}}).matter
+    return make_material(matter, float((high - low).max()), asset.meters_per_unit).young_modulus / asset.meters_per_unit
 
 
 def amount_of(analytic: dict) -> str | None:

@@ -62,7 +62,8 @@ NOTES = {
     "Deformed, light of the photographs": "The true object deformed by a known map, rendered by Mitsuba under the light of the photographs.",
     "Deformed, new light": "The same under a light that no photograph shows; PSNR after one factor a channel, since nobody can tell dark paint from dim light. "
     "Baked ways show the old light.",
-    "Time and memory": "Seconds of binding and baking, and of a picture of 400×400 (posing included); peak memory of the whole process while drawing deformed views.",
+    "Time and memory": "Wall-clock seconds of binding and baking, and of a picture of 400×400 (posing included), beside whatever else the machine did (load, below); peak memory of the "
+    "whole process while drawing deformed views.",
 }
 
 

@@ -1,6 +1,7 @@
 """The command on a scene small enough to know: every table and figure is there, and what is finished is not made again."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -12,14 +13,15 @@ from PIL import Image
 from benchmarks.__main__ import main
 from benchmarks.paper.cells import CellFolder
 from benchmarks.paper.command import repeated
-from benchmarks.paper.figures import STRIP
+from benchmarks.paper.figures import STRIP, young_modulus
 from benchmarks.paper.films import FPS, WAY_THERE, shares, write_film
 from benchmarks.paper.pages import honesty, score_rows
 from benchmarks.paper.variants import VARIANTS
+from drgs.deform.simulation_scene import make_material, parse_simulation_scene
 from drgs.exchange.exr import encode_environment
 from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.reconstruct.geometry.face_surfels import surfels_on_faces_of
-from drgs.scene.asset import Asset, save_asset
+from drgs.scene.asset import Asset, load_asset, save_asset
 from tests.benchmarks.test_quality_benchmark import sphere_shape
 from tests.reconstruct.tiny_capture import SPHERE_RADIUS, sphere_views, write_nerf_synthetic
 from tests.render.closed_form_scenes import constant_sky, mesh_of
@@ -154,6 +156,17 @@ def test_the_page_says_where_another_way_is_better():
     assert "Gaussians seen is **behind** GSP by 1.00 dB" in honesty({"ball": cells(30, 28)}, ways)
     assert "ahead of the best other (GSP) by 2.00 dB" in honesty({"ball": cells(30, 28)}, ways)
     assert "**behind** GSP by 1.00 dB" in honesty({"ball": cells(30, 31)}, ways)
+
+
+def test_the_stiffer_jelly_is_stiffer_in_nothing_else(assets: Path):
+    asset = replace(load_asset(assets / "ball_asset"), meters_per_unit=0.1)
+    low, high = asset.mesh.vertices.amin(0), asset.mesh.vertices.amax(0)
+    materials = []
+    for matter in ({"preset": "jelly"}, {"preset": "jelly", "young_modulus": 10 * young_modulus(asset, "jelly")}):
+        materials.append(make_material(parse_simulation_scene({"matter": matter}).matter, float((high - low).max()), asset.meters_per_unit))
+    soft, stiff = materials
+    assert stiff.young_modulus == pytest.approx(10 * soft.young_modulus)
+    assert replace(stiff, young_modulus=soft.young_modulus) == soft
 
 
 def test_means_are_over_the_scenes_that_every_way_has():
