@@ -2,5 +2,6 @@
 
 The command is command.py. `variant.py` has the interface, `variants/` one file a way, `splats.py` what all that draw Gaussians share and
 `harmonics.py` how their radiance is baked; `cells.py` keeps what is finished, `tables.py` and `figures.py` make it, `pages.py` writes it down.
-`laws.py` and `dances.py` have the figures that move for longer; `character/` is a scene of our own.
+`laws.py` and `dances.py` have the figures that move for longer, `danced_ways.py` the others' dance and `poor_mesh.py` what binding learns; `wires.py` draws edges over
+pictures, `traced.py` says how ours is traced. `character/` is a scene of our own.
 """
