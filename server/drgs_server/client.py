@@ -11,7 +11,9 @@ Speaks only HTTP and WebSocket; imports neither torch nor the renderer. Final st
 the server does not know is an error, never done.
 """
 
+import tempfile
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -237,8 +239,21 @@ class Client:
         return self._call("GET", f"/api/assets/{asset_id}", AssetInfo)
 
     def upload_asset(self, path: Path, name: str | None = None) -> AssetInfo:
-        """A zipped asset, or a mesh (GLB, PLY, OBJ)."""
-        return self._upload("/api/assets", path, name, AssetInfo)
+        """The folder of an asset, the same zipped, or a mesh (GLB, PLY, OBJ).
+
+        Raises:
+            ValueError: a folder that is no asset's.
+        """
+        if not path.is_dir():
+            return self._upload("/api/assets", path, name, AssetInfo)
+        if not (path / "asset.json").is_file():
+            raise ValueError(f"{path}: has no asset.json; expected the folder of an asset, the same zipped, or a mesh")
+        with tempfile.TemporaryDirectory(prefix="drgs-upload-") as folder:
+            packed = Path(folder) / f"{path.resolve().name}.zip"
+            with zipfile.ZipFile(packed, "w") as archive:
+                for file in sorted(path.rglob("*")):
+                    archive.write(file, file.relative_to(path))
+            return self._upload("/api/assets", packed, name, AssetInfo)
 
     def delete_asset(self, asset_id: str) -> None:
         """`undelete_asset` brings it back for a day."""

@@ -14,6 +14,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from drgs.convert.import_mesh import import_mesh
+from drgs.scene.asset import save_asset
 from drgs_server.client import Client, ServerError
 from drgs_server.run import serve
 from drgs_worker.jobs.builders import BUILDER_VARIABLE
@@ -119,6 +121,11 @@ def test_acknowledged_edits_are_there_after_kill_9_of_the_server(running: ServeP
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     asset = client.upload_asset(mesh, name="four faces")
     assert (asset.face_count, asset.has_thumbnail, asset.name) == (4, True, "four faces")
+    save_asset(import_mesh(mesh), tmp_path / "in a folder")
+    folder = client.upload_asset(tmp_path / "in a folder")
+    assert (folder.face_count, folder.name) == (4, "in a folder")
+    with pytest.raises(ValueError, match=r"has no asset\.json"):
+        client.upload_asset(tmp_path)
     session = client.open_session(asset.id)
     for k in range(5):
         revision = session.edit({"op": "material", "select": {"all": True}, "set": {"roughness": k / 10}}).revision
