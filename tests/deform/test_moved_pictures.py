@@ -55,7 +55,7 @@ def test_a_rigid_motion_of_object_light_and_camera_changes_no_picture(driver, pr
     motion[:3, :3], motion[:3, 3] = TURN.double(), SHIFT.double()
     moved_camera = camera_from_opengl(motion @ eye, camera.intrinsics, 48, 48)
     light = {"op": "environment", "rotation": DEGREES}
-    settings = RenderSettings(samples_per_pixel=2048, bounces=0, primary=primary)
+    settings = RenderSettings(samples_per_pixel=4096, bounces=0, primary=primary)
     before = render_frame(pose(asset), camera, settings)
     after = render_frame(pose(asset, driver(asset, tmp_path), light, base_directory=tmp_path), moved_camera, settings)
     covered = before.gbuffer.coverage > 0.01
@@ -78,7 +78,7 @@ def test_a_free_fall_before_a_camera_that_falls_along_changes_no_picture():
     eye = torch.eye(4, dtype=torch.float64)
     eye[:3, 3] = torch.tensor([2.0, -1.0, 8.0])
     intrinsics = torch.tensor([[100.0, 0, 24], [0, 100, 24], [0, 0, 1]])
-    settings = RenderSettings(samples_per_pixel=2048, bounces=0, primary="mesh")
+    settings = RenderSettings(samples_per_pixel=4096, bounces=0, primary="mesh")
     before = render_frame(pose(asset), camera_from_opengl(eye, intrinsics, 48, 48), settings)
     eye[:3, 3] += fallen
     after = render_frame(scene, camera_from_opengl(eye, intrinsics, 48, 48), settings)

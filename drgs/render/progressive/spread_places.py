@@ -22,7 +22,7 @@ ONE = 4
 """Rates are in quarters of a place a pass."""
 LEAST, MOST = 2, 32
 """Rates are powers of two."""
-EMPTY_COST = 0.1
+EMPTY_COST = 0.2
 """Of a place that shows nothing, where one that shows a surface costs 1."""
 ROUNDS = 6
 """Of the search for a row's scale, each of which corrects what rounding to powers of two has left."""
