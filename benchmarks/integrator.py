@@ -171,7 +171,7 @@ def ours(
         for spp in sorted(samples):
             clock, cpu_clock = time.perf_counter(), time.process_time()
             state = start_frame(scene, camera, settings, tracer) if state is None else state
-            state = refine_frame(state, max(0, -(-spp // samples_per_pass(state.inputs).total) - state.passes))
+            state = refine_frame(state, max(0, -(-spp // samples_per_pass(state.inputs).total) - state.passes), consume=True)
             seconds, cpu_seconds = seconds + time.perf_counter() - clock, cpu_seconds + time.process_time() - cpu_clock
             for name in shown:
                 if name == "paper":

@@ -47,7 +47,7 @@ from drgs.warp_torch import thread_count
 SLICES_A_THREAD = (2, 8)
 """Slices of the image for each thread when passes run side by side, fewest and most: with few, some thread waits, for one slice's rays may
 cost twice another's; many are worth it where each still holds half of PIXELS_AT_ONCE."""
-PIXELS_AT_ONCE = 32768
+PIXELS_AT_ONCE = 65536
 """Camera rays that a thread takes together, of as many passes as that makes: Python's share of the time falls with it."""
 POOLS_AT_ONCE = 16
 """Passes that a thread takes together at most where samples choose: their pools (environment_pool.py) then take 2 MiB."""
