@@ -4,7 +4,8 @@
 
 edit_to_pixel_ms: from a slider's event to the first changed picture on the screen, which the browser draws itself; edit_to_traced_ms: to the
 first traced picture of that edit. local_fps: pictures a second that the browser draws while the camera turns, 800x600, once it has found how
-sharp they may be. traced_fps: pictures a second from the server while the camera turns, 400x400. reconnect_s: from the server answering again to
+sharp they may be. traced_fps: pictures a second from the server while the camera turns, 400x400, and in a page of 1280x800, of which panels take a part.
+Where a whole picture takes too long the server sends smaller ones while it turns (live/pace.py). reconnect_s: from the server answering again to
 the page showing that it is there; picture_back_s: to its next picture, for which it first imports the renderer and loads the asset.
 bundle_gz_kb: all built files, gzipped. Medians of the repeats.
 
@@ -85,6 +86,7 @@ def measure(mesh: Path | None, repeats: int, turn_seconds: float) -> dict[str, f
     with started(mesh) as viewer:
         result = measure_bare_local(viewer, turn_seconds) | measure_edits_and_local(viewer, repeats, turn_seconds)
         result |= measure_bare_traced(viewer, turn_seconds) | measure_traced(viewer, turn_seconds)
+        result |= {"traced_fps_1280x800": measure_traced(viewer, turn_seconds, 1280, 800)["traced_fps"]}
     return result | {"bundle_gz_kb": round(bundle_bytes() / 1000, 1)}
 
 
@@ -222,9 +224,9 @@ def measure_bare_traced(viewer: StartedViewer, turn_seconds: float) -> dict[str,
     return {"bare_traced_fps": round(moving(asset, 400, SAMPLES_PER_PASS, frames, None)["fps_moving"], 1)}
 
 
-def measure_traced(viewer: StartedViewer, turn_seconds: float) -> dict[str, float]:
-    """What the server sends of the newest object in the library."""
-    page = _open(viewer.browser, viewer.server, 400, 400, local=False)
+def measure_traced(viewer: StartedViewer, turn_seconds: float, width: int = 400, height: int = 400) -> dict[str, float]:
+    """What the server sends of the newest object in the library to a page of this size, while the camera turns."""
+    page = _open(viewer.browser, viewer.server, width, height, local=False)
     page.locator(".asset").first.click()
     page.locator(".hud").wait_for(timeout=WAIT_MS)
     # A page as narrow as a phone's has folded its panels away.
