@@ -28,6 +28,9 @@ const SKY_PIXELS = 160;
 /** How long a selection shows, in two pulses. */
 const FLASH_MS = 1400;
 const PINS_STRENGTH = 0.7;
+/** Time between pictures in motion [ms] beyond which so many in a row make a machine slow: it draws fewer faces in motion from then on. */
+const SLOW_MS = 50;
+const SLOW_PICTURES = 3;
 
 export class LocalLayer {
   /** Null where the browser has no WebGL 2. */
@@ -35,6 +38,7 @@ export class LocalLayer {
   private dirty = true;
   private sharp = true;
   private readonly resolution = new DynamicResolution();
+  private slowPictures = 0;
   private meshOf = '';
   private environmentUrl = '';
   /** Its light is there, or will not come. */
@@ -86,7 +90,15 @@ export class LocalLayer {
 
   /** Take in the time since the last of two pictures in motion, so that motion stays fluent. */
   measure(elapsedMs: number): void {
-    if (this.resolution.measure(elapsedMs)) this.resize();
+    // The mesh gets coarser before the picture gets blurred.
+    if (this.slow || !this.picture?.canBeCoarse) {
+      if (this.resolution.measure(elapsedMs)) this.resize();
+    } else this.slowPictures = elapsedMs > SLOW_MS ? this.slowPictures + 1 : 0;
+  }
+
+  /** On a machine that is too slow for all of the mesh's faces. */
+  private get slow(): boolean {
+    return this.slowPictures >= SLOW_PICTURES;
   }
 
   /** Once each animation frame. `resting`: the camera has been still for a while; `covered`: a fresh traced picture is over it. */
@@ -126,7 +138,9 @@ export class LocalLayer {
       onlyHighlight: overlay,
       edges,
       splitAt,
+      coarse: !this.sharp && this.slow && picture.canBeCoarse,
     });
+    this.stage.dataset.coarse = String(!this.sharp && this.slow && picture.canBeCoarse);
     this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
   }
 

@@ -9,6 +9,7 @@
 import {
   ACESFilmicToneMapping,
   AgXToneMapping,
+  BufferAttribute,
   DataTexture,
   EquirectangularReflectionMapping,
   FloatType,
@@ -30,7 +31,6 @@ import {
   Vector2,
   Vector3,
   WebGLRenderer,
-  type BufferAttribute,
   type Texture,
   type WebGLCubeRenderTarget,
 } from 'three';
@@ -42,6 +42,7 @@ import type { RestMesh, VertexMaterials } from '../edit/mesh';
 import type { Settings } from '../session/protocol.gen';
 import type { Vec3 } from '../session/view';
 import { blurEnvironment, BLURRED_HEIGHT } from './blur_environment';
+import { coarseFaces, MOST_MOVING_FACES } from './coarse_faces';
 import { lightTurn } from './camera/light_turn';
 import { drawsInSoftware, filterEnvironment } from './filter_environment';
 import { loadMesh, restGeometry } from './mesh_file';
@@ -74,6 +75,8 @@ export interface LocalFrame {
   edges: boolean;
   /** Left of this share of the width the object is drawn as captured; null: nowhere. */
   splitAt: number | null;
+  /** With few faces, for motion on machines that draw all too slowly. */
+  coarse: boolean;
 }
 
 export class LocalPicture {
@@ -96,6 +99,9 @@ export class LocalPicture {
   /** The mesh with shape and materials as captured; made when it is first asked for. */
   private captured: Mesh | null = null;
   private rest: RestMesh | null = null;
+  private fine: BufferAttribute | null = null;
+  /** Fewer faces for motion; made when they are first asked for. */
+  private coarse: BufferAttribute | null = null;
 
   /** Throws where the browser has no WebGL 2. */
   constructor(canvas: HTMLCanvasElement) {
@@ -124,7 +130,7 @@ export class LocalPicture {
     this.object?.geometry.dispose();
     this.captured?.geometry.dispose();
     this.root.clear();
-    this.object = this.captured = this.edges = this.rest = null;
+    this.object = this.captured = this.edges = this.rest = this.fine = this.coarse = null;
   }
 
   /** Replace the mesh by that of an asset. */
@@ -137,7 +143,22 @@ export class LocalPicture {
     this.edges.frustumCulled = false;
     this.root.add(this.object, this.edges);
     this.rest = rest;
+    this.fine = geometry.index;
     return rest;
+  }
+
+  /** Whether there is a coarser mesh to draw in motion. */
+  get canBeCoarse(): boolean {
+    return this.rest !== null && this.rest.faces.length > 3 * MOST_MOVING_FACES;
+  }
+
+  /** Draw few faces from now on, or all. */
+  private drawFaces(coarse: boolean): void {
+    const { object, rest } = this;
+    if (!object || !rest) return;
+    if (coarse) this.coarse ??= new BufferAttribute(coarseFaces(rest.positions, rest.faces), 1);
+    const index = coarse ? this.coarse : this.fine;
+    for (const mesh of [object, this.captured]) if (mesh && mesh.geometry.index !== index) mesh.geometry.setIndex(index);
   }
 
   setMaterials({ albedo, roughness, metallic }: VertexMaterials): void {
@@ -155,6 +176,7 @@ export class LocalPicture {
   setShape(positions: Float32Array): void {
     const { object, rest } = this;
     if (!object || !rest) return;
+    this.drawFaces(false);
     this.write('position', positions);
     if (positions === rest.positions) this.write('normal', rest.normals);
     else object.geometry.computeVertexNormals();
@@ -171,7 +193,7 @@ export class LocalPicture {
   private capturedMesh(): Mesh | null {
     const { object, rest } = this;
     if (!object || !rest || this.captured) return this.captured;
-    this.captured = new Mesh(restGeometry(rest, object.geometry.index), this.material);
+    this.captured = new Mesh(restGeometry(rest, this.fine), this.material);
     this.captured.frustumCulled = false;
     this.root.add(this.captured);
     return this.captured;
@@ -181,6 +203,7 @@ export class LocalPicture {
   pick(camera: PerspectiveCamera, x: number, y: number): { rest: Vec3; vertex: number } | null {
     const { object, rest } = this;
     if (!object || !rest) return null;
+    this.drawFaces(false);
     const ray = new Raycaster();
     camera.updateMatrixWorld();
     ray.setFromCamera(new Vector2(x, y), camera);
@@ -244,6 +267,7 @@ export class LocalPicture {
 
   render(frame: LocalFrame): void {
     this.ensureLight();
+    this.drawFaces(frame.coarse);
     const { camera, light, settings } = frame;
     this.uniforms.highlight.value = frame.highlight;
     this.uniforms.onlyHighlight.value = frame.onlyHighlight ? 1 : 0;

@@ -278,11 +278,13 @@ export class Viewport {
 
   private tick = (now: number) => {
     requestAnimationFrame(this.tick);
-    const elapsed = now - this.lastTick;
+    const lastTick = this.lastTick;
+    const elapsed = now - lastTick;
     this.lastTick = now;
     this.fly.update(elapsed / 1000);
     const moved = this.lookThrough.apply(now) ?? this.controls.update(elapsed / 1000);
-    if (moved && now - this.movedAt < MOVING_MS) this.local.measure(elapsed);
+    // In motion since the last picture, however long that took.
+    if (moved && this.movedAt === lastTick) this.local.measure(elapsed);
     if (!session.value) return;
     if (moved) {
       this.movedAt = now;
