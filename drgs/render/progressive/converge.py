@@ -51,10 +51,10 @@ def tiles_to_go_on(errors: Tensor, passes: Tensor, target: float) -> Tensor:
 
 def frame_errors(state: FrameState) -> Tensor:
     """(tile,) relative error of each tile of a frame so far (tile_errors); 0 outside the window."""
-    sums, window, passes = state.sums, state.window, state.passes_in_window
+    sums, window, places = state.sums, state.window, state.places_in_window
     luminance = state.in_window(sums.luminance)
-    variance = mean_variance(luminance, state.in_window(sums.luminance_squared), state.in_window(sums.scatter)[..., 0], passes)
-    mean = luminance / passes.clamp(min=1)
+    variance = mean_variance(luminance, state.in_window(sums.luminance_squared), state.in_window(sums.scatter)[..., 0], places)
+    mean = luminance / places.clamp(min=1)
     height, width = mean.shape
     errors = tile_errors(mean.flatten(), variance.flatten(), (state.in_window(sums.weight) > 0).flatten(), width, height)
     across, down = tile_grid(width, height)

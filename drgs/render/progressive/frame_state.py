@@ -97,7 +97,7 @@ class FrameState:
 
     @property
     def rays_a_pass(self) -> int:
-        """Of each pixel."""
+        """Of each pixel; in the mean over pixels, where passes look through some more often (spread_places.py)."""
         return moving_counts(self.plan.counts).total if self.is_moving else samples_per_pass(self.inputs).total
 
     @cached_property
@@ -111,9 +111,9 @@ class FrameState:
         return self.window.crop(values.unflatten(0, (self.inputs.height, self.inputs.camera.width)))
 
     @property
-    def passes_in_window(self) -> Float[Tensor, "rows columns"]:
-        """Of each pixel."""
-        return self.in_window(self.sums.passes)
+    def places_in_window(self) -> Float[Tensor, "rows columns"]:
+        """That were looked through, of each pixel."""
+        return self.in_window(self.sums.places)
 
     @property
     def passes(self) -> int:

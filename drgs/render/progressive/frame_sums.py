@@ -25,8 +25,8 @@ class FrameSums:
 
     diffuse: Float[Tensor, "pixel 3"]
     specular: Float[Tensor, "pixel 3"]
-    passes: Float[Tensor, "pixel"]
-    """Places looked through: one a pass, unless passes look through some pixels more often (spread_places.py)."""
+    places: Float[Tensor, "pixel"]
+    """Looked through: one a pass, unless passes look through some pixels more often (spread_places.py)."""
     weight: Float[Tensor, "pixel"]
     """Places that found a surface."""
     luminance: Float[Tensor, "pixel"]
@@ -52,7 +52,7 @@ class SumArrays:
     """Number in the image of the first of them."""
     diffuse: wp.array[wp.vec3]
     specular: wp.array[wp.vec3]
-    passes: wp.array[float]
+    places: wp.array[float]
     weight: wp.array[float]
     luminance: wp.array[float]
     luminance_squared: wp.array[float]
@@ -119,7 +119,7 @@ def no_sums(pixels: int, with_surface: bool, with_indirect: bool, device: torch.
     return FrameSums(
         diffuse=zeros(3),
         specular=zeros(3),
-        passes=zeros(),
+        places=zeros(),
         weight=zeros(),
         luminance=zeros(),
         luminance_squared=zeros(),
@@ -142,7 +142,7 @@ def brighten_sums(sums: FrameSums, brightness: float) -> FrameSums:
 
 
 def add_estimate(sums: FrameSums, primary: PrimaryPoints, light: ShadedPoints, first_pixel: int = 0) -> None:
-    """Add one estimate of the light of some pixels to their sums, in place; `passes` are the caller's to count.
+    """Add one estimate of the light of some pixels to their sums, in place; `places` are the caller's to count.
 
     Args:
         first_pixel: number in the image of the sums' first pixel.
@@ -160,7 +160,7 @@ def sum_arrays(sums: FrameSums, first_pixel: int = 0) -> Any:
     arrays = SumArrays()
     arrays.first_pixel = first_pixel
     arrays.diffuse, arrays.specular, arrays.scatter = (warp_array(x, wp.vec3) for x in (sums.diffuse, sums.specular, sums.scatter))
-    arrays.passes = warp_array(sums.passes)
+    arrays.places = warp_array(sums.places)
     arrays.weight, arrays.visibility = warp_array(sums.weight), warp_array(sums.visibility)
     arrays.luminance, arrays.luminance_squared = warp_array(sums.luminance), warp_array(sums.luminance_squared)
     arrays.indirect = warp_array(sums.diffuse[:0] if sums.indirect is None else sums.indirect, wp.vec3)

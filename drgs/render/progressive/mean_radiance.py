@@ -57,7 +57,7 @@ def mean_over_passes(
     y = i / window.width
     x = i - y * window.width
     p = (window.row + y) * window.image_width + window.column + x
-    count = wp.max(sums.passes[p], 1.0)
+    count = wp.max(sums.places[p], 1.0)
     w = wp.max(sums.weight[p], 1.0)
     mean.diffuse[y, x] = sums.diffuse[p] / w
     mean.specular[y, x] = sums.specular[p] / w
@@ -131,7 +131,7 @@ def mean_gbuffer(state: FrameState) -> GBuffer:
 def _mean_surface(state: FrameState) -> GBuffer:
     assert state.sums.surface is not None
     weight = state.in_window(state.sums.weight)
-    coverage = weight / state.passes_in_window.clamp(min=1)
+    coverage = weight / state.places_in_window.clamp(min=1)
     mean = state.in_window(state.sums.surface) / weight.clamp(min=1)[..., None]
     depth = torch.where(coverage > 0, mean[..., 14], torch.inf)
     normal, wo = (torch.nn.functional.normalize(mean[..., a : a + 3].contiguous(), dim=-1) for a in (3, 6))
@@ -150,7 +150,7 @@ def frame_history(state: FrameState) -> History | None:
 
 def _own_samples(state: FrameState) -> Tensor:
     """(rows, columns, 2) behind the diffuse and the specular part of the frame's own mean."""
-    samples = state.passes_in_window * state.rays_a_pass
+    samples = state.places_in_window * state.rays_a_pass
     return torch.stack([samples, samples], -1)
 
 

@@ -2,7 +2,8 @@
 
 A pass adds `samples_per_pass` rays to every covered pixel and updates the running sums; passes continue the same
 low-discrepancy sequences, so n passes of k samples are as good as one of n k. With the mesh as primary
-surface each pass also looks through another place of the pixel. State is a frozen record: refining returns a new one.
+surface each pass also looks through another place of the pixel, and from the fifth on through more places of some pixels than
+of others (spread_places.py). State is a frozen record: refining returns a new one.
 """
 
 import time
@@ -160,7 +161,7 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
     pixels = _pixels(state, chosen)
     here = pixels.long() - state.inputs.first_pixel
     rates = None if index < FIRST_LOOK or state.rates is None else state.rates[here]
-    places = state.sums.passes[here].int()
+    places = state.sums.places[here].int()
 
     def work(first: int, last: int) -> tuple[int, float, Tensor | None]:
         own, so_far = None if rates is None else rates[first:last], places[first:last]

@@ -63,7 +63,7 @@ def decide_rates(sums: FrameSums, rates: Tensor | None, tiles: Tensor, width: in
         width, height: of the frame [pixels].
     """
     if rates is None:
-        rates = torch.full_like(sums.passes, ONE, dtype=torch.int32)
+        rates = torch.full_like(sums.places, ONE, dtype=torch.int32)
     across, down = tile_grid(width, height)
 
     def rows(values: Tensor) -> Tensor:
@@ -71,7 +71,7 @@ def decide_rates(sums: FrameSums, rates: Tensor | None, tiles: Tensor, width: in
         return torch.nn.functional.pad(values.view(height, width), (0, 0, 0, -height % TILE)).view(down, TILE, width)
 
     chosen = tiles.view(down, 1, across).repeat_interleave(TILE, 2)[..., :width].expand(down, TILE, width)
-    count = rows(sums.passes).clamp(min=1)
+    count = rows(sums.places).clamp(min=1)
     mean = rows(sums.luminance) / count
     variance = (rows(sums.luminance_squared) / count - mean * mean).clamp(min=0) * count / (count - 1).clamp(min=1)
     found = rates_of_rows(mean, variance, rows(sums.weight) / count, chosen)
@@ -94,7 +94,9 @@ def rates_of_rows(mean: Tensor, variance: Tensor, covered: Tensor, chosen: Tenso
     for _ in range(ROUNDS):
         scale = scale * budget / (cost * _powers_of_two(scale * wanted)).sum((1, 2), keepdim=True).clamp(min=1e-30)
     rates = (ONE * _powers_of_two(scale * wanted)).int()
-    return torch.where((wanted * chosen > 0).any(2, keepdim=True).any(1, keepdim=True), rates, ONE)
+    # Without any light nothing says where to look, and light whose square is beyond float32 says it wrongly.
+    is_known = torch.isfinite(wanted).flatten(1).all(1) & torch.isfinite(scale).flatten(1).all(1) & (wanted * chosen > 0).flatten(1).any(1)
+    return torch.where(is_known[:, None, None], rates, ONE)
 
 
 def _of_neighbours(values: Tensor) -> Tensor:
@@ -136,4 +138,4 @@ def list_looks(pixels: Tensor, first: int, last: int, rates: Tensor | None, plac
 
 def count_places(sums: FrameSums, pixels: Tensor, rates: Tensor | None, first: int, last: int) -> None:
     """Book the places of the passes from `first` on, before `last`, of pixels (pixel,) int64 of the frame, in place."""
-    sums.passes[pixels] += last - first if rates is None else places_between(rates[pixels], first, last)
+    sums.places[pixels] += last - first if rates is None else places_between(rates[pixels], first, last)

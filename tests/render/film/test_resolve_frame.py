@@ -24,14 +24,14 @@ def test_means_and_variances_are_those_of_the_passes(device: str) -> None:
     scene = PosedScene(None, on_device(sphere_mesh(3), device), sky)
     state = refine_frame(start_frame(scene, CAMERA.to(device), RenderSettings(samples_per_pass=4, bounces=0)), 3)
     for passes in (1, 3):
-        state.sums.passes.fill_(passes)
+        state.sums.places.fill_(passes)
         shown = resolve_frame(dataclasses.replace(state)).radiance
 
         def part(name: str) -> torch.Tensor:
             values = getattr(state.sums, name)
             return state.window.crop(values.unflatten(0, (CAMERA.height, CAMERA.width)))
 
-        weight, count = part("weight").clamp(min=1), part("passes")
+        weight, count = part("weight").clamp(min=1), part("places")
         exact = mean_variance(part("luminance"), part("luminance_squared"), part("scatter")[..., 0], count) * (count / weight) ** 2
         crop = state.window.crop
         torch.testing.assert_close(crop(shown.variance), exact)

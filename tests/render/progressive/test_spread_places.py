@@ -39,7 +39,7 @@ def started(seed: int = 0, spreads: bool = True, scene: PosedScene = METAL) -> F
 
 def picture(state: FrameState) -> Tensor:
     """(pixel,) luminance, 0 where nothing is seen."""
-    return state.sums.luminance.double() / state.sums.passes.double().clamp(min=1)
+    return state.sums.luminance.double() / state.sums.places.double().clamp(min=1)
 
 
 def test_looks_lie_where_passes_have_doubled() -> None:
@@ -99,6 +99,13 @@ def test_a_row_without_any_light_keeps_one_place_a_pass() -> None:
     assert bool((rates_of_rows(dark, dark, dark, torch.ones(1, 16, 32, dtype=torch.bool)) == ONE).all())
 
 
+@pytest.mark.parametrize("intensity", [1e20, 1e30])
+def test_light_whose_square_is_beyond_numbers_is_looked_at_evenly(intensity: float) -> None:
+    state = refine_frame(started(scene=dataclasses.replace(METAL, environment_intensity=intensity)), 20)
+    assert state.rates is not None and int(state.rates.min()) >= LEAST and int(state.rates.max()) <= MOST
+    assert bool(torch.isfinite(state.sums.diffuse).all()) and bool((state.sums.places >= 0).all())
+
+
 def test_passes_together_are_those_one_by_one_and_stop_anywhere() -> None:
     together, alone = refine_frame(started(), 21), started()
     for _ in range(21):
@@ -128,4 +135,4 @@ def test_the_mean_stays_and_the_error_falls() -> None:
 def test_frames_that_are_told_their_counts_or_to_skip_nothing_look_evenly() -> None:
     for settings in (RenderSettings(counts=SampleCounts(2, 1, 1)), RenderSettings(skip=False)):
         state = refine_frame(start_frame(METAL, CAMERA, settings), 6)
-        assert not state.plan.spread_places and state.rates is None and bool((state.sums.passes[state.sums.passes > 0] == 6).all())
+        assert not state.plan.spread_places and state.rates is None and bool((state.sums.places[state.sums.places > 0] == 6).all())
