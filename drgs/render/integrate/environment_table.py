@@ -64,10 +64,9 @@ def search_stride(count: int) -> int:
     return stride
 
 
-def _padded(sums: Tensor, dtype: torch.dtype) -> Tensor:
-    """Rows of sums with infinity behind them."""
-    beyond = -sums.shape[-1] % LANES + LANES
-    return torch.nn.functional.pad(sums.to(dtype), (0, beyond), value=math.inf)
+def _beyond(count: int) -> int:
+    """How much infinity stands behind a row of so many sums."""
+    return -count % LANES + LANES
 
 
 def build_environment_table(environment: Environment) -> EnvironmentTable:
@@ -84,23 +83,32 @@ def build_environment_table(environment: Environment) -> EnvironmentTable:
             f"the environment's texels span {darkest:g} to {brightest:g}; expected finite radiance from 0 to {MAX_RADIANCE:g}: "
             "clamp it, or scale it and raise the edit's intensity"
         )
+    # One entry of texels after the other, each written once: a table of half a million texels is made anew with every edit of the light.
+    texels = radiance.new_empty(height + 2, width, 4)
+    texels[1:-1, :, :3] = radiance
+    texels[0, :, :3], texels[-1, :, :3] = radiance[0], radiance[-1]
+    nodes = radiance.new_zeros(height + 2, width)
     polar = (torch.arange(height, device=radiance.device, dtype=radiance.dtype) + 0.5) * (math.pi / height)
-    pole = radiance.new_zeros(1, width)
-    nodes = torch.cat([pole, radiance.amax(-1) * torch.sin(polar)[:, None], pole])
+    red, green, blue = radiance.unbind(-1)
+    torch.mul(torch.maximum(torch.maximum(red, green), blue), torch.sin(polar)[:, None], out=nodes[1:-1])
     # A density knows no unit: the brightest texel becomes 0.5 to 1 by a power of two, which is exact, and no square under- or overflows.
-    nodes = torch.ldexp(nodes, torch.tensor(-math.frexp(brightest)[1], device=nodes.device))
+    exponent = -math.frexp(brightest)[1]
+    nodes.mul_(2.0 ** (exponent // 2)).mul_(2.0 ** (exponent - exponent // 2))
+    texels[..., 3] = nodes
     # Sums run in float64: after a sun of 1e6, a float32 sum would forget the dim texels behind it.
-    cells = (0.5 / width) * (nodes + torch.roll(nodes, -1, dims=1)).double()
-    column_sums = torch.cat([cells.new_zeros(height + 2, 1), cells.cumsum(1)], 1)
-    totals = column_sums[:, -1]
+    cells = nodes.new_empty(height + 2, width, dtype=torch.float64)
+    cells[:, :-1], cells[:, -1] = nodes[:, :-1] + nodes[:, 1:], nodes[:, -1] + nodes[:, 0]
+    sums = torch.cumsum(cells.mul_(0.5 / width), 1, out=cells)
+    padded = radiance.new_full((height + 2, width + 1 + _beyond(width + 1)), math.inf)
+    padded[:, 0] = 0.0
+    padded[:, 1 : width + 1] = sums
+    totals = sums[:, -1]
     row_height = torch.full((height + 1,), 1 / height, device=radiance.device, dtype=torch.float64)
     row_height[0] = row_height[-1] = 0.5 / height
     row_sums = torch.cat([totals.new_zeros(1), (0.5 * row_height * (totals[1:] + totals[:-1])).cumsum(0)])
-    rows = torch.arange(-1, height + 1, device=radiance.device).clamp(0, height - 1)
-    texels = torch.cat([radiance[rows], nodes[..., None]], -1)
-    padded = _padded(column_sums, radiance.dtype)
+    padded_rows = torch.nn.functional.pad(row_sums.to(radiance.dtype), (0, _beyond(height + 2)), value=math.inf)
     columns = (torch.arange(LANES, device=radiance.device) * search_stride(width + 1)).clamp(max=padded.shape[1] - 1)
-    return EnvironmentTable(texels, padded, _padded(row_sums, radiance.dtype), padded[:, columns].contiguous())
+    return EnvironmentTable(texels, padded, padded_rows, padded[:, columns].contiguous())
 
 
 def _row_of_v(v: Tensor, height: int) -> tuple[Tensor, Tensor]:

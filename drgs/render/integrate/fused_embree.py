@@ -6,6 +6,7 @@ and over, so they stay in the cache, and Python is entered once for tens of thou
 The two native bodies below go by sixteen rays. They take structs as kernels do; only numbers that differ from call to call come apart.
 """
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,29 @@ def shade_chunks(
         sum_point(point_at(points, listed), (listed - begin) * count, points, samples, scratch.rays, bounces, sums)
 
 
+_scratches = threading.local()
+
+
+def _scratch(rays: int, bounces: int) -> tuple[Any, torch.Tensor]:
+    """Scratch of the calling thread for chunks of so many rays, and its counts (3,); made once, for launches come by the hundred.
+
+    Args:
+        bounces: 0, 1, or 2 for more.
+    """
+    of_thread: dict[tuple[int, int], tuple[Any, torch.Tensor]] = _scratches.__dict__
+    found = of_thread.get((rays, bounces))
+    if found is None:
+        of_thread.clear()  # pictures of another kind have come
+        counts, scratch = torch.zeros(3, dtype=torch.int32), FusedScratch()
+        scratch.rays = ray_samples(rays, torch.device("cpu"))
+        scratch.even = path_arrays(rays if bounces > 0 else 0)
+        scratch.odd = path_arrays(rays if bounces > 1 else 0)
+        scratch.counts = warp_array(counts)
+        found = of_thread[rays, bounces] = scratch, counts
+    found[1].zero_()
+    return found
+
+
 class FusedEmbreeIntegrator(AbstractIntegrator):
     """Final. Its tracer is an EmbreeTracer."""
 
@@ -137,15 +161,12 @@ class FusedEmbreeIntegrator(AbstractIntegrator):
 
     def shade_slice(self, estimate: Estimate, first: int, last: int) -> int:
         chunk = max(1, RAYS_A_CHUNK // estimate.rays_a_point)
-        rays = min(chunk, last - first) * estimate.rays_a_point
-        counts = torch.zeros(3, dtype=torch.int32)
-        scratch = FusedScratch()
-        scratch.rays = ray_samples(rays, torch.device("cpu"))
-        scratch.even = path_arrays(rays if estimate.bounces > 0 else 0)
-        scratch.odd = path_arrays(rays if estimate.bounces > 1 else 0)
-        scratch.counts = warp_array(counts)
+        scratch, counts = _scratch(chunk * estimate.rays_a_point, min(estimate.bounces, 2))
         remembered = RememberedRays()
-        remembered.known, remembered.kept = traced_arrays(estimate.known), traced_arrays(estimate.kept)
+        if estimate.known is not None:
+            remembered.known = traced_arrays(estimate.known)
+        if estimate.kept is not None:
+            remembered.kept = traced_arrays(estimate.kept)
         inputs: list[Any] = [self.tracer.handle, first, last, chunk, estimate.bounces]
         inputs += [estimate.points, estimate.starts, estimate.scene, estimate.samples]
         wp.launch(shade_chunks, dim=-(-(last - first) // chunk), inputs=inputs, outputs=[remembered, scratch, estimate.sums], device="cpu")

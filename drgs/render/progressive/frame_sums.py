@@ -141,13 +141,13 @@ def brighten_sums(sums: FrameSums, brightness: float) -> FrameSums:
     return replace(sums, **{name: known[name] * brightness**power for name, power in BRIGHTNESS_POWERS.items() if name in known})
 
 
-def add_estimate(sums: FrameSums, primary: PrimaryPoints, light: ShadedPoints, first_pixel: int = 0) -> None:
+def add_estimate(sums: FrameSums, arrays: Any, primary: PrimaryPoints, light: ShadedPoints) -> None:
     """Add one estimate of the light of some pixels to their sums, in place; `places` are the caller's to count.
 
     Args:
-        first_pixel: number in the image of the sums' first pixel.
+        arrays: `sum_arrays` of these sums.
     """
-    arrays, device, count = sum_arrays(sums, first_pixel), warp_device(sums.weight), len(primary.points.pixel)
+    device, count = warp_device(sums.weight), len(primary.points.pixel)
     vectors = [warp_array(values, wp.vec3) for values in (light.diffuse, light.specular, light.variance)]
     indirect = warp_array(light.diffuse[:0] if light.indirect is None else light.indirect, wp.vec3)
     launch(add_light, count, [warp_array(primary.points.pixel), *vectors, warp_array(light.visibility), indirect], [arrays], device)

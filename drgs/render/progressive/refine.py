@@ -8,6 +8,7 @@ of others (spread_places.py). State is a frozen record: refining returns a new o
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ from drgs.render.intersect.trace_rays import over_slices
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.converge import MIN_PASSES, still_active
 from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshView, Tiles, with_seconds
-from drgs.render.progressive.frame_sums import add_estimate, copy_sums, no_sums
+from drgs.render.progressive.frame_sums import add_estimate, copy_sums, no_sums, sum_arrays
 from drgs.render.progressive.kept_light.shade_moving import shade_moving
 from drgs.render.progressive.mean_radiance import frame_history, mean_gbuffer
 from drgs.render.progressive.moving_picture import moving_picture
@@ -146,7 +147,8 @@ def _add_pass(state: FrameState, chosen: Tensor, index: int) -> FrameState:
     whole_first_pass = index == 0 and bool((chosen == state.tiles.covered).all())
     primary = _primary_points(state, chosen, index, whole_first_pass)
     traced = time.perf_counter()
-    _shade_and_add(state, _light_tracer(state, index), primary, index, state.first_rays if whole_first_pass else None)
+    arrays = sum_arrays(state.sums, state.inputs.first_pixel)
+    _shade_and_add(state, arrays, _light_tracer(state, index), primary, index, state.first_rays if whole_first_pass else None)
     count_places(state.sums, _pixels(state, chosen).long() - state.inputs.first_pixel, None, index, index + 1)
     if whole_first_pass and isinstance(state.view, MeshView):
         state = replace(state, view=MeshView(first_primary_points=primary))
@@ -161,7 +163,7 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
     pixels = _pixels(state, chosen)
     here = pixels.long() - state.inputs.first_pixel
     rates = None if index < FIRST_LOOK or state.rates is None else state.rates[here]
-    places = state.sums.places[here].int()
+    places, arrays = state.sums.places[here].int(), sum_arrays(state.sums, state.inputs.first_pixel)
 
     def work(first: int, last: int) -> tuple[int, float, Tensor | None]:
         own, so_far = None if rates is None else rates[first:last], places[first:last]
@@ -176,7 +178,7 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
                 so_far = so_far + places_between(own, round_, end)
             primary = trace_primary_points(state.traced.tracer, camera, seed, round_, pixels=looks.pixels, rounds=looks.rounds)
             tracing += time.perf_counter() - began
-            _shade_and_add(state, tracer, primary, looks, None)
+            _shade_and_add(state, arrays, tracer, primary, looks, None)
             points += len(primary.points.pixel)
         return points, tracing, primary.starts.face
 
@@ -222,12 +224,13 @@ def points_in_tiles(primary: PrimaryPoints, tiles: Tensor, width: int, first_pix
 
 def _shade_and_add(
     state: FrameState,
+    arrays: Any,
     tracer: AbstractTracer,
     primary: PrimaryPoints,
     looks: int | Looks,
     memory: RayMemory | None,
 ) -> None:
-    """Light of the points of one pass, or of several passes' looks, added to the sums of their pixels."""
+    """Light of the points of one pass, or of several passes' looks, added to the sums of their pixels (`sum_arrays`)."""
     integrator, light_there, how = choose_integrator(tracer), state.traced.environment_light, _how(state)
     rounds: int | Tensor
     if isinstance(looks, int):
@@ -236,7 +239,7 @@ def _shade_and_add(
         assert primary.ray is not None
         rounds, pools = looks.rounds[primary.ray], looks.passes[primary.ray]
     light = integrator.shade(primary.points, primary.starts, light_there, how, rounds, memory, _horizon(state), pool_rounds=pools)
-    add_estimate(state.sums, primary, light, state.inputs.first_pixel)
+    add_estimate(state.sums, arrays, primary, light)
 
 
 def _how(state: FrameState) -> IntegratorSettings:

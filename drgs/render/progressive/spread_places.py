@@ -7,6 +7,7 @@ What a pixel's own places have found has no part in how many it gets, or the mea
 dark ones. Its neighbours decide, whose places know nothing of its own.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -86,29 +87,30 @@ def rates_of_rows(mean: Tensor, variance: Tensor, covered: Tensor, chosen: Tenso
         chosen: the pixels that share the cost.
     """
     # An error counts relative to what a pixel shows, which its neighbours only guess: where one of them is dark, it may be.
-    error = _of_neighbours(variance) * _of_neighbours(1.0 / (mean * mean + DARK))
-    cost = (EMPTY_COST + (1.0 - EMPTY_COST) * _of_neighbours(covered)) * chosen
-    wanted = torch.sqrt(error / cost.clamp(min=EMPTY_COST))
-    budget = cost.sum((1, 2), keepdim=True)
+    around = _of_neighbours(torch.stack([variance, 1.0 / (mean * mean + DARK), covered]))
+    cost = (EMPTY_COST + (1.0 - EMPTY_COST) * around[2]) * chosen
+    wanted = torch.sqrt(around[0] * around[1] / cost.clamp(min=EMPTY_COST))
+    budget, exponent = cost.sum((1, 2), keepdim=True), torch.log2(wanted)
     scale = budget / (cost * wanted).sum((1, 2), keepdim=True).clamp(min=1e-30)
     for _ in range(ROUNDS):
-        scale = scale * budget / (cost * _powers_of_two(scale * wanted)).sum((1, 2), keepdim=True).clamp(min=1e-30)
-    rates = (ONE * _powers_of_two(scale * wanted)).int()
+        rates = _powers_of_two(exponent + torch.log2(scale))
+        scale = scale * budget / rates.mul_(cost).sum((1, 2), keepdim=True).clamp(min=1e-30)
+    rates = _powers_of_two(exponent + torch.log2(scale)).mul_(ONE).int()
     # Without any light nothing says where to look, and light whose square is beyond float32 says it wrongly.
     is_known = torch.isfinite(wanted).flatten(1).all(1) & torch.isfinite(scale).flatten(1).all(1) & (wanted * chosen > 0).flatten(1).any(1)
     return torch.where(is_known[:, None, None], rates, ONE)
 
 
 def _of_neighbours(values: Tensor) -> Tensor:
-    """Mean of the eight pixels around each one, as far as they lie in its row of tiles."""
-    sums = torch.nn.functional.avg_pool2d(values[:, None], 3, 1, 1, divisor_override=1)[:, 0] - values
-    count = torch.nn.functional.avg_pool2d(torch.ones_like(values[:1, None]), 3, 1, 1, divisor_override=1)[:, 0] - 1.0
-    return (sums / count.clamp(min=1)).clamp(min=0)
+    """Mean of the eight pixels around each one, (..., row, column), as far as they lie in its row of tiles."""
+    sums = torch.nn.functional.avg_pool2d(values, 3, 1, 1, divisor_override=1) - values
+    count = torch.nn.functional.avg_pool2d(torch.ones_like(values[:1, :1]), 3, 1, 1, divisor_override=1) - 1.0
+    return sums.div_(count.clamp(min=1)).clamp_(min=0)
 
 
-def _powers_of_two(rates: Tensor) -> Tensor:
-    """The nearest that are allowed, of places a pass."""
-    return torch.exp2(torch.log2(rates.clamp(LEAST / ONE, MOST / ONE)).round())
+def _powers_of_two(exponents: Tensor) -> Tensor:
+    """The nearest that are allowed, of places a pass, to powers with these exponents; -inf is no place."""
+    return torch.exp2(exponents.clamp(math.log2(LEAST / ONE), math.log2(MOST / ONE)).round())
 
 
 def places_between(rates: Tensor, first: int, last: int) -> Tensor:
@@ -126,14 +128,15 @@ def list_looks(pixels: Tensor, first: int, last: int, rates: Tensor | None, plac
     if rates is None or places is None:
         passes = torch.arange(first, last, dtype=torch.int32, device=pixels.device).repeat_interleave(len(pixels))
         return Looks(pixels.repeat(last - first), passes, passes)
-    count = places_between(rates, first, last).long()
-    of_ray = torch.repeat_interleave(torch.arange(len(pixels)), count)
-    number = torch.arange(len(of_ray)) - (torch.cumsum(count, 0) - count)[of_ray]
-    rate, begin = rates[of_ray], last_look(first)
+    count, begin = places_between(rates, first, last), last_look(first)
+    before = torch.cumsum(count, 0, dtype=torch.int32) - count
+    # All that a ray takes from its pixel at once; with its number in the list the second and last become its own.
+    of_pixel = torch.stack([pixels, places - before, rates, rates * (first - begin) // ONE - before + 1], 1)
+    pixel, place, rate, kth = of_pixel.repeat_interleave(count.long(), 0).unbind(1)
+    number = torch.arange(len(pixel), dtype=torch.int32)
     # Place k behind a look comes in the first pass in which rate / ONE times the passes since that look reaches k.
-    kth = rate * (first - begin) // ONE + number.int() + 1
-    passes = begin - 1 + (ONE * kth + rate - 1) // rate
-    return Looks(pixels[of_ray], places[of_ray] + number.int(), passes)
+    passes = begin - 1 + (ONE * (kth + number) + rate - 1) // rate
+    return Looks(pixel.contiguous(), place + number, passes)
 
 
 def count_places(sums: FrameSums, pixels: Tensor, rates: Tensor | None, first: int, last: int) -> None:
