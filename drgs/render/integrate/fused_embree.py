@@ -127,27 +127,28 @@ def shade_chunks(
         sum_point(point_at(points, listed), (listed - begin) * count, points, samples, scratch.rays, bounces, sums)
 
 
-_scratches = threading.local()
+class ScratchOfThread(threading.local):
+    """Final. Each thread's own, made once for chunks of one kind: launches come by the hundred."""
+
+    kind: tuple[int, int] | None = None
+    """Rays of a chunk; 0, 1, or 2 bounces for more."""
+
+    def __init__(self) -> None:
+        self.scratch, self.counts = FusedScratch(), torch.zeros(3, dtype=torch.int32)
+
+    def fit(self, rays: int, bounces: int) -> None:
+        """Space for chunks of so many rays, whose counts are 0."""
+        self.counts.zero_()
+        if self.kind == (rays, min(bounces, 2)):
+            return
+        self.kind = rays, min(bounces, 2)
+        self.scratch.rays = ray_samples(rays, torch.device("cpu"))
+        self.scratch.even = path_arrays(rays if bounces > 0 else 0)
+        self.scratch.odd = path_arrays(rays if bounces > 1 else 0)
+        self.scratch.counts = warp_array(self.counts)
 
 
-def _scratch(rays: int, bounces: int) -> tuple[Any, torch.Tensor]:
-    """Scratch of the calling thread for chunks of so many rays, and its counts (3,); made once, for launches come by the hundred.
-
-    Args:
-        bounces: 0, 1, or 2 for more.
-    """
-    of_thread: dict[tuple[int, int], tuple[Any, torch.Tensor]] = _scratches.__dict__
-    found = of_thread.get((rays, bounces))
-    if found is None:
-        of_thread.clear()  # pictures of another kind have come
-        counts, scratch = torch.zeros(3, dtype=torch.int32), FusedScratch()
-        scratch.rays = ray_samples(rays, torch.device("cpu"))
-        scratch.even = path_arrays(rays if bounces > 0 else 0)
-        scratch.odd = path_arrays(rays if bounces > 1 else 0)
-        scratch.counts = warp_array(counts)
-        found = of_thread[rays, bounces] = scratch, counts
-    found[1].zero_()
-    return found
+_of_thread = ScratchOfThread()
 
 
 class FusedEmbreeIntegrator(AbstractIntegrator):
@@ -161,7 +162,7 @@ class FusedEmbreeIntegrator(AbstractIntegrator):
 
     def shade_slice(self, estimate: Estimate, first: int, last: int) -> int:
         chunk = max(1, RAYS_A_CHUNK // estimate.rays_a_point)
-        scratch, counts = _scratch(chunk * estimate.rays_a_point, min(estimate.bounces, 2))
+        _of_thread.fit(chunk * estimate.rays_a_point, estimate.bounces)
         remembered = RememberedRays()
         if estimate.known is not None:
             remembered.known = traced_arrays(estimate.known)
@@ -169,5 +170,6 @@ class FusedEmbreeIntegrator(AbstractIntegrator):
             remembered.kept = traced_arrays(estimate.kept)
         inputs: list[Any] = [self.tracer.handle, first, last, chunk, estimate.bounces]
         inputs += [estimate.points, estimate.starts, estimate.scene, estimate.samples]
-        wp.launch(shade_chunks, dim=-(-(last - first) // chunk), inputs=inputs, outputs=[remembered, scratch, estimate.sums], device="cpu")
-        return int(counts[2])
+        outputs = [remembered, _of_thread.scratch, estimate.sums]
+        wp.launch(shade_chunks, dim=-(-(last - first) // chunk), inputs=inputs, outputs=outputs, device="cpu")
+        return int(_of_thread.counts[2])
