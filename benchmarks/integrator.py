@@ -1,6 +1,6 @@
 """Light transport against an independent path tracer: error, bias and time, in one run.
 
-    python -m benchmarks integrator --reference DIR [--spp 8 32 128] [--variants paper sobol plan svgf oidn] [--mitsuba] [--json] [--plots OUT]
+    python -m benchmarks integrator --reference DIR [--spp 8 32 128] [--variants paper sobol plan svgf oidn] [--mitsuba] [--seeds N] [--json] [--plots OUT]
 
 DIR holds mesh.ply, cameras.json, env_*.exr, `<env>_<direct|bounce1>_<camera>.exr` (linear, premultiplied, many
 samples) and `*_se.npy` (standard error of each pixel's mean). relmse = mean over covered pixels and channels of
@@ -12,6 +12,8 @@ numbers; `sobol`, low-discrepancy numbers; `plan`, what the scene does not need 
 as many. --plots draws error against processor time, with the curve of Mitsuba that lies with the reference (another machine's clock).
 With --mitsuba the same images are rendered by Mitsuba's path tracer in the same run (_mitsuba.py), and `time_to_error` gives for both the time
 to relmse 0.01 and 0.003, read off the measured points (log-log between them, error ~ 1 / time beyond).
+--seeds N also compares the mean of N pictures with the most samples (`over_seeds`): where ten pixels of a lamp's mirror image hold three quarters of
+the noise of the sum, one picture's bias says little.
 """
 
 import argparse
@@ -191,6 +193,17 @@ def independent(scene: PosedScene, camera: Camera, settings: RenderSettings, tra
     return state
 
 
+def of_mean(pictures: list[np.ndarray], reference: np.ndarray, standard_error: np.ndarray) -> dict:
+    """Figures of the mean of pictures of several seeds, and how far one's sum lies from another's (`spread`, a share of it).
+
+    Of one picture a few pixels may hold most of the noise of the sum: what is bias, only several tell.
+    """
+    variance = np.var([picture.mean(-1) for picture in pictures], axis=0, ddof=1) / len(pictures)
+    sums = np.array([picture.sum(dtype=np.float64) for picture in pictures])
+    spread = {"seeds": len(pictures), "spread": float(sums.std(ddof=1) / sums.mean())}
+    return compare(np.mean(pictures, axis=0), variance, reference, standard_error) | spread
+
+
 def mitsubas(scene: PosedScene, camera: Camera, bounces: int, seed: int, samples: list[int]) -> Iterator[Shot]:
     """As `ours`; each picture is made from nothing, its own variance is not told."""
     from benchmarks._mitsuba import MitsubaScene
@@ -227,6 +240,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--cameras", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--counts", type=int, nargs=3, help="cosine, GGX and environment samples a pass")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=1, help="also the bias of the mean of so many seeds, with the most samples")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--pictures", type=Path, help="folder for linear images and differences (npy)")
     parser.add_argument("--no-skip", action="store_true", help="without the plan: the same as --variants sobol")
@@ -243,7 +257,7 @@ def main(argv: list[str] | None = None) -> None:
         oidn_filter()  # complain before measuring
     mesh = read_mesh(folder / "mesh.ply")
     tracer = build_tracer(mesh)
-    rows, times = [], []
+    rows, times, means = [], [], []
     for env in arguments.env:
         table = read_exr(folder / f"env_{env}.exr")[..., :3]
         environment = Environment(torch.from_numpy(mitsuba_rows(table) if arguments.mitsuba_rows else table.copy()))
@@ -272,6 +286,13 @@ def main(argv: list[str] | None = None) -> None:
                     maps = np.stack([taken.mean, reference[..., :3], np.repeat(taken.variance[..., None], 3, -1)])
                     np.save(arguments.pictures / f"{env}_{light}_{number}.npy", maps)
             rows += [row for of_renderer in of_image.values() for row in of_renderer]
+            if arguments.seeds > 1:
+                looks = [replace(settings, seed=arguments.seed + k) for k in range(arguments.seeds)]
+                pictures = [next(ours(scene, camera, look, tracer, [max(arguments.spp)], ["plan"])).mean for look in looks]
+                row = {"env": env, "light": light, "camera": number, "spp": max(arguments.spp)}
+                row |= of_mean(pictures, reference, standard_error)
+                means.append(row)
+                _print(row, arguments.json)
             if arguments.plots:
                 arguments.plots.mkdir(parents=True, exist_ok=True)
                 stored = stored_curve(folder, env, light) if number == 0 else []
@@ -284,7 +305,7 @@ def main(argv: list[str] | None = None) -> None:
                 times.append(row)
                 _print(row, arguments.json)
     if arguments.json:
-        print(json.dumps({"rows": rows, "time_to_error": times}))
+        print(json.dumps({"rows": rows, "time_to_error": times, "over_seeds": means}))
 
 
 def _print(row: dict, as_json: bool) -> None:
