@@ -32,6 +32,25 @@ class FirstHit:
     """Weights of the face's second and third vertex."""
 
 
+@wp.struct
+class MiddleView:
+    """A camera that looks through the middles of pixels."""
+
+    image_width: int
+    image_height: int
+    camera_from_pixel: wp.mat33
+    world_from_camera: wp.mat33
+    center: wp.vec3
+    axis: wp.vec3
+    """Unit viewing axis [world]."""
+
+
+@wp.func
+def middle_direction(view: MiddleView, x: int, y: int) -> wp.vec3:
+    """Unit, through a pixel's middle [world]."""
+    return wp.normalize(view.world_from_camera * (view.camera_from_pixel * wp.vec3(float(x) + 0.5, float(y) + 0.5, 1.0)))
+
+
 @dataclass(frozen=True)
 class KernelQuery:
     """How a kernel finds first hits itself; a kernel is made for each tracer's."""
@@ -40,6 +59,9 @@ class KernelQuery:
     """wp.func of a handle, a ray's origin and direction and its reach [world units] -> FirstHit."""
     handle_type: Any
     """Of its first argument."""
+    block_fn: Any = None
+    """wp.func of a handle, a MiddleView, the first x and y of four by four pixels, faces and barycentrics of all pixels, which it writes where
+    there is something to see -> of how many. Where one ray's answer may depend on its neighbours'. None: by closest_fn."""
 
 
 class AbstractTracer(ABC):

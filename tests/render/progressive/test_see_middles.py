@@ -1,11 +1,16 @@
 """What a moving picture sees through the middles of pixels: sixteen rays at once are the rays one by one, and tiles without a surface are told."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.intersect.tracer_embree import EmbreeTracer
-from drgs.render.progressive.see_middles import Middles, see_by_points, see_by_sixteens
-from drgs.render.visible.image_tiles import tile_grid, tile_of_pixels
+from drgs.render.intersect.tracer_warp import WarpTracer
+from drgs.render.progressive.see_middles import Middles, see_middles
+from drgs.render.visible.image_tiles import pixels_of_tiles, tile_grid, tile_of_pixels
+from drgs.render.visible.trace_primary import trace_primary_points
 from drgs.scene.camera import Camera
 from drgs.scene.mesh import TriangleMesh
 from tests.render.closed_form_scenes import crumpled_mesh, front_camera, two_spheres
@@ -19,10 +24,20 @@ def camera_of(width: int, height: int, aside: float = 0.0) -> Camera:
     return Camera(camera.camera_from_world, intrinsics, width, height)
 
 
+class RayByRay(EmbreeTracer):
+    """Final. Without a way to take neighbours at once."""
+
+    kernel_query = replace(EmbreeTracer.kernel_query, block_fn=None)
+
+
 def seen_both_ways(mesh: TriangleMesh, camera: Camera) -> tuple[Middles, Middles]:
+    everywhere = all_tiles(camera)
+    return see_middles(EmbreeTracer(mesh), camera, everywhere), see_middles(RayByRay(mesh), camera, everywhere)
+
+
+def all_tiles(camera: Camera) -> torch.Tensor:
     across, down = tile_grid(camera.width, camera.height)
-    tracer, everywhere = EmbreeTracer(mesh), torch.ones(across * down, dtype=torch.bool)
-    return see_by_sixteens(tracer, camera, everywhere), see_by_points(tracer, camera, everywhere)
+    return torch.ones(across * down, dtype=torch.bool)
 
 
 def assert_close(found: object, wanted: object) -> None:
@@ -46,6 +61,20 @@ def test_sixteen_rays_at_once_see_what_single_rays_see(mesh: TriangleMesh, width
         found, wanted = (getattr(seen.primary.starts, name)[same] for seen in (at_once, one_by_one))
         torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-5)
     assert torch.equal(at_once.tiles, one_by_one.tiles) and at_once.window == one_by_one.window
+
+
+@pytest.mark.parametrize("tracer", [RayByRay(crumpled_mesh()), WarpTracer(crumpled_mesh())], ids=["embree", "warp"])
+def test_single_rays_are_those_of_a_picture_without_jitter(tracer: AbstractTracer) -> None:
+    camera = camera_of(45, 70, 11.3)
+    seen = see_middles(tracer, camera, all_tiles(camera)).primary
+    wanted = trace_primary_points(
+        tracer, camera, 0, 0, jitter=False, pixels=pixels_of_tiles(all_tiles(camera), camera.width, camera.height)
+    )
+    assert torch.equal(seen.points.pixel, wanted.points.pixel) and len(seen.depth) > 50
+    assert torch.equal(seen.starts.face, wanted.starts.face)
+    assert_close(seen.points, wanted.points)
+    assert_close(seen.starts, wanted.starts)
+    torch.testing.assert_close(seen.depth, wanted.depth)
 
 
 def test_tiles_that_show_something_are_told_and_places_are_the_points_numbers() -> None:

@@ -1,7 +1,7 @@
-// The first hits of camera rays through the middles of a block of four by four pixels, CPU only. Body of a Warp native function; see_middles.py
+// The first hits of camera rays through the middles of a block of four by four pixels, CPU only. Body of a Warp native function; tracer_embree.py
 // puts simd_vector.h before it. Embree takes the sixteen rays together: neighbours go down the tree side by side.
 //
-// in   embree, intersect_sixteen_fn (the address of rtcIntersect16), view, x, y (the block's first pixel in the image)
+// in   embree, view, x, y (the block's first pixel in the image)
 // out  face and barycentric of the block's pixels that show something; how many do
 
 // RTCRayHit16 of Embree 4, with space for what builds of it may add behind.
@@ -41,7 +41,7 @@ for (int k = 0; k < 6; ++k) rays.spare[k] = i16(-1);
 alignas(64) int valid[16];
 *(i16*)valid = (column < view.image_width) & (row < view.image_height);
 Arguments arguments = {COHERENT, ALL_FEATURES, nullptr, nullptr, nullptr, {}};
-((IntersectFn)intersect_sixteen_fn)(valid, (void*)embree.scene, &rays, &arguments);
+((IntersectFn)embree.intersect_sixteen_fn)(valid, (void*)embree.scene, &rays, &arguments);
 int seen = 0;
 for (int k = 0; k < 16; ++k) {
     if (valid[k] == 0 || rays.geometry[k] == -1) continue;
