@@ -5,7 +5,8 @@
 A variant is a name and settings that differ from the preset (measures/variants.py). Each build is a process of its own in
 DIR/SCENE/VARIANT/seed_K. A finished row stands in DIR/rows.jsonl and is not run again; DIR/table.md holds the main figures, and differences to the
 first variant: with several seeds those within twice the spread (most less least) are in brackets, for they may be noise. DIR/curves holds PSNR
-and surfels over minutes and iterations. Rows that failed are tried again by the next call.
+and surfels over minutes and iterations, and where variants begin with different presets, what each build reached over the time it took
+(benchmarks/presets.toml: draft, fast, full and two between). Rows that failed are tried again by the next call.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks._plot import Curve, linear_svg
 from benchmarks.measures.bench_scene import BenchScene, open_scene
 from benchmarks.measures.build_process import built_asset, read_events
 from benchmarks.measures.build_variant import variant_command
@@ -59,8 +61,13 @@ COLUMNS = (
     Column("lamps", "light.", ".brightest_energy_scaled"),
     Column("surfels", "asset.", ".surfels", 0),
     Column("seconds", "build.", ".seconds", 0),
+    Column("CPU s", "build.", ".cpu_seconds", 0),
     Column("MiB", "build.", ".peak_memory_mib", 0),
 )
+
+
+REACHED = ("views dB", "relit dB", "deformed dB")
+"""Titles of COLUMNS in the plots over time."""
 
 
 def main(arguments: list[str]) -> None:
@@ -81,15 +88,16 @@ def main(arguments: list[str]) -> None:
     given = parser.parse_args(arguments)
     variants = read_variants(given.variants)
     for variant in variants:
-        apply_overrides(PRESETS[given.preset], variant.overrides)  # complain before the first build
+        apply_overrides(PRESETS[variant.preset or given.preset], variant.overrides)  # complain before the first build
     if given.seeds < 1:
         raise ValueError(f"--seeds is {given.seeds}; expected at least 1")
     settings = QualitySettings(tuple(given.parts), given.spp, given.views)
     scenes = [open_scene(scene_folder(folder, given.out / folder.name / "capture", given.side)) for folder in given.scenes]
 
     def run(scene: BenchScene, variant: Variant, seed: int, work: Path) -> dict:
-        command = variant_command(scene.folder, work / "asset", given.preset, variant.name, variant.overrides, seed, given.device)
-        what = {"preset": given.preset, "overrides": variant.overrides, "seed": seed}
+        preset = variant.preset or given.preset
+        command = variant_command(scene.folder, work / "asset", preset, variant.name, variant.overrides, seed, given.device)
+        what = {"preset": preset, "overrides": variant.overrides, "seed": seed}
         build = built_asset(command, work, what)
         return {"build": build} | measure_asset(scene, load_asset(work / "asset"), work, settings)
 
@@ -97,6 +105,8 @@ def main(arguments: list[str]) -> None:
     table = main_table(rows, [variant.name for variant in variants])
     (given.out / "table.md").write_text(table + "\n")
     write_curves(given.out / "curves", progress_of(rows, given.out))
+    if any(variant.preset for variant in variants):
+        write_reached(given.out / "curves", rows)
     print(table, file=sys.stderr)
     if given.json:
         print(json.dumps({"rows": rows, "failed": read_failures(given.out)}))
@@ -124,7 +134,7 @@ def run_rows(
             for variant in variants:
                 key = {"scene": scene.name, "variant": variant.name, "seed": seed}
                 row = next((row for row in kept if all(row[name] == value for name, value in key.items())), None)
-                asked = {"preset": preset, "overrides": variant.overrides}
+                asked = {"preset": variant.preset or preset, "overrides": variant.overrides}
                 if row is not None and {name: row[name] for name in asked} != asked:
                     raise ValueError(
                         f"{out} holds a row of {variant.name} with {row['preset']}, {row['overrides']}; expected {asked}: rename it"
@@ -215,6 +225,18 @@ def progress_of(rows: list[dict], out: Path) -> dict[str, dict[str, list[dict]]]
         if row["seed"] == 0 and events:
             progress.setdefault(row["scene"], {})[row["variant"]] = events
     return progress
+
+
+def write_reached(folder: Path, rows: list[dict]) -> None:
+    """reached_SCENE.svg: the main figures in decibels of each build of seed 0 over its minutes of processor time."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        found = [main_figures(row) for row in rows if row["scene"] == scene and row["seed"] == 0]
+        found = sorted((figures for figures in found if "CPU s" in figures), key=lambda figures: figures["CPU s"])
+        titles = [title for title in REACHED if all(title in figures for figures in found)]
+        curves = [Curve(title, [(figures["CPU s"] / 60, figures[title]) for figures in found]) for title in titles]
+        if curves and found:
+            (folder / f"reached_{scene}.svg").write_text(linear_svg(curves, scene, "processor minutes", "dB"))
 
 
 def commit() -> str | None:

@@ -16,6 +16,8 @@ class BuildRun:
     """What a finished build took."""
 
     seconds: float
+    cpu_seconds: float
+    """Summed over threads; steadier than the clock where other work runs beside."""
     seconds_per_stage: dict[str, float]
     peak_memory_mib: int
 
@@ -55,7 +57,8 @@ def run_build(command: Sequence[str], log: Path | None = None) -> BuildRun:
     # Linux counts in KiB, macOS in bytes.
     peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     stages = {stage: round(seconds, 2) for stage, seconds in last["provenance"]["seconds"].items()}
-    return BuildRun(round(spent + time.perf_counter() - started, 2), stages, round(peak / 2**20))
+    cpu_seconds = round(usage.ru_utime + usage.ru_stime, 2)
+    return BuildRun(round(spent + time.perf_counter() - started, 2), cpu_seconds, stages, round(peak / 2**20))
 
 
 def read_events(log: Path | None) -> list[dict]:
@@ -78,8 +81,8 @@ def built_asset(command: Sequence[str], work: Path, what: dict) -> dict:
         what: says which build it is, so that no other is taken for it.
 
     Returns:
-        {"seconds", "seconds_per_stage", "peak_memory_mib", "resumed"}. Of a build that was killed in between, seconds are those of all its
-        runs, the stages' and the memory those of the last one.
+        {"seconds", "cpu_seconds", "seconds_per_stage", "peak_memory_mib", "resumed"}. Of a build that was killed in between, seconds are those
+        of all its runs, the processor's, the stages' and the memory those of the last one.
 
     Raises:
         ValueError: the folder holds another build, or this one failed.

@@ -1,6 +1,7 @@
 """Variants of a preset: a name and settings that differ, by dotted path on `Preset` (fit.densify.budget = 60000).
 
 As a JSON or TOML file {name: {path: value}}, or as words: `base` (nothing differs), `many:fit.densify.budget=60000,materials.iterations=600`.
+The path `preset` names another preset to begin with: `short:preset=full,surface.passes=6`.
 A variant is checked against the preset before anything is built.
 """
 
@@ -11,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from drgs.reconstruct.presets import PRESETS
+
 BASE = "base"
 
 
@@ -20,6 +23,8 @@ class Variant:
 
     name: str
     overrides: dict[str, Any] = field(default_factory=dict)
+    preset: str | None = None
+    """That it begins with; None: that of the others."""
 
 
 def read_variants(words: list[str]) -> list[Variant]:
@@ -52,7 +57,14 @@ def _from_file(path: Path) -> list[Variant]:
         raise ValueError(f"{path}: is not a readable file of variants ({error})") from error
     if not isinstance(document, dict) or not all(isinstance(overrides, dict) for overrides in document.values()):
         raise ValueError(f'{path}: expected {{"name": {{"fit.iterations": 2000, ...}}, ...}}')
-    return [Variant(name, _flat(overrides)) for name, overrides in document.items()]
+    return [_variant(name, _flat(overrides)) for name, overrides in document.items()]
+
+
+def _variant(name: str, overrides: dict[str, Any]) -> Variant:
+    preset = overrides.pop("preset", None)
+    if preset is not None and preset not in PRESETS:
+        raise ValueError(f"the variant {name} begins with the preset {preset!r}; expected one of {', '.join(PRESETS)}")
+    return Variant(name, overrides, preset)
 
 
 def _flat(overrides: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -78,7 +90,7 @@ def _from_word(word: str) -> Variant:
             overrides[path] = json.loads(value)
         except json.JSONDecodeError:
             overrides[path] = value
-    return Variant(name, overrides)
+    return _variant(name, overrides)
 
 
 def apply_overrides(settings: Any, overrides: dict[str, Any]) -> Any:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from benchmarks.ablate import main, main_figures, main_table, read_rows, run_rows
+from benchmarks.ablate import main, main_figures, main_table, read_rows, run_rows, write_reached
 from benchmarks.measures.bench_scene import BenchScene
 from benchmarks.measures.build_process import built_asset, read_events
 from benchmarks.measures.build_variant import variant_command
@@ -42,6 +42,29 @@ def test_overrides_reach_nested_settings_and_nothing_else() -> None:
     }
     assert apply_overrides(changed, back) == fast
     assert apply_overrides(fast, {"mesh.voxel_size": 0.01}).mesh.voxel_size == 0.01  # None before
+
+
+def test_variants_may_begin_with_presets_of_their_own() -> None:
+    presets = read_variants([str(Path(__file__).parents[2] / "benchmarks/presets.toml")])
+    assert [(variant.name, variant.preset) for variant in presets] == [
+        ("draft", "draft"), ("fast", "fast"), ("fast_longer", "fast"), ("full_shorter", "full"), ("full", "full"),
+    ]  # fmt: skip
+    for variant in presets:
+        assert variant.preset is not None
+        apply_overrides(PRESETS[variant.preset], variant.overrides)
+    assert read_variants(["short:preset=full,surface.passes=6"]) == [Variant("short", {"surface.passes": 6}, "full")]
+    with pytest.raises(ValueError, match="begins with the preset 'ful'; expected one of draft, fast, full"):
+        read_variants(["short:preset=ful"])
+
+
+def test_what_builds_reached_is_drawn_over_the_time_they_took(tmp_path: Path) -> None:
+    rows = [
+        {"scene": "ball", "variant": name, "seed": 0, "build": {"cpu_seconds": seconds}, "figures": {"views": {"mean": {"psnr": psnr}}}}
+        for name, seconds, psnr in (("slow", 600.0, 31.0), ("quick", 60.0, 28.0))
+    ]
+    write_reached(tmp_path, rows)
+    drawn = (tmp_path / "reached_ball.svg").read_text()
+    assert "views dB" in drawn and "relit dB" not in drawn and "processor minutes" in drawn
 
 
 @pytest.mark.parametrize(
