@@ -51,8 +51,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     metafunc.parametrize("device", [asked] if asked else ["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
 
 
-LONGEST_IN_BROWSER = "tests/web/test_whole_path.py"
-"""It waits for builds of a worker, which gives way to everything else on the machine: it begins first, and has a process for itself."""
+LONGEST_IN_BROWSER = "tests/web/test_whole_path"
+"""The file of that name waits for builds of a worker, which gives way to everything else on the machine: it begins first, and has a process for itself
+and for the one behind it, which takes files of what was built."""
 
 
 HALF_WAY = "tests/web/test_g"
