@@ -38,7 +38,7 @@ from drgs.cli_options import (
     open_asset,
     picture_size,
 )
-from drgs.exchange.export_formats import CommandFormat, command_format_of, refuse_faces
+from drgs.exchange.export_formats import VARIANT_FORMATS, CommandFormat, command_format_of, refuse_faces
 from drgs.installation import unsupported_system
 from drgs.maths.constants import STILL_BOUNCES
 from drgs.openmp import spin_briefly
@@ -248,7 +248,7 @@ def export(
     if chosen == "sog" or chosen == "compressed":
         refuse_faces(faces, (chosen,))
         if variants is not None:
-            raise UsageError(f"format {chosen!r} holds no material variants; expected glb or mesh")
+            raise UsageError(f"format {chosen!r} holds no material variants; expected {', '.join(VARIANT_FORMATS)}")
         left_out = transform_splats(load_asset(asset), out, chosen)
     else:
         left_out = export_asset(load_asset(asset), out, chosen, faces, None if variants is None else load_variants(variants))

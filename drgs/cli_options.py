@@ -97,7 +97,7 @@ FaceLimit = Annotated[
     typer.Option(help="The most that a textured mesh (glb, mesh, usdz, usd) has.", show_default=str(DEFAULT_FACES), min=FEWEST_FACES),
 ]
 VariantsPath = Annotated[
-    Path | None, typer.Option(help="Other materials of a GLB: JSON, lists of material edits by name (docs/formats.md).")
+    Path | None, typer.Option(help="Other materials of a GLB or a page: JSON, lists of material edits by name (docs/formats.md).")
 ]
 SheetPath = Annotated[
     Path | None,

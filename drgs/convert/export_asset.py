@@ -59,7 +59,7 @@ def export_asset(
 
     Args:
         faces: the most that a textured mesh has; the detail of those left out goes into its textures. None: DEFAULT_FACES.
-        variants: other materials of a GLB's mesh, by KHR_materials_variants; textures are baked for each.
+        variants: other materials of the mesh: of a GLB by KHR_materials_variants, with textures baked for each, or to be chosen on a page.
         shown: what a file with variants calls the asset as it is.
 
     Returns:
@@ -80,7 +80,7 @@ def export_asset(
     refuse_faces(faces, (format,))
     if variants is not None:
         if format not in VARIANT_FORMATS:
-            raise ValueError(f"format {format!r} holds no material variants; expected {' or '.join(VARIANT_FORMATS)}")
+            raise ValueError(f"format {format!r} holds no material variants; expected {', '.join(VARIANT_FORMATS)}")
         refuse_variants(variants)
     if format in ("usd", "usdz"):
         refuse_unwritable(out, for_ar=format == "usdz")
@@ -111,7 +111,7 @@ def export_asset(
         elif format == "html":
             from drgs.convert.page.encode_page import encode_page  # here: only pages need it
 
-            page = encode_page(asset)
+            page = encode_page(asset, dict(zip(variants or (), variant_meshes(asset, variants or {}), strict=True)), shown)
             left_out = "" if page.faces == len(asset.mesh.faces) else f"{page.faces} of the mesh's {len(asset.mesh.faces)} faces"
             temporary.write_bytes(page.html)
         else:

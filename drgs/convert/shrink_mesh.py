@@ -3,12 +3,16 @@
 In and out: a TriangleMesh. Corners at one place are joined first, so that faces which share none can shrink too.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import fast_simplification
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from drgs.maths.unique_rows import unique_rows
 from drgs.scene.mesh import TriangleMesh
@@ -19,8 +23,14 @@ AGGRESSIVENESS = 5
 
 def shrink_mesh(mesh: TriangleMesh, most_faces: int) -> TriangleMesh:
     """The mesh with about `most_faces` faces or fewer; the mesh itself where it has no more."""
+    return shrink_worn([mesh], most_faces)[0]
+
+
+def shrink_worn(worn: Sequence[TriangleMesh], most_faces: int) -> list[TriangleMesh]:
+    """`shrink_mesh` of one mesh in several materials, which still have their shape in common: what is left of it depends on nothing else."""
+    mesh = worn[0]
     if len(mesh.faces) <= most_faces:
-        return mesh
+        return list(worn)
     points = mesh.vertices.double().numpy()
     low, extent = points.min(0), max(float(np.ptp(points, axis=0).max()), 1e-12)
     joined, place_of = (found.numpy() for found in unique_rows(torch.from_numpy(points)))
@@ -31,16 +41,21 @@ def shrink_mesh(mesh: TriangleMesh, most_faces: int) -> TriangleMesh:
     )
     used, faces = np.unique(faces[_has_three_corners(faces)], return_inverse=True)
     vertices = simple[used].astype(np.float64) * extent + low
-    values = torch.cat([mesh.normals, mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], -1)
-    means = torch.from_numpy(_means_around(vertices, points, values.double().numpy())).float()
-    return TriangleMesh(
+    materials = [torch.cat([one.albedo, one.roughness[:, None], one.metallic[:, None]], -1) for one in worn]
+    values = torch.cat([mesh.normals, *materials], -1)
+    normals, *means = torch.from_numpy(_means_around(vertices, points, values.double().numpy())).float().split([3, *[5] * len(worn)], dim=1)
+    small = TriangleMesh(
         torch.from_numpy(vertices).float(),
         torch.from_numpy(faces.reshape(-1, 3)).int(),
-        torch.nn.functional.normalize(means[:, :3], dim=-1),
-        means[:, 3:6].contiguous(),
-        means[:, 6].contiguous(),
-        means[:, 7].contiguous(),
+        torch.nn.functional.normalize(normals, dim=-1),
+        *_channels(means[0]),
     )
+    return [small, *(replace(small, **dict(zip(("albedo", "roughness", "metallic"), _channels(mean), strict=True))) for mean in means[1:])]
+
+
+def _channels(material: Float[Tensor, "vertex 5"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Albedo, roughness and metallic."""
+    return material[:, :3].contiguous(), material[:, 3].contiguous(), material[:, 4].contiguous()
 
 
 def _has_three_corners(faces: ndarray) -> ndarray:

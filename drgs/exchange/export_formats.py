@@ -87,7 +87,7 @@ SPLAT_KINDS: dict[SplatFormat, FileKind] = {
     ),
 }
 """By splat-transform: the service has none of these."""
-VARIANT_FORMATS: tuple[ExportFormat, ...] = ("glb", "mesh")
+VARIANT_FORMATS: tuple[ExportFormat, ...] = ("glb", "mesh", "html")
 """They hold other materials of the same mesh."""
 TEXTURED_FORMATS: tuple[ExportFormat, ...] = tuple(name for name in EXPORT_FORMATS if FILE_KINDS[name].textured)
 

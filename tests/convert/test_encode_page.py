@@ -19,9 +19,11 @@ from drgs.convert.page import encode_page
 from drgs.convert.page.pack_arrays import in_order_of_use, pack_arrays, rgbe, steps_from_newest
 from drgs.convert.page.page_lights import page_lights
 from drgs.convert.shrink_mesh import shrink_mesh
+from drgs.deform.pose_scene import pose_scene
 from drgs.maths.color import luminance
 from drgs.maths.spherical_harmonics import sh_basis
 from drgs.scene.asset import Asset
+from drgs.scene.edits import AS_CAPTURED, AS_SHOWN, parse_edits
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh
 from tests.convert.test_export_asset import ball_asset
@@ -80,9 +82,9 @@ def test_a_page_holds_shape_and_materials_of_the_mesh():
     assert len(places) == len(mesh.vertices) and distance.max() < detail["place_step"]
     faces = original.numpy()[np.array(corners).reshape(-1, 3)]
     assert sorted(map(tuple, faces.tolist())) == sorted(map(tuple, mesh.faces.tolist())), "the same faces, wound the same way"
-    assert np.abs((arrays["mesh0.albedo_roots"] / 255) ** 2 - mesh.albedo.numpy()[original]).max() < 0.005
+    assert np.abs((arrays["mesh0.albedo_roots0"] / 255) ** 2 - mesh.albedo.numpy()[original]).max() < 0.005
     surface = torch.stack([mesh.roughness, mesh.metallic], -1).numpy()[original]
-    assert np.abs(arrays["mesh0.surface"] / 255 - surface).max() < 0.003
+    assert np.abs(arrays["mesh0.surface0"] / 255 - surface).max() < 0.003
     flat = arrays["mesh0.normals"] * 2 / (detail["normal_steps"] - 1) - 1
     normals = np.concatenate([flat, 1 - np.abs(flat).sum(1, keepdims=True)], -1)
     normals[:, :2] -= np.maximum(-normals[:, 2:], 0) * np.sign(normals[:, :2])
@@ -90,6 +92,29 @@ def test_a_page_holds_shape_and_materials_of_the_mesh():
     assert cosine.min() > np.cos(np.radians(0.15))
     assert header["faces"] == {"kept": len(mesh.faces), "all": len(mesh.faces)} and page.faces == len(mesh.faces)
     assert [light["name"] for light in header["lights"]] == ["As captured", "Studio", "Day", "Evening"] and detail["closed"]
+    assert header["materials"] == [AS_CAPTURED]
+
+
+@pytest.mark.slow
+def test_a_page_holds_its_variants_at_the_same_vertices_in_both_of_its_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(bake_transfer, "DIRECTIONS", 16)  # how finely shadows are baked is not asked here
+    monkeypatch.setattr(encode_page, "COARSE_FACES", 300)
+    asset = ball_asset()
+    cap = {"sphere": {"center": [0, 0, 3], "radius": 1, "falloff": 0.1}}
+    edits = {"Cap": parse_edits([{"op": "material", "select": cap, "set": {"albedo": [0.9, 0.1, 0.1], "metallic": 1.0}}])}
+    export_asset(asset, tmp_path / "page.html", "html", variants=edits, shown=AS_SHOWN)
+    header, arrays = held((tmp_path / "page.html").read_bytes())
+    assert header["materials"] == [AS_SHOWN, "Cap"] and len(header["meshes"]) == 2
+    worn = pose_scene(asset, edits["Cap"]).mesh
+    for number, mesh in enumerate((asset.mesh, worn)):
+        places = arrays["mesh0.places"] * header["meshes"][0]["place_step"] + np.array(header["meshes"][0]["low"])
+        original = torch.cdist(torch.tensor(places), mesh.vertices.double()).argmin(1).numpy()
+        assert np.abs((arrays[f"mesh0.albedo_roots{number}"] / 255) ** 2 - mesh.albedo.numpy()[original]).max() < 0.005
+        assert np.abs(arrays[f"mesh0.surface{number}"][:, 1] / 255 - mesh.metallic.numpy()[original]).max() < 0.003
+    low, high = np.array(header["meshes"][1]["low"])[2], header["meshes"][1]["high"][2]
+    heights = (arrays["mesh1.places"] * header["meshes"][1]["place_step"])[:, 2] + low
+    captured, cap_metal = (arrays[f"mesh1.surface{number}"][:, 1] / 255 for number in (0, 1))
+    assert (cap_metal[heights > high - 0.2] > 0.9).all() and (np.abs(cap_metal - captured)[heights < 1.8] == 0).all()
 
 
 def test_titles_of_strangers_are_text():

@@ -97,7 +97,7 @@ def test_a_file_that_is_none_is_refused_with_a_sentence(tmp_path: Path, text: st
 
 
 def test_formats_that_hold_none_refuse_them(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="expected glb or mesh"):
+    with pytest.raises(ValueError, match="expected glb, mesh, html"):
         export_asset(ball_asset(), tmp_path / "a.ply", "ply", variants={"Gold": parse_edits(GOLD)})
 
 

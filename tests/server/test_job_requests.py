@@ -87,7 +87,7 @@ VIEW = {"eye": [0, -3, 1], "target": [0, 0, 0]}
         ({"kind": "simulate", "asset": ASSET, "scene": {"gravity": "much"}}, 422, "gravity"),
         ({"kind": "export", "asset": ASSET, "formats": ["glb", "glb"]}, 422, "once"),
         ({"kind": "export", "asset": ASSET, "formats": ["glb"], "faces": 3}, 422, "faces"),
-        ({"kind": "export", "asset": ASSET, "formats": ["ply"], "variants": [{"name": "a", "edits": []}]}, 422, "expected glb or mesh"),
+        ({"kind": "export", "asset": ASSET, "formats": ["ply"], "variants": [{"name": "a", "edits": []}]}, 422, "expected glb, mesh, html"),
         ({"kind": "export", "asset": ASSET, "formats": ["glb"], "variants": [{"name": "a", "edits": []}] * 2}, 422, "the same name"),
         ({"kind": "export", "asset": ASSET, "formats": ["ply", "env"], "faces": 100}, 422, "no textures; expected glb, mesh, usdz, usd"),
         (RENDER | {"environments": ["none.exr"]}, 422, "No environment"),

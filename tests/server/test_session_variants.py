@@ -1,7 +1,10 @@
-"""Variants of a session over REST and the client: edits that change nothing by themselves, put in force, renamed and undone; and in its GLB."""
+"""Variants of a session over REST and the client: edits that change nothing by themselves, put in force, renamed and undone; and in its GLB and page."""
 
+import base64
 import json
+import re
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -87,3 +90,15 @@ def test_a_glb_of_a_session_holds_its_variants(service: Service, tmp_path: Path)
     kept = [{"op": "variant", "name": "Matt", "edits": [rough(0.9)]}]
     assert service.client.put(f"/api/sessions/{session}/edits", json={"edits": kept}).status_code == 200
     assert names() == [AS_CAPTURED, "Matt"]
+
+
+@pytest.mark.slow
+def test_a_page_of_a_session_holds_its_variants(service: Service, tmp_path: Path) -> None:
+    _, session = opened(service, tmp_path)
+    assert service.client.put(f"/api/sessions/{session}/variants/Matt", json={"edits": [rough(0.9)]}).status_code == 200
+    answer = service.client.get(f"/api/sessions/{session}/export?format=html")
+    assert answer.status_code == 200, answer.text
+    (packed,) = re.findall(r'type="text/plain">([^<]+)<', answer.text)
+    data = zlib.decompress(base64.b64decode(packed))
+    (length,) = struct.unpack_from("<I", data)
+    assert json.loads(data[4 : 4 + length])["materials"] == [AS_SHOWN, "Matt"]

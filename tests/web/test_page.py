@@ -1,9 +1,10 @@
 """An exported page, opened from a folder without a network: it shows the object, relights it, and asks nobody for anything."""
 
 import io
+import itertools
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from drgs.deform.pose_scene import pose_scene
 from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.asset import Asset
+from drgs.scene.edits import parse_edits
 from drgs.scene.environment import Environment
 from drgs.scene.three_point_lights import paint_three_point_lights
 from tests.patience import PATIENCE_SECONDS
@@ -28,6 +30,18 @@ from tests.web.conftest import wait_until
 SIZE = {"width": 760, "height": 420}
 DIFFERENCE = 4.0
 """Mean over pixels and channels inside the ball, sRGB 0..255: light is filtered instead of sampled, and shadows are nine numbers."""
+
+
+GOLDEN_CAP = {
+    "op": "material",
+    "select": {"sphere": {"center": [0, 0, 0.5], "radius": 0.6}},
+    "set": {"albedo": [1.0, 0.77, 0.34], "metallic": 1.0},
+}
+VARIANTS = {
+    "Golden cap": parse_edits([GOLDEN_CAP]),
+    "Clay": parse_edits([GOLDEN_CAP | {"set": {"roughness": 0.9}, "select": {"all": True}}]),
+}
+"""The second has the name of a preset."""
 
 
 @dataclass
@@ -75,7 +89,7 @@ def ball_page(built: None, ball_file: Path, tmp_path_factory: pytest.TempPathFac
     light = Environment(torch.from_numpy(paint_three_point_lights(128)))
     asset = Asset(None, imported.mesh, None, light, provenance={"dataset": "painted_ball"})
     path = tmp_path_factory.mktemp("page") / "ball with blanks.html"
-    assert export_asset(asset, path, "html") == ""
+    assert export_asset(asset, path, "html", variants=VARIANTS) == ""
     return path, asset
 
 
@@ -109,6 +123,28 @@ def test_the_page_looks_as_the_object_is_rendered(opened: OpenedPage) -> None:
     assert difference < DIFFERENCE
     outside = theirs[~inside & (np.arange(SIZE["height"]) > 60)[:, None]]
     assert np.median(outside) < 80, "the dark of the page around it"
+
+
+def test_variants_are_put_on_as_an_asset_wears_them(opened: OpenedPage, browser: Browser, tmp_path: Path) -> None:
+    """To the last bit: nothing of a ball stands in the way of its own light, so nothing else changes with its material."""
+    page = opened.page
+    page.get_by_role("switch", name="Show the light").uncheck()
+    page.get_by_role("radio", name="Golden cap").check(force=True)
+    worn = opened.picture()
+    assert page.get_by_role("radio", name="Clay").count() == 1, "instead of the preset"
+    asset = replace(opened.asset, mesh=pose_scene(opened.asset, VARIANTS["Golden cap"]).mesh)
+    export_asset(asset, tmp_path / "worn.html", "html")
+    other = open_page(browser, tmp_path / "worn.html", asset, viewport=SIZE)
+    other.page.get_by_role("switch", name="Show the light").uncheck()
+    np.testing.assert_array_equal(worn[60:, :400], other.picture()[60:, :400], "what the panel leaves of the picture")
+    other.page.context.close()
+    page.get_by_role("radio", name="Chrome").check(force=True)
+    chrome = opened.picture()
+    page.get_by_role("radio", name="Clay").check(force=True)
+    clay = opened.picture()
+    page.get_by_role("radio", name="As captured").last.check(force=True)
+    captured = opened.picture()
+    assert min(np.abs(a - b)[60:, :400].mean() for a, b in itertools.combinations((worn, chrome, clay, captured), 2)) > 0.5
 
 
 def test_light_material_and_hand_change_the_picture(opened: OpenedPage) -> None:

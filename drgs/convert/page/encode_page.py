@@ -6,7 +6,7 @@ here: faces are left out, shadows and inter-reflection baked (bake_transfer), li
 
 import base64
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,10 +18,11 @@ from numpy import ndarray
 from drgs.convert.bake_transfer import bake_transfer
 from drgs.convert.page.pack_arrays import in_order_of_use, pack_arrays, rgbe, steps_from_newest
 from drgs.convert.page.page_lights import PageLight, page_lights
-from drgs.convert.shrink_mesh import shrink_mesh
+from drgs.convert.shrink_mesh import shrink_worn
 from drgs.reconstruct.fit.light.split_sum import LEVELS, brdf_table
 from drgs.reconstruct.geometry.extract_mesh.clean_mesh import is_watertight
 from drgs.scene.asset import Asset
+from drgs.scene.edits import AS_CAPTURED
 from drgs.scene.mesh import TriangleMesh, on_cpu
 
 PROGRAM = Path(__file__).with_name("page.html")
@@ -46,8 +47,13 @@ class Page:
     faces: int
 
 
-def encode_page(asset: Asset) -> Page:
+def encode_page(asset: Asset, variants: Mapping[str, TriangleMesh] | None = None, shown: str = AS_CAPTURED) -> Page:
     """The asset as a page of at most MOST_BYTES.
+
+    Args:
+        variants: the asset's mesh in other materials, by the names of their buttons. Shadows and the light that the object throws onto itself
+            stay those of the asset's own.
+        shown: what the page calls the asset's own material.
 
     Raises:
         ValueError: the page's program is not built, the asset has no faces, or they do not shrink far enough.
@@ -56,17 +62,20 @@ def encode_page(asset: Asset) -> Page:
     if not len(asset.mesh.faces):
         raise ValueError("the asset's mesh has no faces; a page needs some to show")
     mesh = on_cpu(asset.mesh)
-    coarse = shrink_mesh(mesh, COARSE_FACES)
+    worn = [mesh, *(on_cpu(variant) for variant in (variants or {}).values())]
+    names = [shown, *(variants or ())]
+    coarse = shrink_worn(worn, COARSE_FACES)
     lights, factors = page_lights(asset.environment), _brdf_bytes()
     most = MOST_FACES
     for _ in range(ATTEMPTS):
-        small = shrink_mesh(mesh, most)
-        page = _filled(program, asset, (small, coarse) if len(coarse.faces) < len(small.faces) else (small,), lights, factors)
+        small = shrink_worn(worn, most)
+        kept = len(small[0].faces)
+        page = _filled(program, asset, names, (small, coarse) if len(coarse[0].faces) < kept else (small,), lights, factors)
         if len(page) <= MOST_BYTES:
-            return Page(page, len(small.faces))
-        most = int(ROOM * MOST_BYTES / len(page) * len(small.faces))
+            return Page(page, kept)
+        most = int(ROOM * MOST_BYTES / len(page) * kept)
     raise ValueError(
-        f"the page would have {len(page) / 1e6:.1f} MB with {len(small.faces)} of the mesh's {len(mesh.faces)} faces; expected at most "
+        f"the page would have {len(page) / 1e6:.1f} MB with {kept} of the mesh's {len(mesh.faces)} faces; expected at most "
         f"{MOST_BYTES / 1e6:g}, so simplify the mesh: its faces share too few corners to be joined"
     )
 
@@ -77,13 +86,24 @@ def _program() -> str:
     return PROGRAM.read_text(encoding="utf-8")
 
 
-def _filled(program: str, asset: Asset, meshes: Sequence[TriangleMesh], lights: Sequence[PageLight], factors: ndarray) -> bytes:
-    """With the finest mesh first."""
+def _filled(
+    program: str,
+    asset: Asset,
+    names: Sequence[str],
+    meshes: Sequence[Sequence[TriangleMesh]],
+    lights: Sequence[PageLight],
+    factors: ndarray,
+) -> bytes:
+    """
+    Args:
+        names: of the materials.
+        meshes: the finest first, each in every material.
+    """
     title = _title(asset)
     arrays: dict[str, ndarray] = {}
     details = []
-    for number, mesh in enumerate(meshes):
-        found, detail = _mesh_arrays(mesh)
+    for number, worn in enumerate(meshes):
+        found, detail = _mesh_arrays(worn)
         arrays |= {f"mesh{number}.{name}": values for name, values in found.items()}
         details.append(detail)
     for number, light in enumerate(lights):
@@ -91,7 +111,8 @@ def _filled(program: str, asset: Asset, meshes: Sequence[TriangleMesh], lights: 
     about = {
         "title": title,
         "photographs": len(asset.cameras),
-        "faces": {"kept": len(meshes[0].faces), "all": len(asset.mesh.faces)},
+        "faces": {"kept": len(meshes[0][0].faces), "all": len(asset.mesh.faces)},
+        "materials": list(names),
         "meshes": details,
         "roughness_levels": [roughness for roughness, _ in LEVELS],
         "lights": [{"name": light.name, "harmonics": light.harmonics.round(6).tolist()} for light in lights],
@@ -102,8 +123,9 @@ def _filled(program: str, asset: Asset, meshes: Sequence[TriangleMesh], lights: 
     return program.replace(OBJECT_PLACE, packed).replace(TITLE_PLACE, html.escape(title)).encode()
 
 
-def _mesh_arrays(mesh: TriangleMesh) -> tuple[dict[str, ndarray], dict]:
-    """Quantised, and how to turn them back."""
+def _mesh_arrays(worn: Sequence[TriangleMesh]) -> tuple[dict[str, ndarray], dict]:
+    """One mesh in several materials, quantised, and how to turn its numbers back."""
+    mesh = worn[0]
     vertices = mesh.vertices.double().numpy()
     faces, order = in_order_of_use(mesh.faces.long().numpy(), vertices)
     vertices = vertices[order]
@@ -115,10 +137,11 @@ def _mesh_arrays(mesh: TriangleMesh) -> tuple[dict[str, ndarray], dict]:
         "places": np.rint((vertices - low) / extent * (PLACE_STEPS - 1)).astype(np.uint16),
         "normals": _octahedral(mesh.normals.double().numpy()[order]),
         "transfer": np.rint((transfer / range_ + 1) / 2 * (TRANSFER_STEPS - 1)).astype(np.uint16),
-        # Roots keep the steps of dark colours small, as sRGB does.
-        "albedo_roots": _bytes_of(np.sqrt(mesh.albedo.clamp(0, 1).numpy()[order])),
-        "surface": _bytes_of(torch.stack([mesh.roughness, mesh.metallic], -1).numpy()[order]),
     }
+    for number, material in enumerate(worn):
+        # Roots keep the steps of dark colours small, as sRGB does.
+        arrays[f"albedo_roots{number}"] = _bytes_of(np.sqrt(material.albedo.clamp(0, 1).numpy()[order]))
+        arrays[f"surface{number}"] = _bytes_of(torch.stack([material.roughness, material.metallic], -1).numpy()[order])
     about = {
         "low": low.tolist(),
         "place_step": extent / (PLACE_STEPS - 1),

@@ -6,13 +6,12 @@ import { hexFromLinear, linearFromHex } from '../edit/material/color';
 import { PRESETS } from '../edit/material/preset_table';
 import { Section, Slider, Switch } from '../ui/fields';
 import { Icon } from '../ui/icons';
-import { chosenLight, choosePreset, exposureStops, metallic, panelOpen, preset, rotation, roughness, sky, tint, turning, material, WHITE } from './choices';
+import { chosenLight, choosePreset, chooseWorn, exposureStops, metallic, panelOpen, preset, rotation, roughness, sky, tint, turning, material, WHITE, worn } from './choices';
 import type { PageObject } from './page_object';
 import { PageStage } from './page_stage';
 import { skyThumbnail } from './sky_thumbnail';
 
 const NARROW = '(max-width: 620px)';
-const AS_CAPTURED = 'As captured';
 /** What a slider stands at while the object has values of its own. */
 const MIDDLE = 0.5;
 
@@ -61,7 +60,7 @@ export function Page({ object }: { object: PageObject }) {
         <aside class="panel inspector" aria-label="Light and material">
           <div class="tab-page">
             <LightSection object={object} />
-            <MaterialSection />
+            <MaterialSection object={object} />
             <About object={object} />
           </div>
         </aside>
@@ -117,9 +116,11 @@ function LightSection({ object }: { object: PageObject }) {
   );
 }
 
-function MaterialSection() {
-  const names = [AS_CAPTURED, ...PRESETS.map(({ name }) => name)];
-  const chosen = preset.value ?? AS_CAPTURED;
+/** The object's own materials, then presets; a variant stands in for the preset of its name. */
+function MaterialSection({ object }: { object: PageObject }) {
+  const own = object.materials;
+  const names = [...own, ...PRESETS.map(({ name }) => name).filter((name) => !own.includes(name))];
+  const chosen = chosenMaterial(object);
   const hand = { roughness: roughness.value !== null, metallic: metallic.value !== null, tint: tint.value !== WHITE };
   return (
     <Section title="Material">
@@ -128,7 +129,7 @@ function MaterialSection() {
         <div class="choice-row grid materials">
           {names.map((name) => (
             <label>
-              <input type="radio" name="material" value={name} checked={name === chosen} onChange={() => choosePreset(name === AS_CAPTURED ? null : name)} />
+              <input type="radio" name="material" value={name} checked={name === chosen} onChange={() => (own.includes(name) ? chooseWorn(own.indexOf(name)) : choosePreset(name))} />
               <span>{name}</span>
             </label>
           ))}
@@ -166,9 +167,11 @@ function MaterialSection() {
   );
 }
 
+const chosenMaterial = (object: PageObject) => preset.value ?? object.materials[worn.value]!;
+
 function About({ object }: { object: PageObject }) {
   const [announced, setAnnounced] = useState('');
-  useSignalEffect(() => setAnnounced(`${object.lights[chosenLight.value]!.name}, ${preset.value ?? AS_CAPTURED}`));
+  useSignalEffect(() => setAnnounced(`${object.lights[chosenLight.value]!.name}, ${chosenMaterial(object)}`));
   const { kept, all } = object.faces;
   const count = (value: number) => value.toLocaleString('en');
   return (

@@ -17,9 +17,11 @@ export const turning = signal(false);
 export const panelOpen = signal(true);
 
 export const WHITE: Rgb = [1, 1, 1];
-/** Of a preset; null: as captured. */
+/** Number of the object's own material, 0 without a variant; what follows is laid over it. */
+export const worn = signal(0);
+/** Of a preset; null: as the object's own material says. */
 export const preset = signal<string | null>(null);
-/** Set by hand; null: as captured, or as the preset says. */
+/** Set by hand; null: as the material or the preset says. */
 export const roughness = signal<number | null>(null);
 export const metallic = signal<number | null>(null);
 export const tint = signal<Rgb>(WHITE);
@@ -28,6 +30,11 @@ export const material = computed<MaterialChoice>(() => {
   const named = PRESETS.find(({ name }) => name === preset.value);
   return { albedo: named?.albedo ?? null, roughness: roughness.value ?? named?.roughness ?? null, metallic: metallic.value ?? named?.metallic ?? null, tint: tint.value };
 });
+
+export function chooseWorn(number: number): void {
+  worn.value = number;
+  choosePreset(null);
+}
 
 export function choosePreset(name: string | null): void {
   preset.value = name;

@@ -22,14 +22,18 @@ export interface PageMesh {
   /** Every edge has two faces: nobody sees its inside. */
   closed: boolean;
   corners: Uint32Array<ArrayBuffer>;
-  /** VERTEX_BYTES each. */
+  /** VERTEX_BYTES each, in the material that was put on last. */
   vertices: ArrayBuffer;
+  /** Roots of albedo, and roughness beside metallic, in every material. */
+  materials: Table[][];
 }
 
 export interface PageObject {
   title: string;
   photographs: number;
   faces: { kept: number; all: number };
+  /** Names: the object as it is, then its variants. */
+  materials: string[];
   /** Box of the object, z up [world units]. */
   low: Vec3;
   high: Vec3;
@@ -44,11 +48,14 @@ export interface PageObject {
 
 /** A vertex: place (3), normal (2) and transfer (9) in 16 bits each; roots of albedo (3), roughness and metallic in 8; three bytes of room. */
 export const VERTEX_BYTES = 36;
+/** Of them, those before the material. */
+const SHAPE_BYTES = 28;
 
 interface Header {
   title: string;
   photographs: number;
   faces: { kept: number; all: number };
+  materials: string[];
   meshes: { low: Vec3; high: Vec3; place_step: number; normal_steps: number; transfer_low: number; transfer_step: number; closed: boolean }[];
   roughness_levels: number[];
   lights: { name: string; harmonics: Vec3[] }[];
@@ -69,6 +76,10 @@ export function readObject({ about, arrays }: Unpacked): PageObject {
     });
   const meshes = header.meshes.map(({ low, place_step, normal_steps, transfer_low, transfer_step, closed }, k): PageMesh => {
     const of = (name: string) => named(`mesh${k}.${name}`);
+    const materials = header.materials.map((_, number) => [of(`albedo_roots${number}`), of(`surface${number}`)]);
+    const vertices = new ArrayBuffer(VERTEX_BYTES * of('places').rows);
+    putColumns(['places', 'normals', 'transfer'].map(of), new Uint16Array(vertices), 0);
+    putColumns(materials[0]!, new Uint8Array(vertices), SHAPE_BYTES);
     return {
       low,
       placeStep: place_step,
@@ -77,13 +88,15 @@ export function readObject({ about, arrays }: Unpacked): PageObject {
       transferStep: transfer_step,
       closed,
       corners: cornersFromSteps(of('steps').values),
-      vertices: joinVertices(['places', 'normals', 'transfer'].map(of), ['albedo_roots', 'surface'].map(of)),
+      vertices,
+      materials,
     };
   });
   return {
     title: header.title,
     photographs: header.photographs,
     faces: header.faces,
+    materials: header.materials,
     low: header.meshes[0]!.low,
     high: header.meshes[0]!.high,
     meshes,
@@ -94,21 +107,19 @@ export function readObject({ about, arrays }: Unpacked): PageObject {
   };
 }
 
-/** All that belongs to a vertex side by side. */
-function joinVertices(words: Table[], bytes: Table[]): ArrayBuffer {
-  const count = words[0]!.rows;
-  const joined = new ArrayBuffer(VERTEX_BYTES * count);
-  const put = (tables: Table[], into: Uint8Array | Uint16Array, start: number) => {
-    const stride = VERTEX_BYTES / into.BYTES_PER_ELEMENT;
-    let at = start;
-    for (const { values, columns } of tables) {
-      for (let row = 0; row < count; row++) for (let k = 0; k < columns; k++) into[row * stride + at + k] = values[row * columns + k]!;
-      at += columns;
-    }
-    return at * into.BYTES_PER_ELEMENT;
-  };
-  put(bytes, new Uint8Array(joined), put(words, new Uint16Array(joined), 0));
-  return joined;
+/** Put another of its materials on a mesh. */
+export function wear(mesh: PageMesh, material: number): void {
+  putColumns(mesh.materials[material]!, new Uint8Array(mesh.vertices), SHAPE_BYTES);
+}
+
+/** Tables side by side into what belongs to each vertex, from a byte of it on. */
+function putColumns(tables: Table[], into: Uint8Array | Uint16Array, firstByte: number): void {
+  const stride = VERTEX_BYTES / into.BYTES_PER_ELEMENT;
+  let at = firstByte / into.BYTES_PER_ELEMENT;
+  for (const { values, rows, columns } of tables) {
+    for (let row = 0; row < rows; row++) for (let k = 0; k < columns; k++) into[row * stride + at + k] = values[row * columns + k]!;
+    at += columns;
+  }
 }
 
 /** Red, green, blue of each texel; half a step is added, since Python rounds down. */

@@ -3,7 +3,7 @@
 import { effect } from '@preact/signals';
 import { freeArea } from '../stage/camera/free_area';
 import { DynamicResolution } from '../stage/dynamic_resolution';
-import { chosenLight, exposureStops, material, panelOpen, rotation, sky, turning } from './choices';
+import { chosenLight, exposureStops, material, panelOpen, rotation, sky, turning, worn } from './choices';
 import { between, FOV_DEGREES, moved, same, START, turned, viewOf, zoomed, type Orbit } from './orbit';
 import type { PageObject } from './page_object';
 import { PagePicture } from './picture';
@@ -54,6 +54,10 @@ export class PageStage {
     this.listen();
     effect(() => {
       this.picture.chooseLight(object.lights[chosenLight.value]!);
+      this.dirty = true;
+    });
+    effect(() => {
+      this.picture.chooseMaterial(worn.value);
       this.dirty = true;
     });
     effect(() => {

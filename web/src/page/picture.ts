@@ -3,7 +3,7 @@
 import type { Vec3 } from '../session/view';
 import { lightSheet, sheetHeight, SHEET_WIDTH, turnHarmonics } from './light';
 import type { View } from './orbit';
-import { VERTEX_BYTES, type PageLight, type PageMesh, type PageObject } from './page_object';
+import { VERTEX_BYTES, wear, type PageLight, type PageMesh, type PageObject } from './page_object';
 import { objectFragment, objectVertex, SHADED_FRAGMENT, SKY_VERTEX, skyFragment } from './shaders';
 
 /** Level at which the sky is shown behind the object: out of focus, as behind a portrait. */
@@ -36,9 +36,10 @@ export class PagePicture {
   /** The same, with colours found at vertices. */
   private readonly roughProgram: Program;
   private readonly skyProgram: Program;
-  private readonly meshes: { mesh: PageMesh; vertices: WebGLVertexArrayObject }[];
+  private readonly meshes: UploadedMesh[];
   private readonly sheets = new Map<PageLight, WebGLTexture>();
   private light: PageLight;
+  private worn = 0;
 
   /** Throws where the browser has no WebGL 2. */
   constructor(
@@ -51,7 +52,7 @@ export class PagePicture {
     this.objectProgram = new Program(gl, objectVertex(object.roughnessLevels, false), objectFragment(object.roughnessLevels));
     this.roughProgram = new Program(gl, objectVertex(object.roughnessLevels, true), SHADED_FRAGMENT);
     this.skyProgram = new Program(gl, SKY_VERTEX, skyFragment(object.roughnessLevels.length));
-    this.meshes = object.meshes.map((mesh) => ({ mesh, vertices: uploadVertices(gl, mesh) }));
+    this.meshes = object.meshes.map((mesh) => uploadMesh(gl, mesh));
     gl.activeTexture(gl.TEXTURE1);
     uploadFactors(gl, object);
     gl.activeTexture(gl.TEXTURE0);
@@ -69,6 +70,18 @@ export class PagePicture {
     if (!sheet) this.sheets.set(light, (sheet = uploadLight(gl, light)));
     gl.bindTexture(gl.TEXTURE_2D, sheet);
     this.light = light;
+  }
+
+  /** By its number among the object's materials. */
+  chooseMaterial(number: number): void {
+    if (number === this.worn) return;
+    const { gl } = this;
+    for (const { mesh, buffer } of this.meshes) {
+      wear(mesh, number);
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, mesh.vertices);
+    }
+    this.worn = number;
   }
 
   /** [device pixels] */
@@ -160,10 +173,19 @@ class Program {
   };
 }
 
-function uploadVertices(gl: WebGL2RenderingContext, { vertices, corners }: PageMesh): WebGLVertexArrayObject {
+interface UploadedMesh {
+  mesh: PageMesh;
+  vertices: WebGLVertexArrayObject;
+  /** Of them. */
+  buffer: WebGLBuffer;
+}
+
+function uploadMesh(gl: WebGL2RenderingContext, mesh: PageMesh): UploadedMesh {
+  const { vertices, corners } = mesh;
   const array = gl.createVertexArray();
+  const buffer = gl.createBuffer();
   gl.bindVertexArray(array);
-  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
   gl.bufferData(gl.ARRAY_BUFFER, vertices, gl.STATIC_DRAW);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
@@ -175,7 +197,7 @@ function uploadVertices(gl: WebGL2RenderingContext, { vertices, corners }: PageM
     offset += narrow ? width : 2 * width;
   });
   gl.bindVertexArray(null);
-  return array;
+  return { mesh, vertices: array, buffer };
 }
 
 function uploadLight(gl: WebGL2RenderingContext, { tables }: PageLight): WebGLTexture {

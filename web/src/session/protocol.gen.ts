@@ -397,7 +397,7 @@ export interface ExportRequest {
   formats: ("ply" | "ply3" | "spz" | "glb" | "mesh" | "usdz" | "usd" | "env" | "html" | "zip")[];
   /** The most that textured meshes (glb, mesh, usdz, usd) have; 30 000 where nothing is said. */
   faces?: number | null;
-  /** Other materials, for the formats that hold some (glb, mesh). */
+  /** Other materials, for the formats that hold some (glb, mesh, html). */
   variants?: MaterialVariant[];
 }
 

@@ -8,8 +8,8 @@ The server calls it (`run_file_tool`), so that a decoder that crashes or swallow
     pictures CAPTURE OUT        folder of a posed capture -> folder with its pictures as 0.jpg, 1.jpg, ..., in the order of look.json's cameras, without lens distortion
     masks CAPTURE STROKES OUT   the same and strokes (drgs/scene/strokes.py) -> folder with masks.json and sheet.jpg, on which the strokes' masks are outlined
     export ASSET OUT FORMAT FACES [EDITS ENVIRONMENTS N]    asset folder, with the edits put into it -> a format of drgs/exchange/export_formats.py, or zip
-                                (the asset itself); FACES: the most that a textured mesh has, 0 where nobody says. A GLB has the variants that the edits keep
-    export ASSET OUT FORMAT FACES VARIANTS ENVIRONMENTS     asset folder -> a GLB with the variants of a file (drgs/convert/material_variants.py)
+                                (the asset itself); FACES: the most that a textured mesh has, 0 where nobody says. A GLB and a page have the variants that the edits keep
+    export ASSET OUT FORMAT FACES VARIANTS ENVIRONMENTS     asset folder -> a GLB or a page with the variants of a file (drgs/convert/material_variants.py)
     version ASSET OUT EDITS ENVIRONMENTS N      asset folder with the edits of a JSON file put into it -> asset folder, version N
 """
 
@@ -278,10 +278,12 @@ def export_edited(asset_folder: Path, out: Path, format: Any, faces: int, edits:
 
     asset, listed = load_asset(asset_folder), load_edits(edits)
     made, variants = bake_edits(asset, listed, environments, version), kept_variants(listed)
-    if variants and format in VARIANT_FORMATS:
-        shown = AS_SHOWN if material_edits(listed) else AS_CAPTURED
-        source = pose_scene(asset, listed, environments, confine=True).vertex_source
-        export_asset(made, out, format, faces or None, worn_meshes(asset, made.mesh, variants, environments, source), shown)
+    if format in VARIANT_FORMATS:
+        shown, worn = AS_SHOWN if material_edits(listed) else AS_CAPTURED, None
+        if variants:
+            source = pose_scene(asset, listed, environments, confine=True).vertex_source
+            worn = worn_meshes(asset, made.mesh, variants, environments, source)
+        export_asset(made, out, format, faces or None, worn, shown)
     else:
         write_export(made, asset_folder, out, format, faces, lambda: thumbnail(made))
 

@@ -264,7 +264,7 @@ class ExportRequest(_Job):
     faces: Annotated[int, Field(ge=FEWEST_FACES, le=MOST_FACES)] | None = None
     """The most that textured meshes (glb, mesh, usdz, usd) have; 30 000 where nothing is said."""
     variants: list[MaterialVariant] = Field(default_factory=list, max_length=MOST_VARIANTS)
-    """Other materials, for the formats that hold some (glb, mesh)."""
+    """Other materials, for the formats that hold some (glb, mesh, html)."""
 
     @model_validator(mode="after")
     def _names_each_once(self) -> "ExportRequest":
@@ -275,7 +275,7 @@ class ExportRequest(_Job):
     @model_validator(mode="after")
     def _has_a_use_for_variants(self) -> "ExportRequest":
         if self.variants and not set(self.formats) & set(VARIANT_FORMATS):
-            raise ValueError(f"none of the formats {self.formats} holds material variants; expected {' or '.join(VARIANT_FORMATS)}")
+            raise ValueError(f"none of the formats {self.formats} holds material variants; expected {', '.join(VARIANT_FORMATS)}")
         if len({variant.name for variant in self.variants}) < len(self.variants):
             raise ValueError("two variants of this export have the same name")
         return self
