@@ -46,7 +46,7 @@ export class LocalLayer {
   /** NaN: from the next picture on. */
   private flashedAt = -Infinity;
 
-  /** `onMesh`: there is another mesh to draw, or none. */
+  /** `onMesh`: there is another mesh to draw, or none; `onChange`: there is another picture to draw, soon. */
   constructor(
     private readonly stage: HTMLElement,
     canvas: HTMLCanvasElement,
@@ -54,6 +54,7 @@ export class LocalLayer {
     private readonly bounds: Sphere,
     private readonly reducedMotion: boolean,
     private readonly onMesh: () => void,
+    private readonly onChange: () => void,
   ) {
     try {
       this.picture = new LocalPicture(canvas);
@@ -80,12 +81,13 @@ export class LocalLayer {
 
   redraw(): void {
     this.dirty = true;
+    this.onChange();
   }
 
   resize(): void {
     const scale = this.sharp ? 1 : this.resolution.scale;
     this.picture?.resize(this.stage.clientWidth, this.stage.clientHeight, scale * screenPixelRatio());
-    this.dirty = true;
+    this.redraw();
   }
 
   /** Take in the time since the last of two pictures in motion, so that motion stays fluent. */
@@ -115,7 +117,7 @@ export class LocalLayer {
     const { splitAt } = this;
     // Over a traced picture only the selection and the edges are drawn, on nothing.
     const overlay = ((flashing && known) || marks || edges) && !shows && !before.value && splitAt === null;
-    if (flashing || this.stage.dataset.overlay !== String(overlay)) this.dirty = true;
+    if (flashing || this.stage.dataset.overlay !== String(overlay)) this.redraw();
     this.stage.dataset.overlay = String(overlay);
     if (!this.standsIn && !overlay && !before.value && splitAt === null) return;
     if (resting !== this.sharp && (this.dirty || (resting && !covered))) {
@@ -150,7 +152,7 @@ export class LocalLayer {
       const rest = mesh.value;
       const shown = before.value ? rest?.materials : materials.value;
       if (shown) this.picture?.setMaterials(shown);
-      this.dirty = true;
+      this.redraw();
     });
     let shape: Float32Array | null = null;
     effect(() => {
@@ -159,21 +161,22 @@ export class LocalLayer {
       if (!rest || !next || next === shape) return;
       shape = next;
       this.picture?.setShape(next);
-      this.dirty = true;
+      this.redraw();
     });
     effect(() => {
       const marked = this.marksPins ? pinWeights.value : selectionWeights.value;
       if (marked) this.picture?.setHighlighted(marked);
-      this.dirty = true;
+      this.redraw();
     });
     effect(() => {
       if (flash.value > 0) this.flashedAt = NaN; // however late that picture is
+      this.onChange();
     });
     effect(() => {
       wireframe.value;
       settings.value;
       this.splitAt;
-      this.dirty = true;
+      this.redraw();
     });
     effect(() => {
       if (namedMaterials.value && mesh.value) this.drawMaterials();
@@ -215,7 +218,8 @@ export class LocalLayer {
     } catch {
       notify('The light for the instant local picture could not be loaded; traced pictures show the right one.', 'info');
     }
-    this.lit = this.dirty = true;
+    this.lit = true;
+    this.redraw();
     this.drawMaterials();
     this.drawVariants();
   }

@@ -20,6 +20,7 @@ import { frameBox } from './camera/framing';
 import { freeArea } from './camera/free_area';
 import { LookThrough } from './camera/look_through';
 import { screenPixelRatio } from './dynamic_resolution';
+import { FrameLoop } from './frame_loop';
 import { Gizmo } from './gizmo';
 import { LocalLayer } from './local_layer';
 import { PointerTools } from './pointer_tools';
@@ -57,6 +58,7 @@ export class Viewport {
   /** Of the camera and settings on screen; -1: to be asked for. */
   private cameraNumber = 0;
   private fresh = false;
+  private readonly loop: FrameLoop;
   private lastTick = performance.now();
   private movedAt = -Infinity;
 
@@ -72,8 +74,9 @@ export class Viewport {
     this.controls.touches.two = CameraControls.ACTION.TOUCH_DOLLY_TRUCK;
     this.controls.smoothTime = reducedMotion ? 0 : 0.12;
     this.controls.draggingSmoothTime = reducedMotion ? 0 : 0.04;
+    this.loop = new FrameLoop(this.tick);
     this.traced = new TracedPicture(stage, tracedCanvas);
-    this.local = new LocalLayer(stage, localCanvas, this.camera, this.bounds, reducedMotion, () => this.updateLayers());
+    this.local = new LocalLayer(stage, localCanvas, this.camera, this.bounds, reducedMotion, () => this.updateLayers(), () => this.loop.wake());
     this.gizmo = new Gizmo(stage);
     this.fly = new FlyControls(this.camera, this.controls, this.bounds);
     this.lookThrough = new LookThrough(stage, this.camera, this.controls, this.bounds, reducedMotion ? 0 : undefined);
@@ -83,7 +86,6 @@ export class Viewport {
     this.followCamera();
     this.followPicture();
     this.local.followState();
-    requestAnimationFrame(this.tick);
   }
 
   // ---- what the page asks for --------------------------------------------------------------------------------------------
@@ -166,12 +168,14 @@ export class Viewport {
       this.fly.setActive(flying.value);
     });
     effect(() => {
+      this.loop.wake();
       this.stage.dataset.view = String(viewNumber.value ?? '');
       if (viewNumber.value !== null) flying.value = false;
     });
     effect(() => {
       const wanted = wantedAim.value;
       if (!wanted) return;
+      this.loop.wake();
       untracked(() => this.leaveView());
       this.camera.fov = wanted.fov_y_degrees;
       this.camera.updateProjectionMatrix();
@@ -183,6 +187,7 @@ export class Viewport {
   }
 
   private onResize = () => {
+    this.loop.wake();
     const { clientWidth: width, clientHeight: height } = this.stage;
     if (!width || !height) return;
     this.camera.aspect = width / height;
@@ -194,6 +199,7 @@ export class Viewport {
   // ---- from the server ---------------------------------------------------------------------------------------------------
 
   private onHello = (hello: ServerHello) => {
+    this.loop.wake();
     this.box.set(new Vector3(...hello.minimum), new Vector3(...hello.maximum));
     this.box.getBoundingSphere(this.bounds);
     this.controls.minDistance = 0.05 * this.bounds.radius;
@@ -246,12 +252,14 @@ export class Viewport {
       // Settings renumber the camera; the next animation frame asks by which number.
       if (now.slice(1).some((value, i) => value !== last[i + 1])) this.cameraNumber = -1;
       last = now;
+      this.loop.wake();
       // A picture may come before the news that it shows the newest edits; a slider put back where it was asks for no new one.
       this.updateFresh();
     });
     effect(() => {
       if (openedAsset.value !== this.framedAsset) this.stage.removeAttribute('data-picture');
       session.value;
+      this.loop.wake();
       this.cameraNumber = -1; // a new stream counts anew
       untracked(() => this.setFresh(false));
     });
@@ -276,13 +284,12 @@ export class Viewport {
 
   // ---- every animation frame ---------------------------------------------------------------------------------------------
 
-  private tick = (now: number) => {
-    requestAnimationFrame(this.tick);
-    const lastTick = this.lastTick;
-    const elapsed = now - lastTick;
+  private readonly tick = (now: number, elapsed: number) => {
+    const { lastTick } = this;
     this.lastTick = now;
     this.fly.update(elapsed / 1000);
     const moved = this.lookThrough.apply(now) ?? this.controls.update(elapsed / 1000);
+    if (moved) this.loop.wake();
     // In motion since the last picture, however long that took.
     if (moved && this.movedAt === lastTick) this.local.measure(elapsed);
     if (!session.value) return;
