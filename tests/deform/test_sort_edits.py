@@ -1,7 +1,5 @@
 """Lists of edits are sorted once; what is added, taken away or put elsewhere is found without looking at all of them."""
 
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +9,7 @@ from test_pose_scene import material, plate_asset, twist
 from drgs.deform.pose_scene import pose_scene
 from drgs.deform.sort_edits import EditFiles, SortedEdits, sort_edits
 from drgs.scene.edits import Edit, parse_edits, shared_beginning
+from tests.count_calls import count_calls
 
 FILES = EditFiles(None, confine=False)
 
@@ -22,22 +21,6 @@ def edits(count: int) -> list[Edit]:
         lambda k: {"op": "environment", "rotation": k},
     )
     return parse_edits([kinds[k % 3](k) for k in range(count)])
-
-
-def calls(work: Callable[[], object]) -> int:
-    """Of functions, Python's and C's."""
-    count = 0
-
-    def see(frame: object, event: str, argument: object) -> None:
-        nonlocal count
-        count += event in ("call", "c_call")
-
-    sys.setprofile(see)
-    try:
-        work()
-    finally:
-        sys.setprofile(None)
-    return count
 
 
 def digests(found: SortedEdits) -> tuple:
@@ -61,7 +44,7 @@ def test_an_edit_more_takes_as_many_steps_behind_two_thousand_as_behind_a_hundre
     for count in (100, 2000):
         asset, longer = plate_asset(), tuple(edits(count + 1))
         pose_scene(asset, longer[:-1])
-        taken.append(calls(lambda asset=asset, longer=longer: pose_scene(asset, longer)))
+        taken.append(count_calls(lambda asset=asset, longer=longer: pose_scene(asset, longer)))
     assert taken[1] < 1.1 * taken[0]
 
 

@@ -2,10 +2,8 @@
 
 import asyncio
 import random
-import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +14,7 @@ from hypothesis import strategies as st
 from drgs.scene.edits import Edit, parse_edits
 from drgs_server.live import sessions
 from drgs_server.live.edit_log import ChangeQueue, ChangeRequest, EditLog, EventKind, NothingToDo, Splice
+from tests.count_calls import count_calls
 
 
 def material(roughness: float) -> dict:
@@ -66,20 +65,6 @@ def test_the_log_behaves_like_two_stacks(kinds: list[str]) -> None:
 
 
 def test_a_change_of_a_long_log_takes_as_many_steps_as_that_of_a_short_one() -> None:
-    def calls(work: Callable[[], object]) -> int:
-        count = 0
-
-        def see(frame: object, event: str, argument: object) -> None:
-            nonlocal count
-            count += event in ("call", "c_call")
-
-        sys.setprofile(see)
-        try:
-            work()
-        finally:
-            sys.setprofile(None)
-        return count
-
     def change(log: EditLog, kind: EventKind, edit: Edit | None = None) -> None:
         after = log.after(kind, edit)
         after.change_since(log).model_dump_json()
@@ -96,7 +81,7 @@ def test_a_change_of_a_long_log_takes_as_many_steps_as_that_of_a_short_one() -> 
             ("edit", log, "edit", EDITS[3]), ("undo", log, "undo", None), ("replace", log, "replace", EDITS[4]),
             ("undo again", half, "undo", None), ("redo", half, "redo", None), ("edit instead", half, "edit", EDITS[3]),
         ):  # fmt: skip
-            taken.setdefault(name, []).append(calls(lambda start=start, kind=kind, edit=edit: change(start, kind, edit)))
+            taken.setdefault(name, []).append(count_calls(lambda start=start, kind=kind, edit=edit: change(start, kind, edit)))
     # Where lists part is found by halving: a few steps more, not as many as there are edits.
     assert all(long < 2 * short for short, long in taken.values()), taken
 
