@@ -11,6 +11,7 @@ from safetensors.torch import save_file
 
 from drgs.reconstruct import checkpoints
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
+from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.densify import ScreenGradientStats
 from drgs.reconstruct.fit.fit_loop import FitState
 
@@ -20,7 +21,7 @@ CPU = torch.device("cpu")
 def small_fit(seed: int, size: int = 7) -> FitState:
     generator = torch.Generator().manual_seed(seed)
     parameters = {name: torch.randn(size, 3, generator=generator).requires_grad_(True) for name in ("centers", "sh")}
-    optimizer = torch.optim.Adam([{"params": [value], "lr": 0.1, "name": name} for name, value in parameters.items()], fused=True)
+    optimizer = Adam([{"params": [value], "lr": 0.1, "name": name} for name, value in parameters.items()])
     gradients = ScreenGradientStats(torch.rand(size, generator=generator), torch.ones(size))
     return FitState(parameters, optimizer, generator, screen_gradients=gradients)
 
@@ -32,7 +33,7 @@ def run(fit: FitState, steps: int) -> None:
         loss = torch.stack([((value - noise) ** 2).sum() for value in fit.parameters.values()]).sum()
         loss.backward()
         fit.optimizer.step()
-        fit.optimizer.zero_grad(set_to_none=True)
+        fit.optimizer.zero_grad()
         fit.iteration += 1
 
 

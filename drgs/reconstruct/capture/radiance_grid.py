@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 
 HARMONICS = 4
@@ -144,7 +145,7 @@ def fit_radiance_grid(
     total = sum(steps for _, steps in settings.levels)
     for count, steps in settings.levels:
         grid = _finer(grid, box, is_inside, count, settings)
-        optimizer = torch.optim.Adam(
+        optimizer = Adam(
             [{"params": [grid.density], "lr": settings.density_rate}, {"params": [grid.colors], "lr": settings.color_rate}],
             betas=(0.9, 0.99),
             eps=1e-15,
@@ -162,7 +163,7 @@ def fit_radiance_grid(
             cost = partial(_cost_of_rays, grid, batch, settings, done > settings.gathered_from * total)
             loss, _ = cost_in_slices(len(drawn), (grid.density, grid.colors), cost, generator)
             steps_between = [grid.density.diff(dim=axis).square().mean() for axis in range(3)]
-            optimizer.zero_grad(set_to_none=True)
+            optimizer.zero_grad()
             (loss / len(drawn) + settings.weight_even * torch.stack(steps_between).sum()).backward()
             optimizer.step()
             done += 1

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.surfel_parameters import divide_surfels, keep_surfels
 from drgs.scene.camera import Camera
 
@@ -56,7 +57,7 @@ class ScreenGradientStats:
 
 
 def densify(
-    optimizer: torch.optim.Adam,
+    optimizer: Adam,
     parameters: dict[str, Tensor],
     gradients: ScreenGradientStats,
     settings: DensifySettings,
@@ -79,7 +80,7 @@ def densify(
     return ScreenGradientStats.zeros(len(parameters["centers"]), parameters["centers"].device)
 
 
-def reset_opacity(optimizer: torch.optim.Adam, parameters: dict[str, Tensor], ceiling: float = 0.1) -> None:
+def reset_opacity(optimizer: Adam, parameters: dict[str, Tensor], ceiling: float = 0.1) -> None:
     """Opacity of every surfel at most `ceiling`, with Adam's memory of it cleared: fog does not come back, surfaces do."""
     with torch.no_grad():
         parameters["opacity_logits"].clamp_(max=float(torch.logit(torch.tensor(ceiling))))

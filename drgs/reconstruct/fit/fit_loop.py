@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.densify import ScreenGradientStats
 from drgs.scene.camera import Camera
 
@@ -23,7 +24,7 @@ class FitState:
     """Everything a checkpoint must hold to go on with the same numbers."""
 
     parameters: dict[str, Tensor]
-    optimizer: torch.optim.Adam
+    optimizer: Adam
     """One group a parameter, of the same `name`; `full_rate` is its rate at the start."""
     generator: torch.Generator
     iteration: int = 0
@@ -98,7 +99,7 @@ def run_fit(fit: FitLoop, report: Callable[[FitReport], None] | None = None, sho
         if fit.after_backward is not None:
             fit.after_backward(loss)
         state.optimizer.step()
-        state.optimizer.zero_grad(set_to_none=True)
+        state.optimizer.zero_grad()
         state.iteration += 1
         if fit.after_step is not None:
             fit.after_step(state.iteration)
@@ -121,7 +122,7 @@ def _report(fit: FitLoop, loss: StepLoss, mean_squared_error: float, seconds: fl
     )
 
 
-def cosine_rates(optimizer: torch.optim.Adam, iteration: int, iterations: int) -> dict[str, float]:
+def cosine_rates(optimizer: Adam, iteration: int, iterations: int) -> dict[str, float]:
     """Rates that fall from `full_rate` to a tenth of it by a cosine."""
     share = 0.55 + 0.45 * math.cos(math.pi * iteration / iterations)
     return {group["name"]: group["full_rate"] * share for group in optimizer.param_groups}

@@ -12,6 +12,7 @@ from torch import Tensor
 from drgs.maths.color import linear_from_srgb
 from drgs.maths.frames import quat_wxyz_from_rotation, rotation_from_quat_wxyz, tangents_from_normal
 from drgs.reconstruct.capture.initial_points import InitialPoints
+from drgs.reconstruct.fit.adam import Adam
 from drgs.scene.gaussians import Gaussians
 
 ADAM_EPSILON = 1e-15
@@ -80,7 +81,7 @@ def initial_parameters(points: InitialPoints, device: torch.device, seed: int) -
     return {name: value.to(device).requires_grad_(True) for name, value in parameters.items()}
 
 
-def make_optimizer(parameters: dict[str, Tensor], rates: object, radius: float) -> torch.optim.Adam:
+def make_optimizer(parameters: dict[str, Tensor], rates: object, radius: float) -> Adam:
     """One group a name, in the order of `parameters`; parameters that want no gradient stay as they are.
 
     Args:
@@ -90,7 +91,7 @@ def make_optimizer(parameters: dict[str, Tensor], rates: object, radius: float) 
     for name, value in parameters.items():
         rate = rate_of_group(name, rates) * (radius if name == "centers" else 1.0) if value.requires_grad else 0.0
         groups.append({"params": [value], "lr": rate, "name": name, "full_rate": rate})
-    return torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+    return Adam(groups, eps=ADAM_EPSILON)
 
 
 def rate_of_group(name: str, rates: object) -> float:
@@ -148,7 +149,7 @@ def logits_of_shares(shares: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]
     return torch.logit(shares.clamp(0.005, 0.995))
 
 
-def _replace(optimizer: torch.optim.Adam, parameters: dict[str, Tensor], change) -> None:
+def _replace(optimizer: Adam, parameters: dict[str, Tensor], change) -> None:
     """Apply `change(name, tensor, is_moment)` to every surfel tensor and to its Adam moments."""
     for group in optimizer.param_groups:
         name = group["name"]
@@ -165,14 +166,12 @@ def _replace(optimizer: torch.optim.Adam, parameters: dict[str, Tensor], change)
         parameters[name] = new
 
 
-def keep_surfels(optimizer: torch.optim.Adam, parameters: dict[str, Tensor], kept: Bool[Tensor, "surfel"]) -> None:
+def keep_surfels(optimizer: Adam, parameters: dict[str, Tensor], kept: Bool[Tensor, "surfel"]) -> None:
     """Drop the surfels where `kept` (N,) is False."""
     _replace(optimizer, parameters, lambda name, value, is_moment: value[kept])
 
 
-def divide_surfels(
-    optimizer: torch.optim.Adam, parameters: dict[str, Tensor], chosen: Int[Tensor, "chosen"], generator: torch.Generator
-) -> None:
+def divide_surfels(optimizer: Adam, parameters: dict[str, Tensor], chosen: Int[Tensor, "chosen"], generator: torch.Generator) -> None:
     """Replace each chosen surfel (indices) by two: half-sized along its longer axis, set apart along it, so that they cover the same disc.
 
     Clone and split of 3DGS in one: a small surfel's halves stay within its footprint, a large one's separate.

@@ -7,6 +7,7 @@ import torch
 
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.reconstruct.capture.initial_points import InitialPoints
+from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.densify import DensifySettings, ScreenGradientStats, densify, reset_opacity
 from drgs.reconstruct.fit.surfel_parameters import (
     SURFEL_GROUPS,
@@ -22,7 +23,7 @@ from tests.render.closed_form_scenes import front_camera
 COUNT = 50
 
 
-def fit_with_moments(count: int = COUNT) -> tuple[torch.optim.Adam, dict[str, torch.Tensor]]:
+def fit_with_moments(count: int = COUNT) -> tuple[Adam, dict[str, torch.Tensor]]:
     """Surfels on a sphere after one step, in which the gradient of surfel i was i + 1 in every entry."""
     points = fibonacci_sphere(count)
     start = InitialPoints(points, points, torch.full((count, 3), 0.5), torch.zeros(3), 1.0, "hull", None, None)
@@ -33,12 +34,12 @@ def fit_with_moments(count: int = COUNT) -> tuple[torch.optim.Adam, dict[str, to
     return optimizer, parameters
 
 
-def step(optimizer: torch.optim.Adam, parameters: dict[str, torch.Tensor]) -> None:
+def step(optimizer: Adam, parameters: dict[str, torch.Tensor]) -> None:
     for value in parameters.values():
         number = torch.arange(1.0, 1 + len(value)).reshape(-1, *[1] * (value.dim() - 1))
         value.grad = number.expand_as(value).clone()
     optimizer.step()
-    optimizer.zero_grad(set_to_none=True)
+    optimizer.zero_grad()
 
 
 def gradients_largest_at(count: int, largest: list[int]) -> ScreenGradientStats:
@@ -52,11 +53,11 @@ def roomy(**changes) -> DensifySettings:
     return DensifySettings(**{"growth": 0.1, "budget": 1000, "prune_opacity": 0.05, "prune_radius": 0.5} | changes)
 
 
-def first_moment(optimizer: torch.optim.Adam, parameters: dict[str, torch.Tensor], name: str) -> torch.Tensor:
+def first_moment(optimizer: Adam, parameters: dict[str, torch.Tensor], name: str) -> torch.Tensor:
     return optimizer.state[parameters[name]]["exp_avg"]
 
 
-def assert_sizes_agree(optimizer: torch.optim.Adam, parameters: dict[str, torch.Tensor], count: int) -> None:
+def assert_sizes_agree(optimizer: Adam, parameters: dict[str, torch.Tensor], count: int) -> None:
     for group in optimizer.param_groups:
         value = group["params"][0]
         assert value is parameters[group["name"]] and value.requires_grad and value.is_leaf
