@@ -4,6 +4,8 @@ import base64
 import json
 import re
 import struct
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 from typing import Any
@@ -94,6 +96,9 @@ def test_a_glb_of_a_session_holds_its_variants(service: Service, tmp_path: Path)
 
 @pytest.mark.slow
 def test_a_page_of_a_session_holds_its_variants(service: Service, tmp_path: Path) -> None:
+    subprocess.run(
+        [sys.executable, Path(__file__).parents[2] / "web" / "build.py"], check=True
+    )  # the page's program, as browser tests have it made
     _, session = opened(service, tmp_path)
     assert service.client.put(f"/api/sessions/{session}/variants/Matt", json={"edits": [rough(0.9)]}).status_code == 200
     answer = service.client.get(f"/api/sessions/{session}/export?format=html")

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
 from tests.render.closed_form_scenes import front_camera
 
@@ -15,7 +16,7 @@ CAMERA = front_camera(8)
 def parabola_state() -> FitState:
     parameters = {"opacity_logits": torch.tensor([3.0, -2.0], requires_grad=True), "light": torch.tensor([1.0], requires_grad=True)}
     groups = [{"params": [value], "lr": 0.1, "full_rate": 0.1, "name": name} for name, value in parameters.items()]
-    return FitState(parameters, torch.optim.Adam(groups), torch.Generator().manual_seed(0))
+    return FitState(parameters, Adam(groups), torch.Generator().manual_seed(0))
 
 
 def terms_of(state: FitState) -> dict[str, Tensor]:
