@@ -93,12 +93,13 @@ def build_environment_table(environment: Environment) -> EnvironmentTable:
     torch.mul(torch.maximum(torch.maximum(red, green), blue), torch.sin(polar)[:, None], out=nodes[1:-1])
     # A density knows no unit: the brightest texel becomes 0.5 to 1 by a power of two, which is exact, and no square under- or overflows.
     exponent = -math.frexp(brightest)[1]
+    # In two steps: 2^149, for the dimmest sky, is no float32.
     nodes.mul_(2.0 ** (exponent // 2)).mul_(2.0 ** (exponent - exponent // 2))
     texels[..., 3] = nodes
     # Sums run in float64: after a sun of 1e6, a float32 sum would forget the dim texels behind it.
     cells = nodes.new_empty(height + 2, width, dtype=torch.float64)
     cells[:, :-1], cells[:, -1] = nodes[:, :-1] + nodes[:, 1:], nodes[:, -1] + nodes[:, 0]
-    sums = torch.cumsum(cells.mul_(0.5 / width), 1, out=cells)
+    sums = cells.mul_(0.5 / width).cumsum_(1)
     padded = radiance.new_full((height + 2, width + 1 + _beyond(width + 1)), math.inf)
     padded[:, 0] = 0.0
     padded[:, 1 : width + 1] = sums

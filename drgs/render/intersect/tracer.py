@@ -61,7 +61,8 @@ class KernelQuery:
     """Of its first argument."""
     block_fn: Any = None
     """wp.func of a handle, a MiddleView, the first x and y of four by four pixels, faces and barycentrics of all pixels, which it writes where
-    there is something to see -> of how many. Where one ray's answer may depend on its neighbours'. None: by closest_fn."""
+    there is something to see -> how many of them see something. One ray's answer may depend on its neighbours' (on a common edge, which
+    face). None: the rays go one by one, by closest_fn."""
 
 
 class AbstractTracer(ABC):

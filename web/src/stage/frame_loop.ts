@@ -41,9 +41,13 @@ export class FrameLoop {
   private readonly frame = (now: number): void => {
     const elapsed = now - this.last;
     this.last = now;
-    this.step(now, this.rested ? Math.min(elapsed, FRAME_MS) : elapsed);
-    this.rested = performance.now() > this.awakeUntil;
-    if (this.rested) this.timer = setTimeout(this.ask, REST_MS);
-    else this.ask();
+    try {
+      this.step(now, this.rested ? Math.min(elapsed, FRAME_MS) : elapsed);
+    } finally {
+      // Also behind a step that failed: the next one may not.
+      this.rested = performance.now() > this.awakeUntil;
+      if (this.rested) this.timer = setTimeout(this.ask, REST_MS);
+      else this.ask();
+    }
   };
 }

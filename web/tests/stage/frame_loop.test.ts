@@ -51,3 +51,17 @@ test('a step that wakes goes on at full pace', () => {
   vi.advanceTimersByTime(2000);
   expect(stepsIn(300, taken).length).toBeGreaterThan(14);
 });
+
+test('a step that fails is followed by others', () => {
+  const taken: number[] = [];
+  let failed = false;
+  new FrameLoop((_, elapsed) => {
+    if (!failed) {
+      failed = true;
+      throw new Error('no picture');
+    }
+    taken.push(elapsed);
+  });
+  expect(() => vi.advanceTimersByTime(FRAME_MS + 1)).toThrow('no picture');
+  expect(stepsIn(300, taken).length).toBeGreaterThan(14);
+});
