@@ -17,27 +17,18 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.staticfiles import StaticFiles
 
 from drgs import __version__
-from drgs_server.api import (
-    routes_assets,
-    routes_captures,
-    routes_jobs,
-    routes_sessions,
-    routes_uploads,
-    routes_variants,
-    routes_views,
-    routes_weights,
-)
-from drgs_server.api.body_limit import BodyLimit
 from drgs_server.api.context import ServerContext
 from drgs_server.api.docs_page import docs_page
+from drgs_server.api.door.body_limit import BodyLimit
+from drgs_server.api.door.incoming import IncomingUploads
+from drgs_server.api.door.rate_limit import CallBuckets, RateLimit
+from drgs_server.api.door.security import COOKIE_NAME, Gatekeeper, GateMiddleware
 from drgs_server.api.environments import EnvironmentStore
-from drgs_server.api.incoming import IncomingUploads
 from drgs_server.api.metrics import CONTENT_TYPE, Metrics, MetricsMiddleware
 from drgs_server.api.openapi_document import complete_document
 from drgs_server.api.problems import ProblemError, UnexpectedErrors, add_problem_handlers
-from drgs_server.api.rate_limit import CallBuckets, RateLimit
 from drgs_server.api.rest_records import Health, TokenRequest
-from drgs_server.api.security import COOKIE_NAME, Gatekeeper, GateMiddleware
+from drgs_server.api.routes import assets, captures, jobs, sessions, uploads, variants, views, weights
 from drgs_server.live import stream
 from drgs_server.live.admission import Admission
 from drgs_server.live.return_memory import memory_returner
@@ -62,17 +53,7 @@ BACKUP_SECONDS = 3600.0
 """Between two copies of the databases."""
 RETURN_SECONDS = 2.0
 """Between two times that freed memory is given back."""
-_ROUTES = (
-    routes_uploads,
-    routes_captures,
-    routes_jobs,
-    routes_assets,
-    routes_views,
-    routes_sessions,
-    routes_variants,
-    routes_weights,
-    stream,
-)
+_ROUTES = (uploads, captures, jobs, assets, views, sessions, variants, weights, stream)
 VIEWER = Path(__file__).parent / "static"
 
 
@@ -164,7 +145,7 @@ async def _requeue_dead_workers_jobs(context: ServerContext) -> None:
 async def _remove_unused(context: ServerContext) -> None:
     while True:
         try:
-            await asyncio.to_thread(routes_assets.remove_deleted_assets, context)
+            await asyncio.to_thread(assets.remove_deleted_assets, context)
             await asyncio.to_thread(remove_unused_weights, context.directory, context.engine)
             await asyncio.to_thread(remove_unused_poses, context.directory, context.engine)
             keep_seconds = context.settings.limits.keep_upload_seconds

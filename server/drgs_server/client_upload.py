@@ -1,5 +1,5 @@
 """How the client sends large files: in parts, going on from what has arrived whenever the connection is lost or the server restarts
-(routes_uploads.py has the protocol, tus 1.0.0)."""
+(api/routes/uploads.py has the protocol, tus 1.0.0)."""
 
 import base64
 import os

@@ -19,9 +19,9 @@ from starlette.types import ASGIApp
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from drgs.openmp import sleep_at_once
-from drgs_server.api.connections import guarded_connections
-from drgs_server.api.rate_limit import KeepPeer
-from drgs_server.api.text_streams import TextStream
+from drgs_server.api.door.connections import guarded_connections
+from drgs_server.api.door.rate_limit import KeepPeer
+from drgs_server.api.door.text_streams import TextStream
 from drgs_server.app import create_app
 from drgs_worker.logs import set_up_logging
 from drgs_worker.store.backups import restore_backups

@@ -11,7 +11,7 @@ from test_rest import is_problem
 from test_uploads import uploaded
 
 from drgs_server import client_upload
-from drgs_server.api.routes_captures import KEPT_MASKS
+from drgs_server.api.routes.captures import KEPT_MASKS
 from drgs_worker.store.database import JobRow
 from tests.reconstruct.tiny_capture import HEIGHT, WIDTH, sphere_views, write_nerf_synthetic
 

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from starlette.websockets import WebSocketDisconnect
 from test_stream import Talk, camera, material
 
-from drgs_server.api.routes_uploads import PART_TYPE
+from drgs_server.api.routes.uploads import PART_TYPE
 from drgs_server.live.messages import ClientMessage
 
 QUIET = settings(

@@ -14,8 +14,8 @@ from conftest import Service
 from drgs.convert.import_mesh import import_mesh
 from drgs.exchange.exr import encode_environment
 from drgs.scene.asset import save_asset
+from drgs_server.api.door.rate_limit import BURST_SECONDS, CallBuckets, RateLimit
 from drgs_server.api.metrics import Metrics
-from drgs_server.api.rate_limit import BURST_SECONDS, CallBuckets, RateLimit
 from drgs_server.render.drgs_renderer import DrgsRenderer
 from drgs_server.run import uvicorn_config
 from drgs_worker.store.settings import CONFIG_VARIABLE, Limits, ServiceSettings, read_settings

@@ -16,8 +16,8 @@ from test_rest import is_problem
 from test_stream import talk
 
 from drgs.scene.edits import Edit, EnvironmentEdit, PoseEdit, UnreadableEdit, parse_edits
-from drgs_server.api import routes_assets
 from drgs_server.api.problems import ProblemError
+from drgs_server.api.routes import assets
 from drgs_server.live.pose_edits import pose_edits
 from drgs_server.render.interface import AbstractPose
 from drgs_worker.store.database import JobRow, now
@@ -140,7 +140,7 @@ def test_exports_and_versions_leave_broken_edits_out(service: Service, monkeypat
         else:
             Path(out).write_bytes(b"glTF")
 
-    monkeypatch.setattr(routes_assets, "_run_tool", tool)
+    monkeypatch.setattr(assets, "_run_tool", tool)
     assert service.client.get(f"/api/sessions/{session}/export?format=glb").content == b"glTF"
     service.context.sessions._live.clear()
     saved = service.client.post(f"/api/sessions/{session}/save").json()

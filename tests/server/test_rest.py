@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from drgs.exchange.exr import decode_environment
 from drgs_server.api.made_environments import SIZE, is_made
-from drgs_server.api.routes_assets import remove_deleted_assets
+from drgs_server.api.routes.assets import remove_deleted_assets
 from drgs_worker.store.asset_folder import count_asset_folder
 from drgs_worker.store.database import AssetRow, JobRow, now
 

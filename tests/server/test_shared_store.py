@@ -9,7 +9,7 @@ from conftest import Service
 from painter import PaintedAsset, Painter
 from test_rest import exr, is_problem, uploaded_environments, zipped
 
-from drgs_server.api.routes_assets import remove_deleted_assets
+from drgs_server.api.routes.assets import remove_deleted_assets
 from drgs_server.settings import Limits
 from drgs_worker.store.artifacts import share_job
 from drgs_worker.store.register_asset import register_asset

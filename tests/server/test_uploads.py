@@ -17,7 +17,7 @@ from test_rest import is_problem, left_on_disk, zipped
 from test_service import ServeProcess, capture, running
 
 from drgs_server import client_upload
-from drgs_server.api import incoming
+from drgs_server.api.door import incoming
 from drgs_server.client import Client, ServerError
 from drgs_server.settings import Limits
 from drgs_worker.store.database import CaptureRow, now

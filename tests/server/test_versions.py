@@ -10,7 +10,7 @@ from conftest import Service
 from test_rest import is_problem, left_on_disk, zipped
 
 from drgs.scene.asset import load_asset
-from drgs_server.api import routes_assets
+from drgs_server.api.routes import assets
 
 TETRAHEDRON = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
@@ -52,7 +52,7 @@ def test_an_export_leaves_no_draft_whatever_range_is_asked_for(
     async def tool(_: object, __: object, ___: object, kind: str, source: str, out: str, *rest: str) -> None:
         Path(out).write_bytes(b"glTF")
 
-    monkeypatch.setattr(routes_assets, "_run_tool", tool)
+    monkeypatch.setattr(assets, "_run_tool", tool)
     headers = {} if asked is None else {"Range": asked}
     assert service.client.get(f"/api/assets/{service.add_asset()}/export?format=glb", headers=headers).status_code == status
     assert list(service.context.scratch.folder.glob(".export-*")) == []
@@ -66,7 +66,7 @@ def test_a_download_passes_on_how_many_faces_were_asked_for(service: Service, mo
         Path(out).write_bytes(b"glTF")
 
     asset, session = opened(service, tmp_path)
-    monkeypatch.setattr(routes_assets, "_run_tool", tool)
+    monkeypatch.setattr(assets, "_run_tool", tool)
     for address in (f"/api/assets/{asset}/export", f"/api/sessions/{session}/export"):
         assert service.client.get(address, params={"format": "usdz"}).status_code == 200
         assert service.client.get(address, params={"format": "usdz", "faces": 500}).status_code == 200
@@ -91,7 +91,7 @@ def test_an_export_leaves_no_draft_where_sending_fails(tmp_path: Path) -> None:
 
     scope = {"type": "http", "method": "GET", "headers": [], "asgi": {"spec_version": "2.4"}}
     with pytest.raises(ConnectionResetError):
-        asyncio.run(routes_assets.DraftResponse(folder / "asset.glb")(scope, receive, send))
+        asyncio.run(assets.DraftResponse(folder / "asset.glb")(scope, receive, send))
     assert not folder.exists()
 
 

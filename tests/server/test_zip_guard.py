@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from drgs_server.api.zip_guard import ZipLimits, single_folder, unpack_zip
+from drgs_server.api.door.zip_guard import ZipLimits, single_folder, unpack_zip
 
 SMALL = ZipLimits(entries=10, total_bytes=3_000_000, ratio=200, ratio_from_bytes=100_000)
 

@@ -1,4 +1,6 @@
-"""REST. Begin with routes_*.py, one file a subject; rest_records.py has their bodies and context.py what they work with.
+"""REST. Begin with routes/, one file a subject; rest_records.py has their bodies, answers.py fills them from the database, context.py is what they
+work with. door/ stands before them: who may ask, how much and how often, and what is let in.
 
-security.py and rate_limit.py stand around all of it, problems.py makes every error a sentence, uploads.py and zip_guard.py take files in.
+problems.py makes every error a sentence, metrics.py counts requests, environments.py (with made_environments.py) stores environments.
+openapi_document.py describes all this to programs, docs_page.py to people.
 """

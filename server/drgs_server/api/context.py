@@ -6,10 +6,10 @@ from fastapi import Request
 from sqlalchemy import Engine
 from starlette.requests import HTTPConnection
 
+from drgs_server.api.door.incoming import IncomingUploads
+from drgs_server.api.door.security import Gatekeeper
 from drgs_server.api.environments import EnvironmentStore
-from drgs_server.api.incoming import IncomingUploads
 from drgs_server.api.metrics import Metrics
-from drgs_server.api.security import Gatekeeper
 from drgs_server.live.admission import Admission, Caller
 from drgs_server.live.sessions import SessionRegistry
 from drgs_server.render.thread import RenderThread

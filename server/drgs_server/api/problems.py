@@ -12,8 +12,8 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from drgs_server.api.door.while_connected import CallerLeft
 from drgs_server.api.rest_records import Problem
-from drgs_server.api.while_connected import CallerLeft
 from drgs_worker.store import disk_trouble
 from drgs_worker.store.artifact_store import ArtifactError, ArtifactMissing, StoreAway
 

@@ -18,11 +18,11 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from drgs_server.api.context import ServerContext, caller_of, context_of
-from drgs_server.api.incoming import Incoming
+from drgs_server.api.door.incoming import Incoming
+from drgs_server.api.door.while_connected import while_connected
+from drgs_server.api.door.zip_guard import single_folder, unpack_zip
 from drgs_server.api.problems import ProblemError
 from drgs_server.api.rest_records import CaptureInfo, CaptureList, CaptureLook, CaptureMasks, CaptureRequest, MasksRequest
-from drgs_server.api.while_connected import while_connected
-from drgs_server.api.zip_guard import single_folder, unpack_zip
 from drgs_server.live.admission import Caller
 from drgs_worker.jobs.file_tool import LOOK_NAME, MASKS_NAME, SHEET_NAME, FileToolError, look_bytes, masks_bytes, run_file_tool
 from drgs_worker.store.artifacts import fetch_capture, share_artifact

@@ -20,10 +20,10 @@ from drgs.exchange.export_formats import FEWEST_FACES, FILE_KINDS, MOST_FACES, D
 from drgs.scene.edits import Edit, plain_edit
 from drgs_server.api.answers import asset_info
 from drgs_server.api.context import ServerContext, caller_of, context_of
+from drgs_server.api.door.receive_upload import receive_upload
+from drgs_server.api.door.while_connected import while_connected
 from drgs_server.api.problems import ProblemError
 from drgs_server.api.rest_records import AssetInfo, AssetList, EnvironmentInfo, EnvironmentList
-from drgs_server.api.uploads import receive_upload
-from drgs_server.api.while_connected import while_connected
 from drgs_server.live.admission import Caller
 from drgs_server.live.live_session import LiveSession
 from drgs_worker.jobs.file_tool import FileToolError, file_tool_bytes, run_file_tool

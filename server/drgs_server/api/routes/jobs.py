@@ -19,11 +19,11 @@ from starlette.concurrency import run_in_threadpool
 
 from drgs_server.api.answers import JOB_LIST_COLUMNS, job_info, job_infos
 from drgs_server.api.context import ServerContext, context_of
+from drgs_server.api.door.receive_upload import receive_upload
+from drgs_server.api.door.zip_guard import single_folder, unpack_zip
 from drgs_server.api.problems import ProblemError
 from drgs_server.api.rest_records import BuildRequest, JobFile, JobFileList, JobInfo, JobList, PoseRequest
-from drgs_server.api.routes_captures import CAPTURE_PREFIX, folder_of_capture
-from drgs_server.api.uploads import receive_upload
-from drgs_server.api.zip_guard import single_folder, unpack_zip
+from drgs_server.api.routes.captures import CAPTURE_PREFIX, folder_of_capture
 from drgs_worker.jobs.queue import JobNotInState, is_alive
 from drgs_worker.jobs.requests import JOB_REQUESTS, OWN_LIGHT, ExportRequest, JobRequest, RedecoupleRequest, RenderRequest, SimulateRequest
 from drgs_worker.store.artifact_store import StoreAway

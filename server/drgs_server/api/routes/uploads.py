@@ -2,7 +2,7 @@
 
 The protocol is tus 1.0.0 with its extensions creation and termination (https://tus.io/protocols/resumable-upload), so that its clients work, too:
 POST announces a file, PATCH sends bytes from where it is, HEAD tells where that is. What a part's connection brought before it was lost has arrived.
-An upload that is complete is used by its id (routes_captures.py) and gone then.
+An upload that is complete is used by its id (captures.py) and gone then.
 """
 
 import base64
@@ -15,8 +15,8 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from drgs_server.api.context import ServerContext, context_of
+from drgs_server.api.door.while_connected import CallerLeft
 from drgs_server.api.problems import ProblemError
-from drgs_server.api.while_connected import CallerLeft
 from drgs_worker.store.user_names import name_from_file
 
 TUS_VERSION = "1.0.0"

@@ -1,6 +1,6 @@
 """Uploads that arrive in parts and go on after a lost connection: what has come of each lies in the data directory, so that a restart loses none of it.
 
-In: parts, each with the place that it begins at. Out: a file that is complete, for routes_captures.py to unpack. What counts as arrived is what the
+In: parts, each with the place that it begins at. Out: a file that is complete, for routes/captures.py to unpack. What counts as arrived is what the
 file holds. Knows nothing of what is in the files, and nothing of HTTP but the problems that it raises.
 """
 

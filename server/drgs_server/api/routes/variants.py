@@ -10,9 +10,9 @@ from pydantic import ValidationError
 from drgs.scene.edits import Edit, MaterialVariant, VariantEdit
 from drgs.scene.variants import kept_variants, material_edits, wearing_variant, with_renamed_variant, with_variant, without_variant
 from drgs_server.api.context import ServerContext, caller_of, context_of
+from drgs_server.api.door.while_connected import while_connected
 from drgs_server.api.problems import ProblemError
 from drgs_server.api.rest_records import VariantList, VariantNameRequest, VariantRequest
-from drgs_server.api.while_connected import while_connected
 from drgs_server.live.edit_log import ChangeRequest
 from drgs_server.live.messages import EditLog
 from drgs_worker.store.user_names import UserName

@@ -12,9 +12,9 @@ from http.cookies import CookieError, SimpleCookie
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from drgs_server.api.connections import CONNECTION, GuardedConnection
+from drgs_server.api.door.connections import CONNECTION, GuardedConnection
+from drgs_server.api.door.rate_limit import OPEN_API_PATHS, CallBuckets, peer_of, too_many_failures
 from drgs_server.api.problems import problem_response
-from drgs_server.api.rate_limit import OPEN_API_PATHS, CallBuckets, peer_of, too_many_failures
 from drgs_server.live.messages import CLOSE_POLICY, CLOSE_TRY_AGAIN
 
 COOKIE_NAME = "drgs_session"

@@ -5,8 +5,8 @@ from starlette.datastructures import Headers
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from drgs_server.api.door.rate_limit import OPEN_API_PATHS
 from drgs_server.api.problems import problem_response
-from drgs_server.api.rate_limit import OPEN_API_PATHS
 from drgs_server.settings import Limits
 
 OPEN_BODY_BYTES = 4096

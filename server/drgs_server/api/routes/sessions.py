@@ -15,6 +15,7 @@ from drgs.scene.edits import Edit, EnvironmentEdit
 from drgs.scene.tone_curve import ToneCurve
 from drgs_server.api.answers import session_info, snapshot_info
 from drgs_server.api.context import ServerContext, caller_of, context_of
+from drgs_server.api.door.while_connected import while_connected
 from drgs_server.api.problems import ProblemError
 from drgs_server.api.rest_records import (
     AssetInfo,
@@ -27,8 +28,7 @@ from drgs_server.api.rest_records import (
     SnapshotInfo,
     SnapshotList,
 )
-from drgs_server.api.routes_assets import FacesQuery, save_version, write_export
-from drgs_server.api.while_connected import while_connected
+from drgs_server.api.routes.assets import FacesQuery, save_version, write_export
 from drgs_server.live.admission import Caller
 from drgs_server.live.edit_log import ChangeRequest
 from drgs_server.live.live_session import LiveSession

@@ -12,7 +12,7 @@ from drgs.exchange.photographs import PHOTOGRAPHS, read_photograph
 from drgs_server.api.context import ServerContext, context_of
 from drgs_server.api.problems import ProblemError
 from drgs_server.api.rest_records import TrainingView, TrainingViewList
-from drgs_server.api.routes_assets import asset_folder
+from drgs_server.api.routes.assets import asset_folder
 from drgs_worker.store.training_views import has_photographs, training_views
 
 router = APIRouter(prefix="/api/assets/{asset_id}/views", tags=["assets"])
