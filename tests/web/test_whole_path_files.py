@@ -7,8 +7,9 @@ and tests/blender.
 
 import io
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,11 @@ from scipy.spatial import cKDTree
 from benchmarks.measures.three_picture import SeenByThree, ThreePage
 from blender.build import build_extension
 from drgs.convert import bake_transfer
+from drgs.convert.bake_edits import bake_edits
 from drgs.convert.export_asset import export_asset
-from drgs.convert.transform_splats import transform_splats
+from drgs.convert.transform_splats import DEVICES, transform_splats
 from drgs.deform.pose_scene import pose_scene
+from drgs.exchange.export_formats import SPLAT_KINDS, ExportFormat, SplatFormat
 from drgs.exchange.gaussian_ply import log_thickness
 from drgs.exchange.gltf_splats import EXTENSION, GltfSplats
 from drgs.exchange.ply import parse_ply
@@ -35,7 +38,7 @@ from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.asset import Asset, load_asset
 from drgs.scene.camera import Camera, camera_from_opengl
-from drgs.scene.edits import parse_edits
+from drgs.scene.edits import AS_CAPTURED, parse_edits
 from drgs_server.client import Client
 from drgs_worker.jobs.builders import BuildRequest
 from drgs_worker.jobs.start_view import FOV_Y_DEGREES, start_view
@@ -43,8 +46,18 @@ from tests.blender.test_blender_extension import inside_blender, needs_blender
 from tests.exchange.write_splats import with_document
 from tests.web import short_builder
 from tests.web.browser import RunningServer
-from tests.web.test_exported_files import ERROR, check_splats, check_spz, findings, meant, name_splats_as_ours, splats_in_three
-from tests.web.test_exported_glb import ENVIRONMENTS
+from tests.web.test_exported_files import (
+    ERROR,
+    check_splats,
+    check_spz,
+    findings,
+    harmonics,
+    meant,
+    name_splats_as_ours,
+    radiance,
+    splats_in_three,
+)
+from tests.web.test_exported_glb import ENVIRONMENTS, stands
 from tests.web.test_whole_path import small_capture
 
 NAME = "Little sample"
@@ -52,10 +65,17 @@ SIDE = 128
 SAMPLES = 128
 LIGHT = "overcast.exr"
 THREE_DIFFERENCE = 5.0
-"""Mean over pixels and channels, sRGB 0..255: 3.7. docs/formats.md says what such a difference consists of."""
+"""Mean over pixels and channels, sRGB 0..255: 3.7, of a GLB and of a USDZ. docs/formats.md says what such a difference consists of."""
+USDZ_DIRECTIONS = 64
+"""A quarter of those that an export looks into for its occlusion: with all of them 0.1 less."""
+GOLD = parse_edits([{"op": "material", "select": {"all": True}, "set": {"albedo": [1.0, 0.77, 0.34], "metallic": 1.0, "roughness": 0.3}}])
+VARIANT_CHANGE = 20.0
+"""Mean difference, likewise, that gold makes to three.js' picture, at least: 45."""
+COMPRESSED: dict[SplatFormat, tuple[float, float]] = {"compressed": (0.001, 3.0), "sog": (0.0001, 1.0)}
+"""Largest difference of places, as a share of the extent: 0.0002 and 0.00002; and mean of colours from any side, of 255: 2.1 and 0.4."""
 CYCLES_SAMPLES = 256
 CYCLES_DIFFERENCE = 2.5
-"""Likewise: 1.7 by Blender 5.0.1, noise of both included."""
+"""As THREE_DIFFERENCE: 1.7 by Blender 5.0.1, noise of both included."""
 
 Picture = Float[ndarray, "height width 4"]
 """0..255, sRGB, straight alpha."""
@@ -100,19 +120,67 @@ def test_the_gltf_validator_finds_no_fault_in_the_samples_glb(exported: Path, ru
     assert len(refused) == 19 and all(name.startswith(f"{EXTENSION}:") for name in refused), "names that it does not know yet"
 
 
-def test_three_draws_the_samples_glb_as_we_do(sample: Asset, exported: Path, browser: Browser) -> None:
-    low, high = sample.mesh.vertices.amin(0).tolist(), sample.mesh.vertices.amax(0).tolist()
-    view = start_view(low, high)
-    focal = SIDE / 2 / np.tan(np.radians(FOV_Y_DEGREES / 2))
-    camera = camera_from_opengl(torch.from_numpy(view), torch.tensor([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1.0]]), SIDE, SIDE)
-    in_metres = view.copy()
+@pytest.fixture(scope="module")
+def three(browser: Browser) -> Iterator[ThreePage]:
+    """three.js under LIGHT."""
+    with closing(ThreePage(browser, (ENVIRONMENTS / LIGHT).read_bytes())) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def seen(sample: Asset) -> SeenByThree:
+    """The sample as the viewer opens it."""
+    in_metres = first_view(sample)
     in_metres[:3, 3] *= sample.meters_per_unit
-    seen = SeenByThree(in_metres.tolist(), FOV_Y_DEGREES, SIDE, SIDE)
-    with closing(ThreePage(browser, (ENVIRONMENTS / LIGHT).read_bytes())) as three:
-        theirs = three.fine_picture(exported.read_bytes(), ".glb", seen)
-    difference = mean_difference(our_picture(sample, camera, LIGHT), theirs)
+    return SeenByThree(in_metres.tolist(), FOV_Y_DEGREES, SIDE, SIDE)
+
+
+@pytest.fixture(scope="module")
+def ours(sample: Asset) -> Picture:
+    """Our picture of what three.js is to draw."""
+    focal = SIDE / 2 / np.tan(np.radians(FOV_Y_DEGREES / 2))
+    intrinsics = torch.tensor([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1.0]])
+    return our_picture(sample, camera_from_opengl(torch.from_numpy(first_view(sample)), intrinsics, SIDE, SIDE), LIGHT)
+
+
+def first_view(asset: Asset) -> Float[ndarray, "4 4"]:
+    return start_view(asset.mesh.vertices.amin(0).tolist(), asset.mesh.vertices.amax(0).tolist())
+
+
+def test_three_draws_the_samples_glb_as_we_do(exported: Path, three: ThreePage, seen: SeenByThree, ours: Picture) -> None:
+    difference = mean_difference(ours, three.fine_picture(exported.read_bytes(), ".glb", seen))
     print(f"three.js: mean difference {difference:.2f} of 255")
     assert difference < THREE_DIFFERENCE
+
+
+def test_three_draws_the_samples_usdz_as_we_do(
+    sample: Asset, three: ThreePage, seen: SeenByThree, ours: Picture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pxr", reason="the optional package usd-core is not installed")
+    monkeypatch.setattr(bake_transfer, "DIRECTIONS", USDZ_DIRECTIONS)
+    path = tmp_path / "sample.usdz"
+    export_asset(sample, path, "usdz")
+    difference = mean_difference(ours, three.fine_picture(path.read_bytes(), ".usdz", replace(seen, stands=stands(path))))
+    print(f"three.js: mean difference {difference:.2f} of 255")
+    assert difference < THREE_DIFFERENCE
+
+
+def test_three_shows_the_sample_in_gold_as_it_shows_a_sample_of_gold(
+    sample: Asset, three: ThreePage, seen: SeenByThree, run_node: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bake_transfer, "DIRECTIONS", 16)  # how finely shadows are baked is not asked here
+    path, golden = tmp_path / "variants.glb", tmp_path / "gold.glb"
+    export_asset(sample, path, "mesh", faces=1000, variants={"Gold": GOLD})
+    export_asset(bake_edits(sample, GOLD, tmp_path, 2), golden, "mesh", faces=1000)
+    assert findings(run_node, tmp_path, variants=path.read_bytes()) == {"variants": []}
+
+    def shown(file: Path, variant: str | None) -> Picture:
+        return three.picture(file.read_bytes(), ".glb", replace(seen, variant=variant)).astype(float)
+
+    opened, worn = shown(path, None), shown(path, "Gold")
+    np.testing.assert_array_equal(opened, shown(path, AS_CAPTURED))
+    np.testing.assert_array_equal(worn, shown(golden, None))
+    assert mean_difference(opened, worn) > VARIANT_CHANGE
 
 
 def our_picture(asset: Asset, camera: Camera, light: str | None = None) -> Picture:
@@ -147,25 +215,38 @@ def test_three_reads_the_samples_splats(sample: Asset, exported: Path, run_node:
     splats_in_three(run_node, tmp_path / "plain.glb", splats)
 
 
-def test_supersplats_reader_takes_every_column_of_the_samples_ply(sample: Asset, run_node: Callable[..., str], tmp_path: Path) -> None:
-    export_asset(sample, tmp_path / "a.ply", "ply")
-    check_splats(run_node, tmp_path / "a.ply", meant(sample), "2dgs")
+@pytest.mark.parametrize(("format", "model"), [("ply", "2dgs"), ("ply3", "default")])
+def test_supersplats_reader_takes_every_column_of_the_samples_ply(
+    sample: Asset, run_node: Callable[..., str], tmp_path: Path, format: ExportFormat, model: str
+) -> None:
+    export_asset(sample, tmp_path / "a.ply", format)
+    check_splats(run_node, tmp_path / "a.ply", meant(sample), model)
 
 
 def test_splat_transform_reads_the_samples_spz(sample: Asset, run_node: Callable[..., str], tmp_path: Path) -> None:
     check_spz(run_node, sample, tmp_path)
 
 
-def test_splat_transform_reads_the_sample_that_it_compressed(sample: Asset, run_node: Callable[..., str], tmp_path: Path) -> None:
-    """As PLY: a SOG of as many is clustered for far longer than all of this takes, so those of the suite are the ball's."""
-    made = tmp_path / "a.compressed.ply"
-    transform_splats(sample, made, "compressed")
+@pytest.mark.parametrize("format", COMPRESSED)
+def test_splat_transform_reads_the_sample_that_it_compressed(
+    sample: Asset, run_node: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: SplatFormat
+) -> None:
+    """A SOG of ten thousand splats takes six seconds of a core; that no GPU is there to make it takes two more to be found out."""
+    monkeypatch.setitem(DEVICES, "sog", (("--gpu", "cpu"),))
+    made = tmp_path / f"a{SPLAT_KINDS[format].suffix}"
+    transform_splats(sample, made, format)
     run_node("node_modules/@playcanvas/splat-transform/bin/cli.mjs", "--quiet", made, tmp_path / "back.ply")
-    read = parse_ply((tmp_path / "back.ply").read_bytes()).elements["vertex"].scalars
-    found, given = np.stack([read[axis] for axis in "xyz"], -1).astype(float), meant(sample)["centers"]
-    nearest, _ = cKDTree(found).query(given)
-    print(f"compressed: places {nearest.max() / np.ptp(given):.6f} of the extent")
-    assert len(found) == len(given) and nearest.max() < 0.001 * np.ptp(given)
+    read, given = parse_ply((tmp_path / "back.ply").read_bytes()).elements["vertex"].scalars, meant(sample)
+    found = np.stack([read[axis] for axis in "xyz"], -1).astype(float)
+    away, nearest = cKDTree(found).query(given["centers"])
+    assert len(found) == len(set(nearest)) == len(given["centers"])
+    directions = np.random.default_rng(0).normal(size=found.shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    color = 255 * np.abs(radiance({"sh": harmonics(read)[nearest]}, directions) - radiance(given, directions)).mean()
+    place = away.max() / np.ptp(given["centers"])
+    print(f"{format}: places {place:.6f} of the extent, colours {color:.2f} of 255")
+    most_place, most_color = COMPRESSED[format]
+    assert place < most_place and color < most_color
 
 
 def test_no_validator_of_openusd_finds_a_fault_in_the_samples_files(sample: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
