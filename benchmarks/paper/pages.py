@@ -20,8 +20,9 @@ Written by `python -m benchmarks paper`; each table and figure names the command
 the same asset and the same photographs, so that what differs is how Gaussians are bound, driven and shaded. Pictures are compared on white; PSNR in dB.
 Figures of the paper itself are of other scenes and of other code, and are not beside these.
 """
-MISSING = """## What is not here yet
-- LPIPS: its weights come with no package that we install; PSNR and SSIM only.
+MISSING = "## What is not here yet"
+NO_LPIPS = "- LPIPS: its weights come with no package that we install; `--lpips FILE` adds it to the tables (benchmarks/README.md says which file)."
+OTHERS_MISSING = """\
 - Deformed truth is of analytic maps (bend, twist, stretch), drawn by Mitsuba, and of one character that is our own. With `--mitsuba` its photographs and the
   truth of its dance are Mitsuba's; without, our renderer draws both, and is no witness of how light is computed.
 - What is simulated is shown, and of sand it is said how far its picture is from balls of its particles' volume; no truth of a real fall is there.
@@ -50,7 +51,7 @@ def page(document: dict, variants: list[AbstractVariant]) -> str:
         if rows:
             columns = list(dict.fromkeys(column for row in rows for column in row))
             parts.append(f"## {title}\n{NOTES[title]}\n\n{markdown_table(rows, columns)}\n\n{made_of(document, kind)}\n")
-    parts += [honesty(document, variants), figures(document), MISSING]
+    parts += [honesty(document, variants), figures(document), missing(document, variants)]
     return "\n".join(part for part in parts if part)
 
 
@@ -58,9 +59,9 @@ NOTABLE = 0.05
 """[dB] below which two of our own ways count as equal."""
 WHY_SSIM = "Computed from the tables. What noise rays leave is filtered (SVGF), as in the paper; drawn colours have none. More rays (`--spp`) leave less."
 NOTES = {
-    "Static views": "Test views at rest under the light of the photographs: PSNR and SSIM.",
+    "Static views": "Test views at rest under the light of the photographs.",
     "Deformed, light of the photographs": "The true object deformed by a known map, rendered by Mitsuba under the light of the photographs.",
-    "Deformed, new light": "The same under a light that no photograph shows; PSNR after one factor a channel, since nobody can tell dark paint from dim light. "
+    "Deformed, new light": "The same under a light that no photograph shows; PSNR and LPIPS after one factor a channel, since nobody can tell dark paint from dim light. "
     "Baked ways show the old light.",
     "Time and memory": "Wall-clock seconds of binding and baking, and of a picture of 400×400 (posing included), beside whatever else the machine did (load, below); peak memory of the "
     "whole process while drawing deformed views.",
@@ -85,7 +86,9 @@ def deformed_scores(document: dict, new_light: bool) -> dict[str, dict[str, dict
         for way, cell in cells["deformed"].items():
             kind = [figures for figures in cell["figures"].values() if figures["new_light"] is new_light]
             if kind:
-                names = ("psnr", "ssim", *(("psnr_scaled",) if new_light else ()))
+                names = [
+                    name for name in ("psnr", "ssim", "psnr_scaled", "lpips", "lpips_scaled") if all(name in figures for figures in kind)
+                ]
                 found.setdefault(scene, {})[way] = {name: float(np.mean([figures[name] for figures in kind])) for name in names}
     return found
 
@@ -95,8 +98,12 @@ def deformed_rows(document: dict, variants: list[AbstractVariant], new_light: bo
 
 
 def score_rows(scores: dict[str, dict[str, dict]], variants: list[AbstractVariant], key: str) -> list[dict[str, object]]:
-    """A row a way: PSNR and SSIM of each scene, and the means over those that every way has."""
-    rows = []
+    """A row a way: PSNR, SSIM and, where it was asked for, LPIPS of each scene, and the means over those scenes that every way has.
+
+    Args:
+        key: "psnr" or "psnr_scaled", and LPIPS likewise.
+    """
+    rows, distance = [], lpips_key(key)
     shown = [variant.name for variant in variants if any(variant.name in by_way for by_way in scores.values())]
     shared = [scene for scene, by_way in scores.items() if all(name in by_way for name in shown)]
     for variant in variants:
@@ -106,11 +113,20 @@ def score_rows(scores: dict[str, dict[str, dict]], variants: list[AbstractVarian
         row: dict[str, object] = {"way": variant.title}
         for scene, figures in own.items():
             row |= {f"{scene} PSNR": f"{figures[key]:.2f}", f"{scene} SSIM": f"{figures['ssim']:.3f}"}
+            if any(distance in others for others in scores[scene].values()):
+                row[f"{scene} LPIPS"] = f"{figures[distance]:.3f}" if distance in figures else None
         if len(shared) > 1:
             row["mean PSNR"] = f"{np.mean([own[scene][key] for scene in shared]):.2f}"
             row["mean SSIM"] = f"{np.mean([own[scene]['ssim'] for scene in shared]):.3f}"
+            if all(distance in scores[scene][name] for scene in shared for name in shown):
+                row["mean LPIPS"] = f"{np.mean([own[scene][distance] for scene in shared]):.3f}"
         rows.append(row)
     return rows
+
+
+def lpips_key(key: str) -> str:
+    """Of LPIPS of the pictures that this PSNR is of."""
+    return key.replace("psnr", "lpips")
 
 
 def cost_rows(document: dict, variants: list[AbstractVariant]) -> list[dict[str, object]]:
@@ -168,7 +184,28 @@ def honesty(document: dict, variants: list[AbstractVariant]) -> str:
             if others[structure]["ssim"] > by_way["ours_particles"]["ssim"]:
                 more = others[structure]["ssim"] - by_way["ours_particles"]["ssim"]
                 lines.append(f"- {scene}, {table}: by SSIM {titles[structure]} is **ahead** of ours (P) by {more:.3f}.")
+            distances = {way: figures[lpips_key(key)] for way, figures in by_way.items() if lpips_key(key) in figures}
+            alike = min(others.keys() & distances.keys(), key=lambda way: distances[way], default=None)
+            if alike is not None and distances[alike] < distances.get("ours_particles", 0):
+                less = distances["ours_particles"] - distances[alike]
+                lines.append(f"- {scene}, {table}: by LPIPS {titles[alike]} is **ahead** of ours (P) by {less:.3f}.")
     return "\n".join(["## Who is better", WHY_SSIM, "", *lines, ""]) if lines else ""
+
+
+def missing(document: dict, variants: list[AbstractVariant]) -> str:
+    """What the page has not, and the rows that have no LPIPS though it was asked for."""
+    lines, asked = [], False
+    for kind, told in (("static", "static views"), ("deformed", "deformed views")):
+        for scene, cells in document.items():
+            asked |= any("lpips" in cell for cell in cells[kind].values())
+            own = {variant.title: cells[kind][variant.name] for variant in variants if variant.name in cells[kind]}
+            lacking = [title for title, cell in own.items() if "lpips" in cell and cell["lpips"] is None]
+            if lacking:
+                lines.append(
+                    f"- LPIPS of {scene}, {told}: {', '.join(lacking)}. Their pictures are gone or of another run; without their files in `OUT/cells` they are drawn anew."
+                )
+    lines += ["- LPIPS of the dances."] if asked else [NO_LPIPS]
+    return "\n".join([MISSING, *lines, OTHERS_MISSING])
 
 
 def figures(document: dict) -> str:
@@ -193,13 +230,16 @@ def made_of(document: dict, kind: str) -> str:
         f"the first, every {settings['test_every']}. test view." if settings["test_every"] > 1 else
         f"{settings['samples_per_pixel']} rays a pixel, {settings['budget']} Gaussians on faces of their own, {settings['bake']['rounds']} rounds of baking after the first."
     )  # fmt: skip
-    times = sorted(cell["made"]["time"] for cell in cells)
-    commits = ", ".join(sorted({cell["made"]["commit"] or "no checkout" for cell in cells}))
-    machines = ", ".join(sorted({re.sub(r", load \d+$", "", cell["made"]["machine"]) for cell in cells}))
-    loads = [int(found[1]) for cell in cells if (found := re.search(r"load (\d+)$", cell["made"]["machine"]))]
-    commands = "; ".join(f"`{command}`" for command in sorted({cell["made"]["command"] for cell in cells}))
+    distances = [cell["lpips"] for cell in cells if cell.get("lpips")]
+    networks = "".join(f" {network}; less is better." for network in sorted({distance["network"] for distance in distances}))
+    makings = [cell["made"] for cell in (*cells, *distances)]
+    times = sorted(made["time"] for made in makings)
+    commits = ", ".join(sorted({made["commit"] or "no checkout" for made in makings}))
+    machines = ", ".join(sorted({re.sub(r", load \d+$", "", made["machine"]) for made in makings}))
+    loads = [int(found[1]) for made in makings if (found := re.search(r"load (\d+)$", made["machine"]))]
+    commands = "; ".join(f"`{command}`" for command in sorted({made["command"] for made in makings}))
     load = f", load {min(loads)} to {max(loads)}" if loads else ""
-    return f"{spent} {commands}; commit {commits}; {times[0]} to {times[-1]}; {machines}{load}."
+    return f"{spent}{networks} {commands}; commit {commits}; {times[0]} to {times[-1]}; {machines}{load}."
 
 
 def made_by(cell: dict) -> str:

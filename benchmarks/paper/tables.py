@@ -17,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from benchmarks.measures.bench_scene import BenchScene, read_light, read_rgba
+from benchmarks.measures.lpips import LpipsNetwork
 from benchmarks.measures.peak_memory import measured
 from benchmarks.paper.cells import CellFolder, write_tensors
 from benchmarks.paper.fields import at_rest, field_of_map
@@ -51,6 +52,8 @@ class SceneEvidence:
     asset_path: Path
     cells: CellFolder
     settings: EvidenceSettings
+    lpips: LpipsNetwork | None = None
+    """None: not asked for. What is drawn does not depend on it."""
 
     @cached_property
     def subject(self) -> Subject:
@@ -111,7 +114,7 @@ def static_cell(evidence: SceneEvidence, variant: AbstractVariant) -> dict:
 
     def make() -> dict:
         bound, subject = read_bound(evidence, variant), evidence.subject
-        cameras = evidence.scene.cameras[:: evidence.settings.test_every]
+        cameras = drawn_cameras(evidence, Path("test"))
 
         def run() -> dict:
             drawn = variant.pose(subject, bound, at_rest, None)
@@ -137,7 +140,7 @@ def deformed_cell(evidence: SceneEvidence, variant: AbstractVariant) -> dict:
             for folder, new_light in evidence.truths():
                 moved_by = field_of_map(evidence.deformations[folder.parent.name])
                 drawn = variant.pose(subject, bound, moved_by, read_light(scene, folder.name) if new_light else None)
-                cameras = [camera for camera in scene.cameras if (scene.folder / folder / f"{camera.name}.png").is_file()]
+                cameras = drawn_cameras(evidence, folder)
                 pairs = draw_and_read(drawn, cameras, evidence.pictures(variant) / folder, scene.folder / folder)
                 figures[f"{folder.parent.name}/{folder.name}"] = picture_figures(pairs, new_light) | {"new_light": new_light}
                 count += len(cameras)
@@ -150,7 +153,15 @@ def deformed_cell(evidence: SceneEvidence, variant: AbstractVariant) -> dict:
     return evidence.cells.cell(f"{evidence.scene.name}-{variant.name}-deformed", evidence.asked, make)
 
 
-def draw_and_read(drawn: Draw, cameras: tuple[Camera, ...] | list[Camera], out: Path, truth: Path) -> list[tuple[np.ndarray, np.ndarray]]:
+def drawn_cameras(evidence: SceneEvidence, folder: Path) -> list[Camera]:
+    """Test cameras whose pictures are compared with the scene's folder of truth."""
+    scene = evidence.scene
+    if folder == Path("test"):
+        return list(scene.cameras[:: evidence.settings.test_every])
+    return [camera for camera in scene.cameras if (scene.folder / folder / f"{camera.name}.png").is_file()]
+
+
+def draw_and_read(drawn: Draw, cameras: list[Camera], out: Path, truth: Path) -> list[tuple[np.ndarray, np.ndarray]]:
     """Pictures as their 8-bit files hold them, each with its truth, (height, width, 4)."""
     out.mkdir(parents=True, exist_ok=True)
     pairs = []

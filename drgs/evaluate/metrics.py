@@ -97,10 +97,7 @@ def picture_figures(pairs: list[tuple[Array, Array]], new_light: bool = False) -
     }
     if new_light:
         scale = light_scale(pairs)
-        scaled = [
-            np.concatenate([srgb_from_linear(np.clip(linear_from_srgb(rendered[..., :3]) * scale, 0, 1)), rendered[..., 3:]], -1)
-            for rendered, _ in pairs
-        ]
+        scaled = [scale_light(rendered, scale) for rendered, _ in pairs]
         figures["psnr_scaled"] = float(np.mean([psnr(on_white(rendered), true) for rendered, (_, true) in zip(scaled, white, strict=True)]))
         figures["scale"] = [round(float(k), 4) for k in scale]
     return figures
@@ -115,6 +112,11 @@ def light_scale(pairs: list[tuple[Array, Array]]) -> Array:
         products += np.sum(a * b, axis=0)
         squares += np.sum(a * a, axis=0)
     return products / np.maximum(squares, 1e-9)
+
+
+def scale_light(rgba: Array, scale: Array) -> Array:
+    """The (height, width, 4) sRGB picture with its linear colour times (3,) factors."""
+    return np.concatenate([srgb_from_linear(np.clip(linear_from_srgb(rgba[..., :3]) * scale, 0, 1)), rgba[..., 3:]], -1)
 
 
 def normal_error_degrees(rendered: Array, true: Array) -> Array:

@@ -188,7 +188,11 @@ def test_commands_for_readers_name_no_folder_of_this_machine():
 
 @pytest.mark.parametrize(
     ("more", "sentence"),
-    [(["--spp", "0"], "--spp is 0"), (["--assets", "nowhere/{scene}"], "nowhere/ball holds no asset.json")],
+    [
+        (["--spp", "0"], "--spp is 0"),
+        (["--assets", "nowhere/{scene}"], "nowhere/ball holds no asset.json"),
+        (["--lpips", __file__], "has the sha256 .*; expected alexnet.ckpt"),
+    ],
 )
 def test_what_cannot_be_compared_is_refused(scene: Path, assets: Path, tmp_path: Path, more: list[str], sentence: str):
     with pytest.raises(ValueError, match=sentence):
