@@ -58,11 +58,13 @@ from drgs.reconstruct.stages import (
     capture_digest,
     fit_stage,
     forget_checkpoints,
+    ground_stage,
     hollows_stage,
     masks_stage,
     mesh_materials_stage,
     mesh_stage,
     points_of_found_masks,
+    points_on_ground,
     stage_two_preview,
     surface_preview,
     surface_stage,
@@ -170,6 +172,8 @@ def build_stages(
             forget_checkpoints(place)
         fit_settings = replace(preset.fit, seed=settings.seed)
         if not views.has_masks:
+            views = ground_stage(place, views, settings.seed)
+            points = points_on_ground(views, points, preset.points, settings.seed, settings.box)
             masked = masks_stage(place, views, points, fit_settings, device, settings.box)
             views = views_of(views, masked)  # without those in which the box's content is hidden
             points = points_of_found_masks(masked, points, preset.points, settings.seed, settings.box)

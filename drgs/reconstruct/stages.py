@@ -18,6 +18,7 @@ from drgs.reconstruct.capture.build_box import BuildBox
 from drgs.reconstruct.capture.cut_to_box import chosen_views
 from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
 from drgs.reconstruct.capture.find_masks import find_masks
+from drgs.reconstruct.capture.on_ground.stands_on_ground import stands_on_ground
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
@@ -42,11 +43,14 @@ from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, pixel_rays_world, scaled_camera
 from drgs.scene.gaussians import Gaussians
+from drgs.scene.ground import Ground
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 
 MASKS = "masks.safetensors"
 """Of a capture that has none of its own."""
+GROUND = "ground.safetensors"
+"""What the object stands on, where it has no masks."""
 HOLLOWS = "hollows.safetensors"
 """Points without the hull's hollows; those of the hull where it has none."""
 FIT, MESH, SURFACE, MATERIALS = "stage1.safetensors", "mesh.safetensors", "surface.safetensors", "stage2.safetensors"
@@ -85,7 +89,7 @@ def capture_digest(views: Views, box: BuildBox | None = None) -> str:
 
 def forget_checkpoints(place: Workplace) -> None:
     """Else a later build that resumes would take them for this one's."""
-    for stale in (MASKS, *CHECKPOINTS):
+    for stale in (GROUND, MASKS, *CHECKPOINTS):
         (place.folder / stale).unlink(missing_ok=True)
 
 
@@ -107,6 +111,30 @@ def masks_stage(
     kept = _kept_or_made(place, MASKS, torch.device("cpu"), found)
     numbers = [number for number in range(len(views.cameras)) if f"coverage.{number}" in kept]
     return replace(chosen_views(views, numbers), coverage=tuple(kept[f"coverage.{number}"] for number in numbers), has_masks=True)
+
+
+def ground_stage(place: Workplace, views: Views, seed: int) -> Views:
+    """stands_on_ground; the very views where there is no ground."""
+
+    def made() -> dict[str, Tensor]:
+        place.reporter.report("read", 0.0, "no masks: looking for what the object stands on")
+        found = stands_on_ground(views, seed)
+        if found is None or found.ground is None:
+            return {"found": torch.zeros(1)}
+        ground = found.ground
+        kept = {name: value for name, value in vars(ground).items() if isinstance(value, Tensor)} | {"half": torch.tensor([ground.half])}
+        return {"found": torch.ones(1)} | kept | {f"coverage.{number}": mask for number, mask in enumerate(found.coverage)}
+
+    kept = _kept_or_made(place, GROUND, torch.device("cpu"), made)
+    if not kept["found"]:
+        return views
+    ground = Ground(kept["middle"], kept["axes"], float(kept["half"]), kept["color_srgb"], kept["known"])
+    return replace(views, ground=ground, coverage=tuple(kept[f"coverage.{number}"] for number in range(len(views.cameras))))
+
+
+def points_on_ground(views: Views, points: InitialPoints, count: int, seed: int, box: BuildBox | None) -> InitialPoints:
+    """Points where the object may be; the given ones where no ground tells."""
+    return points if views.ground is None else points_of_found_masks(replace(views, has_masks=True), points, count, seed, box)
 
 
 def points_of_found_masks(masked: Views, points: InitialPoints, count: int, seed: int, box: BuildBox | None) -> InitialPoints:
@@ -149,7 +177,7 @@ def hollows_stage(
 
 def fit_stage(place: Workplace, views: Views, points: InitialPoints, settings: FitSettings, device: torch.device) -> FitState:
     """fit_gaussians."""
-    state, radius = start_fit(points, settings, device, views.has_masks), points.bounds_radius
+    state, radius = start_fit(points, settings, device, views.has_masks, views.ground), points.bounds_radius
     _checkpointed_fit(
         place,
         FitStage(

@@ -6,6 +6,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from drgs.scene.camera import Camera
+from drgs.scene.ground import Ground
 from drgs.scene.lens import Lens
 
 
@@ -31,3 +32,5 @@ class Views:
     """Of each view, how much more of the light its exposure keeps than the mean one (mean of logarithms 0); None: all alike."""
     light_from_world: tuple[Float[Tensor, "3 3"], ...] | None = None
     """Of each view, the rotation of directions in the world to those of the light's own table; None: the light stands still in the world."""
+    ground: Ground | None = None
+    """Without masks, what the object stands on; coverage is then 255 where a picture may show it. None: not known, or masks tell the object."""

@@ -83,7 +83,7 @@ def shown_views(views: Views, cut: list[CutMask], box: BuildBox) -> Views:
             f"{FEWEST_LEFT} pictures that show it.",
             "Make the box larger, so that it holds what is in front, too; or build all and leave faces out afterwards.",
         )
-    return chosen_views(replace(views, coverage=tuple(mask.coverage for mask in cut), has_masks=True), kept)
+    return chosen_views(replace(views, coverage=tuple(mask.coverage for mask in cut), has_masks=True, ground=None), kept)
 
 
 def shown(cut: list[CutMask]) -> list[int]:

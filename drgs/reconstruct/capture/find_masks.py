@@ -2,7 +2,8 @@
 
 Surfels are fitted in the sphere that all cameras look at, in front of a picture of the surroundings that depends on the direction alone,
 while coverage costs a little: whatever keeps its place against the directions as the camera moves becomes surfels, the rest background. Masks are
-what the surfels cover. Surroundings that are near (a table) move as the object does and become part of it.
+what the surfels cover. Near surroundings move as the object does and become part of it, but for the ground that it stands on, where that was found
+(on_ground): it lies before the surroundings, and surfels on it are none of the object.
 
 In: Views without masks, random points. Out: the same Views with masks. Measured on the bunny before its own surroundings (64 views,
 256 pixels, 400 iterations): intersection over union with the true masks 0.94.
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox
@@ -56,7 +57,7 @@ def find_masks(
     """
     settings = replace(settings, iterations=ITERATIONS, half_size_share=0.6, densify=replace(settings.densify, budget=12_000))
     small = smaller_views(views, SIDE)
-    state = start_fit(points, settings, device, has_masks=False)
+    state = start_fit(points, settings, device, has_masks=False, ground=views.ground)
     fit_gaussians(small, state, settings, points.bounds_radius, report, should_stop)
     return masked_by_surfels(views, gaussians_from_state(state), points.bounds_radius, box) if state.iteration == ITERATIONS else None
 
@@ -88,14 +89,20 @@ def masked_by_surfels(views: Views, gaussians: Gaussians, radius: float, box: Bu
 
 
 def with_drawn_masks(views: Views, gaussians: Gaussians, radius: float) -> Views:
-    """The capture masked by what surfels cover; radius: of the object's bounding sphere [world units]."""
-    masks = (share > HALF for share in _drawn(views, gaussians, radius, torch.ones_like(gaussians.opacity_logits)))
-    return replace(views, coverage=tuple((255 * mask).to(torch.uint8) for mask in masks), has_masks=True)
+    """The capture masked by what surfels cover above the ground; radius: of the object's bounding sphere [world units]."""
+    drawn = _drawn(views, gaussians, radius, _above_ground(views, gaussians).float())
+    masks = ((share > HALF) & (may > 0) for share, may in zip(drawn, views.coverage, strict=True))
+    return replace(views, coverage=tuple((255 * mask).to(torch.uint8) for mask in masks), has_masks=True, ground=None)
+
+
+def _above_ground(views: Views, gaussians: Gaussians) -> Bool[Tensor, "surfel"]:
+    """Surfels that stand on the ground; all where none is known."""
+    return torch.ones_like(gaussians.opacity_logits, dtype=torch.bool) if views.ground is None else views.ground.heights(gaussians.centers) > 0
 
 
 def drawn_in_box(views: Views, gaussians: Gaussians, radius: float, box: BuildBox) -> list[CutMask]:
     """The same of the surfels in the box alone, where no others are in front of them."""
-    held = box.holds(gaussians.centers)
+    held = box.holds(gaussians.centers) & _above_ground(views, gaussians)
     if not held.any():
         return [CutMask(torch.zeros_like(coverage), 0.0) for coverage in views.coverage]
     alone = chosen_surfels(gaussians, held)

@@ -96,7 +96,7 @@ def make_optimizer(parameters: dict[str, Tensor], rates: object, radius: float) 
 
 def rate_of_group(name: str, rates: object) -> float:
     """Of the record with a rate a name; tables of light share `environment`."""
-    return getattr(rates, "environment" if name.startswith("environment") or name == "background" else name)
+    return getattr(rates, "environment" if name.startswith("environment") or name in ("background", "ground") else name)
 
 
 def parameters_from_gaussians(gaussians: Gaussians) -> dict[str, Tensor]:

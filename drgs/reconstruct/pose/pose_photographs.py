@@ -45,6 +45,8 @@ from drgs.reconstruct.pose.upright_world import upright_world
 from drgs.reconstruct.progress import Progress
 
 WORK = ".pose"
+NO_BACKDROP = "no_backdrop"
+"""In the work folder: by what lies before a plain backdrop alone no poses were found."""
 STEPS = ("features", "matches", "poses", "undistort")
 """Of run_colmap.py."""
 POSE_SHARES = {"read": 0.05, "features": 0.29, "matches": 0.41, "poses": 0.17, "undistort": 0.08}
@@ -114,17 +116,28 @@ def pose_photographs(
     prepared, left_out = prepare_photos(listed, work, lambda done: report("read", done, len(listed)), should_stop)
     check_readable(photos, prepared, left_out)
     masks_from = "files" if prepared[0].has_mask else "none"
-    if masks_from == "none":
+    whole = prepared, left_out
+    if masks_from == "none" and not (work / NO_BACKDROP).exists():
         prepared, others = with_backdrop_masks(prepared, work, should_stop)
         masks_from, left_out = "backdrop" if prepared[0].has_mask else "none", left_out | others
-    job = _job(prepared, settings)
-    if settings.resume and (finished := read_posed_capture(out)) is not None and finished.identity == job["identity"]:
-        shutil.rmtree(work)
-        return finished
-    _write_job(job, work, out)
     seconds = {"read": round(time.monotonic() - started, 2)}
-
-    found = _found_poses(photos, work, prepared, settings, report, should_stop)
+    while True:
+        job = _job(prepared, settings)
+        same = {job["identity"], _job(whole[0], settings)["identity"]}
+        if settings.resume and (finished := read_posed_capture(out)) is not None and finished.identity in same:
+            shutil.rmtree(work)
+            return finished
+        _write_job(job, work, out)
+        try:
+            found = _found_poses(photos, work, prepared, settings, report, should_stop)
+            break
+        except ValueError:
+            if masks_from != "backdrop":
+                raise
+        # What looked like paper may be a table that stands still with the object, and has the features that the object lacks.
+        _forget_search(work)
+        (work / NO_BACKDROP).touch()
+        (prepared, left_out), masks_from = whole, "none"
     seconds |= {step: _document(work / f"{step}.done")["seconds"] for step in STEPS}
     capture = _write(photos, out, listed, prepared, left_out, found, job | {"masks_from": masks_from}, seconds)
     shutil.rmtree(work)
@@ -288,6 +301,15 @@ def _write_job(job: dict[str, Any], work: Path, out: Path) -> None:
     draft = path.with_suffix(".part")
     draft.write_text(json.dumps(job), encoding="utf-8")
     os.replace(draft, path)
+
+
+def _forget_search(work: Path) -> None:
+    """All of it but the prepared pictures."""
+    for part in work.iterdir():
+        if part.name == "images":
+            continue
+        shutil.rmtree(part) if part.is_dir() else part.unlink()
+    (work / "masks").mkdir()
 
 
 def _core_count() -> int:

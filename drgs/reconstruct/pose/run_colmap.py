@@ -26,7 +26,13 @@ POLL_SECONDS = 0.5
 LEAST_MODEL = 3
 """Pictures of a model that is kept."""
 SMALL_SIDE = 1000
-"""Pictures up to this size [pixels] are doubled before features are looked for: else there are too few."""
+"""Pictures up to this size [pixels] are doubled before features are looked for, and fainter ones count: else there are too few."""
+FAINT = 0.003
+"""Contrast from which a feature counts there, as a share of white; COLMAP's own is 0.0067."""
+MORE_PLACED = 0.05
+"""Share of the pictures that placing all at once must find a place for beyond what one after the other does."""
+MOST_PIXELS_OFF = 2.0
+"""Mean reprojection error of all at once [pixels]: beyond it the pictures did not fit together."""
 
 
 def main() -> None:
@@ -69,7 +75,10 @@ def _extract(job: dict[str, Any], work: Path) -> None:
     options.max_image_size = job["feature_side"]
     options.sift.max_num_features = job["most_features"]
     longest = max(max(group["width"], group["height"]) for group in job["groups"])
-    options.sift.first_octave = -1 if longest <= SMALL_SIDE else 0
+    if longest <= SMALL_SIDE:
+        options.sift.first_octave, options.sift.peak_threshold = -1, FAINT
+    else:
+        options.sift.first_octave = 0
     files = [file for group in job["groups"] for file in group["files"]]
     with _Polled("features", database, "keypoints", len(files)):
         pycolmap.extract_features(database, work / "images", files, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu)
@@ -119,7 +128,8 @@ def _match_report(database: Path) -> dict[str, Any]:
 
 
 def _map(job: dict[str, Any], work: Path) -> None:
-    """Poses and points; of several models the one with the most pictures."""
+    """Poses and points; of several models the one with the most pictures. Where pictures are left over, all are placed at once, too, by the rotations
+    between pairs: a chain of few matches then need not begin anywhere, nor break."""
     sparse = work / "sparse"
     shutil.rmtree(sparse, ignore_errors=True)
     sparse.mkdir()
@@ -137,7 +147,12 @@ def _map(job: dict[str, Any], work: Path) -> None:
     options.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
     pycolmap.set_random_seed(job["seed"])
-    models = pycolmap.incremental_mapping(work / "database.db", work / "images", sparse, options, next_image_callback=next_image)
+    models = dict(pycolmap.incremental_mapping(work / "database.db", work / "images", sparse, options, next_image_callback=next_image))
+    most = max((model.num_reg_images() for model in models.values()), default=0)
+    if most < total:
+        whole = _all_at_once(job, work, sparse / "at_once")
+        if whole is not None and whole.num_reg_images() >= most + MORE_PLACED * total:
+            models[max(models, default=-1) + 1] = whole
     sizes = {str(number): model.num_reg_images() for number, model in models.items()}
     if not models:
         _write(work / "model.json", {"models": sizes, "pictures": {}})
@@ -163,6 +178,18 @@ def _map(job: dict[str, Any], work: Path) -> None:
         "pictures": pictures,
     }
     _write(work / "model.json", report)
+
+
+def _all_at_once(job: dict[str, Any], work: Path, sparse: Path) -> Any | None:
+    """The largest model of global structure from motion (docs/sources.md: pan2024); None without one whose pictures fit together."""
+    sparse.mkdir()
+    options = pycolmap.GlobalPipelineOptions()
+    options.min_model_size = LEAST_MODEL
+    options.num_threads, options.random_seed = 1, job["seed"]
+    pycolmap.set_random_seed(job["seed"])
+    models = pycolmap.global_mapping(work / "database.db", work / "images", sparse, options)
+    model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    return model if model is not None and model.compute_mean_reprojection_error() <= MOST_PIXELS_OFF else None
 
 
 def _undistort(job: dict[str, Any], work: Path) -> None:

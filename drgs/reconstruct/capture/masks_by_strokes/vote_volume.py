@@ -4,7 +4,7 @@ In: cameras and a mask of each. Out: a volume, cells in a box, and from it silho
 say that it is not: unlike a visual hull's, whose every mask is to be trusted, this share is the caller's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,8 @@ from drgs.scene.camera import Camera
 
 SEEN_SHARE = 0.5
 """Of the pictures that see the best seen place, how many must see all others."""
+LEAST_ASKED = 0.1
+"""Of the pictures: where fewer may vote on a place, they count as so many, so that one alone does not decide."""
 SMALLEST_PART = 0.05
 """Of the largest part of a volume: smaller ones are not the object."""
 RIM = 2
@@ -83,25 +85,35 @@ def vote_volume(
     against: float,
     least_size: float = 0.0,
     most_against: float = 1.0,
+    known: Sequence[Bool[Tensor, "_height _width"]] | None = None,
+    possible: Callable[[Float[Tensor, "cell 3"]], Bool[Tensor, "cell"]] | None = None,
 ) -> Volume | None:
     """What of the region is the object's; None where nothing is.
 
     Args:
         masks: 1 object, 0 not. against: share of the pictures that see a place, of which more may not say that it is not the object's.
+        known: pixels that may vote at all; None: all. possible: places that may be the object's; None: all.
         least_size: [cubic world units] if the volume were smaller, as many more may speak against it as make it that large, but no more than `most_against`.
     """
     centers = region.centers()
     points = centers.reshape(-1, 3)
-    says_no, seen = torch.zeros(len(points)), torch.zeros(len(points))
-    for camera, mask in zip(cameras, masks, strict=True):
+    says_no, seen, asked = torch.zeros(len(points)), torch.zeros(len(points)), torch.zeros(len(points))
+    for number, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
         pixels, depth = _projected(points, camera)
         size = pixels.new_tensor([camera.width, camera.height])
         inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
         places = (2 * pixels / size - 1)[None, None]
         found = torch.nn.functional.grid_sample(mask[None, None], places, align_corners=False, padding_mode="border")[0, 0, 0]
-        says_no += torch.where(inside, 1 - found, 0.0)
+        votes = inside
+        if known is not None:
+            votes = inside & (torch.nn.functional.grid_sample(known[number].float()[None, None], places, align_corners=False)[0, 0, 0] > 0.5)
+        says_no += torch.where(votes, 1 - found, 0.0)
+        asked += votes
         seen += inside
-    share = torch.where(seen >= max(1.0, SEEN_SHARE * float(seen.max())), says_no / seen.clamp_min(1), torch.inf)
+    least_asked = 1.0 if known is None else max(1.0, LEAST_ASKED * len(cameras))
+    share = torch.where(seen >= max(1.0, SEEN_SHARE * float(seen.max())), says_no / asked.clamp_min(least_asked), torch.inf)
+    if possible is not None:
+        share = torch.where(possible(points), share, torch.inf)
     wanted = min(int(least_size / region.cell**3), int(share.isfinite().sum()) - 1)
     if wanted > int((share <= against).sum()):
         against = max(against, min(most_against, float(share.kthvalue(wanted + 1).values)))

@@ -11,7 +11,7 @@ In: Views. Out: Gaussians at rest, Environment. Knows nothing of meshes or of th
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -22,6 +22,7 @@ from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.fit.densify import DensifySettings, ScreenGradientStats, densify, reset_opacity
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import BACKGROUND_ROWS, ENVIRONMENT_PYRAMID, background_image, environment_table
+from drgs.reconstruct.fit.light.ground_layer import before_ground, ground_logits
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import (
     display_image,
@@ -45,6 +46,7 @@ from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targe
 from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.camera import Camera
 from drgs.scene.gaussians import Gaussians
+from drgs.scene.ground import Ground
 from drgs.scene.views import Views
 
 
@@ -65,7 +67,9 @@ class FitSettings:
     weight_dissimilarity: float = 0.2
     weight_mask: float = 0.1
     weight_coverage: float = 0.02
-    """Without masks: the mean coverage costs this much, so that what the background shows as well is not the object's."""
+    """Without masks: the mean coverage of what is compared costs this much, so that what the background shows as well is not the object's."""
+    weight_coverage_on_ground: float = 0.06
+    """The same where the ground is known: it explains its shadows, too."""
     weight_normal: float = 0.05
     weight_normal_smooth: float = 0.02
     weight_residual: float = 0.1
@@ -75,14 +79,18 @@ class FitSettings:
     seed: int = 0
 
 
-def start_fit(points: InitialPoints, settings: FitSettings, device: torch.device, has_masks: bool = True) -> FitState:
-    """Surfels on the initial points under a uniform light; without masks, before a grey background."""
+def start_fit(
+    points: InitialPoints, settings: FitSettings, device: torch.device, has_masks: bool = True, ground: Ground | None = None
+) -> FitState:
+    """Surfels on the initial points under a uniform light; without masks, before a grey background, and above the ground where there is one."""
     parameters = initial_parameters(points, device, settings.seed)
     for rows in ENVIRONMENT_PYRAMID:
         value = math.log(INITIAL_LIGHT) if rows == ENVIRONMENT_PYRAMID[0] else 0.0
         parameters[f"environment_{rows}"] = torch.full((1, 3, rows, 2 * rows), value, device=device, requires_grad=True)
     if not has_masks:
         parameters["background"] = torch.zeros(1, 3, BACKGROUND_ROWS, 2 * BACKGROUND_ROWS, device=device, requires_grad=True)
+    if ground is not None:
+        parameters["ground"] = ground_logits(ground).to(device).requires_grad_(True)
     return FitState(
         parameters,
         make_optimizer(parameters, settings.rates, points.bounds_radius),
@@ -113,7 +121,9 @@ class _Steps:
     """Final. Stage 1's part of the fit loop."""
 
     def __init__(self, views: Views, state: FitState, settings: FitSettings, radius: float) -> None:
-        self.views, self.state, self.settings, self.radius = views, state, settings, radius
+        self.views, self.state, self.radius = views, state, radius
+        on_ground = replace(settings, weight_coverage=settings.weight_coverage_on_ground)
+        self.settings = settings if views.ground is None else on_ground
         self.targets: list[ViewTarget] = []
         self.target_factor = 0.0
         """Size of the targets as a share of the photographs'."""
@@ -133,7 +143,7 @@ class _Steps:
         maps = render_stage_one(
             parameters, tables, target.camera, near_plane(self.radius), self._sh_degree(progress), target.light_from_world
         )
-        image = displayed(maps, target, parameters.get("background"))
+        image = displayed(maps, target, parameters, self.views.ground)
         terms = stage_one_terms(maps, image, target, environment, self.settings, self.views.has_masks, normal_share(progress))
         return StepLoss(terms, target.whole or target.camera, squared_error(image, target))
 
@@ -203,14 +213,18 @@ def normal_share(progress: float) -> float:
 
 
 def displayed(
-    maps: StageOneMaps, target: ViewTarget, background: Float[Tensor, "1 3 rows columns"] | None
+    maps: StageOneMaps, target: ViewTarget, parameters: dict[str, Tensor] | None = None, ground: Ground | None = None
 ) -> Float[Tensor, "height width 3"]:
-    """(rows, columns, 3) sRGB within the target's box, on black or before the learned surroundings."""
+    """(rows, columns, 3) sRGB within the target's box, on black or before the surroundings among the parameters."""
     box = target.box
     image = display_image(maps.radiance_linear[box], maps.coverage[box], target.saturation[box], target.ceiling)
-    if background is not None:
-        image = image + (1 - maps.coverage[box])[..., None] * background_image(background, target.camera)[box]
-    return image
+    if parameters is None or "background" not in parameters:
+        return image
+    behind = background_image(parameters["background"], target.camera)
+    if ground is not None:
+        behind = before_ground(parameters["ground"], ground, target.camera, behind)
+    # Where the photograph certainly does not show the object it is left out of the comparison, black.
+    return image + ((1 - maps.coverage[box]) * target.mask[box])[..., None] * behind[box]
 
 
 def squared_error(image: Float[Tensor, "height width 3"], target: ViewTarget) -> float:
@@ -237,7 +251,7 @@ def stage_one_terms(
     if has_masks:
         terms["mask"] = settings.weight_mask * target.share * mask_loss(maps.coverage, target.mask)
     elif settings.weight_coverage > 0:
-        terms["coverage"] = settings.weight_coverage * target.share * maps.coverage.mean()
+        terms["coverage"] = settings.weight_coverage * maps.coverage.mean()
     if normal_weight_share > 0:
         consistency = normal_consistency(maps.normal_world, maps.depth, maps.coverage, target.camera)
         terms["normal"] = settings.weight_normal * normal_weight_share * consistency

@@ -141,7 +141,7 @@ def fit_mesh_surfels(
         maps = render_stage_one(
             surfels_on_faces(state), tables, target.camera, near_plane(radius), weights.sh_degree, target.light_from_world
         )
-        image = displayed(maps, target, None)
+        image = displayed(maps, target)
         terms = stage_one_terms(maps, image, target, environment, weights, views.has_masks)
         return StepLoss(terms, target.camera, squared_error(image, target))
 

@@ -1,0 +1,165 @@
+"""What a flat ground looks like, gathered from all pictures, and where each picture shows it.
+
+A place of the ground has one colour in most of the pictures that see it; what stands on it hides it in some, from another side in each. Where an object
+hides a place from all sides pictures may agree as well, on the object's own colour: so a place counts as known only near sparse points that lie on
+the ground, for they were seen there. In: the plane, cameras, pictures. Out: a picture of the ground with how far its colours vary, and the logarithm of
+how likely a camera's pixels are if they show it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from drgs.reconstruct.capture.on_ground.ground_plane import GroundPlane
+from drgs.scene.camera import Camera
+from drgs.scene.ground import Ground, places_on_ground
+
+
+@dataclass(frozen=True)
+class GroundPictureSettings:
+    extent: float = 3.0
+    """Half the side of the picture, as a share of the sphere that all cameras see."""
+    side: int = 256
+    """[texels]"""
+    most_views: int = 32
+    """That are asked."""
+    guesses: int = 6
+    """Pictures whose colour is tried as a place's own."""
+    alike: float = 0.08
+    """Colours that differ by less (root mean square of channels, sRGB 0..1) are the same place's."""
+    fewest: int = 4
+    """Pictures that must agree on a place's colour, and"""
+    agreeing: float = 0.35
+    """how many of those that look there, whether or not something hides it."""
+    reach: float = 3.0
+    """A place is known within so many times the usual distance between neighbouring points on the ground."""
+    least_cosine: float = 0.12
+    """Of the view's angle to the ground's normal: flatter ones show it too small."""
+    least_deviation: float = 0.03
+    """Of colours, by noise and blur."""
+    others: float = 0.02
+    """Share of the pixels that show the ground and look otherwise, by a shadow or a highlight."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPicture:
+    """The ground, and how sure its colours are."""
+
+    ground: Ground
+    deviation: Float[Tensor, "1 side side"]
+    """Standard deviation of colours that agree, of one channel [sRGB 0..1]."""
+
+
+def ground_picture(
+    plane: GroundPlane,
+    cameras: Sequence[Camera],
+    images_srgb: Sequence[UInt8[Tensor, "_height _width 3"]],
+    middle: Float[Tensor, "3"],
+    radius: float,
+    free: Sequence[Bool[Tensor, "_height _width"]] | None = None,
+    settings: GroundPictureSettings = GroundPictureSettings(),
+) -> GroundPicture:
+    """Gather it.
+
+    Args:
+        middle, radius: of the sphere that all cameras see.
+        free: of each picture, the pixels that may show the ground; None: all.
+    """
+    normal = torch.from_numpy(plane.normal_world).float()
+    foot = middle - (middle @ normal - plane.offset) * normal
+    side = torch.eye(3)[int(normal.abs().argmin())]
+    first = torch.nn.functional.normalize(side - (side @ normal) * normal, dim=0)
+    axes, half = torch.stack([first, torch.linalg.cross(normal, first)]), settings.extent * radius
+    steps = (2 * (torch.arange(settings.side) + 0.5) / settings.side - 1) * half
+    texels = foot + steps[None, :, None] * axes[0] + steps[:, None, None] * axes[1]
+    asked = sorted({round(number) for number in np.linspace(0, len(cameras) - 1, min(settings.most_views, len(cameras)))})
+    seen = [_seen(texels.reshape(-1, 3), normal, cameras[number], images_srgb[number], free and free[number], settings) for number in asked]
+    color, deviation, sure = _agreed(torch.stack([samples for samples, _ in seen]), torch.stack([inside for _, inside in seen]), settings)
+    points = torch.from_numpy(plane.points_world).float() - foot
+    flat = (points @ axes.T).numpy()
+    spacing = float(np.median(cKDTree(flat).query(flat, k=min(5, len(flat)))[0][:, -1]))
+    far = cKDTree(flat).query(((texels - foot) @ axes.T).reshape(-1, 2).numpy())[0] > settings.reach * spacing
+    known = (sure & ~torch.from_numpy(far)).float()
+    size = (settings.side, settings.side)
+    ground = Ground(foot, axes, half, color.T.reshape(3, *size), known.reshape(1, *size))
+    return GroundPicture(ground, deviation.reshape(1, *size))
+
+
+def _seen(
+    points: Float[Tensor, "texel 3"],
+    normal: Float[Tensor, "3"],
+    camera: Camera,
+    image: UInt8[Tensor, "height width 3"],
+    free: Bool[Tensor, "height width"] | None,
+    settings: GroundPictureSettings,
+) -> tuple[Float[Tensor, "texel 3"], Bool[Tensor, "texel"]]:
+    """The picture's colours at places of the ground, NaN where it does not see them free; and which places it looks at."""
+    pixel_from_world = (camera.intrinsics.double() @ camera.camera_from_world.double()[:3]).float()
+    projected = points @ pixel_from_world[:, :3].T + pixel_from_world[:, 3]
+    depth = projected[:, 2:]
+    pixels = projected[:, :2] / torch.where(depth > 0, depth, 1.0)
+    size = pixels.new_tensor([camera.width, camera.height])
+    towards = torch.nn.functional.normalize(camera.center_world - points, dim=-1)
+    inside = (depth[:, 0] > 0) & (pixels >= 0.5).all(-1) & (pixels <= size - 0.5).all(-1) & (towards @ normal > settings.least_cosine)
+    picture = image.permute(2, 0, 1)[None].float() / 255
+    if free is not None:
+        picture = torch.cat([picture, free[None, None].float()], 1)
+    found = torch.nn.functional.grid_sample(picture, (2 * pixels / size - 1)[None, None], align_corners=False)[0, :, 0].T
+    shown = inside if free is None else inside & (found[:, 3] > 0.99)
+    return torch.where(shown[:, None], found[:, :3], torch.nan), inside
+
+
+def _agreed(
+    samples: Float[Tensor, "view texel 3"], looked: Bool[Tensor, "view texel"], settings: GroundPictureSettings
+) -> tuple[Float[Tensor, "texel 3"], Float[Tensor, "texel"], Bool[Tensor, "texel"]]:
+    """Of each texel the colour that most views agree on, its deviation, and whether enough of them do."""
+    seen = samples[..., 0].isfinite()
+    count = seen.sum(0)
+    # Guesses: of each texel, views spread over those that see it.
+    order = torch.argsort(~seen, dim=0, stable=True)
+    best, most = torch.zeros_like(samples[0]), torch.full(count.shape, -1)
+    for guess in range(settings.guesses):
+        rank = (count * guess) // settings.guesses
+        color = samples.gather(0, order.gather(0, rank[None])[..., None].expand(1, -1, 3))[0]
+        alike = (_difference(samples, color) < settings.alike).sum(0)
+        better = alike > most
+        best, most = torch.where(better[:, None], color, best), torch.where(better, alike, most)
+    for _ in range(2):
+        weight = (_difference(samples, best) < settings.alike).float()
+        best = (samples.nan_to_num() * weight[..., None]).sum(0) / weight.sum(0).clamp_min(1)[:, None]
+    weight = (_difference(samples, best) < settings.alike).float()
+    agreeing = weight.sum(0)
+    variance = ((samples.nan_to_num() - best).square().mean(-1) * weight).sum(0) / agreeing.clamp_min(1)
+    sure = (agreeing >= settings.fewest) & (agreeing >= settings.agreeing * looked.sum(0))
+    return best, variance.sqrt().clamp_min(settings.least_deviation), sure
+
+
+def _difference(samples: Float[Tensor, "view texel 3"], color: Float[Tensor, "texel 3"]) -> Float[Tensor, "view texel"]:
+    """Infinite where a view sees nothing."""
+    return (samples - color).square().mean(-1).sqrt().nan_to_num(torch.inf)
+
+
+def ground_likelihood(
+    picture: GroundPicture, camera: Camera, image_srgb: UInt8[Tensor, "height width 3"], settings: GroundPictureSettings = GroundPictureSettings()
+) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
+    """Logarithm of the density of each pixel's colour (sRGB 0..1) if it shows the ground, and whether the ground there is known."""
+    ground = picture.ground
+    places, meets = places_on_ground(ground, camera, settings.least_cosine)
+    table = torch.cat([ground.color_srgb, picture.deviation, ground.known])
+    found = torch.nn.functional.grid_sample(table[None], places[None], align_corners=False)[0]
+    known = (meets > 0) & (found[4] > 0.99)
+    image = image_srgb.permute(2, 0, 1).float() / 255
+    # Poses are off by up to a pixel: the best of the neighbouring places counts.
+    padded = torch.nn.functional.pad(found[None, :3], (1, 1, 1, 1), mode="replicate")[0]
+    height, width = image.shape[1:]
+    shifted = (padded[:, y : y + height, x : x + width] for y in range(3) for x in range(3))
+    square = torch.stack([(image - color).square().sum(0) for color in shifted]).amin(0)
+    deviation = found[3].clamp_min(settings.least_deviation)
+    log_density = -0.5 * square / deviation.square() - 3 * torch.log(deviation) - 1.5 * np.log(2 * np.pi)
+    likely = torch.logaddexp(log_density + np.log(1 - settings.others), torch.full_like(log_density, np.log(settings.others)))
+    return likely, known
