@@ -37,7 +37,9 @@ class Ground:
         return (points_world - self.middle.to(points_world.device)) @ self.normal.to(points_world.device)
 
 
-def places_on_ground(ground: Ground, camera: Camera, least_cosine: float) -> tuple[Float[Tensor, "height width 2"], Float[Tensor, "height width"]]:
+def places_on_ground(
+    ground: Ground, camera: Camera, least_cosine: float
+) -> tuple[Float[Tensor, "height width 2"], Float[Tensor, "height width"]]:
     """Where each pixel's ray meets the plane, as grid_sample takes places on its picture, and whether it does (1 or 0).
 
     Args:

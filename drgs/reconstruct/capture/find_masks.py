@@ -97,7 +97,9 @@ def with_drawn_masks(views: Views, gaussians: Gaussians, radius: float) -> Views
 
 def _above_ground(views: Views, gaussians: Gaussians) -> Bool[Tensor, "surfel"]:
     """Surfels that stand on the ground; all where none is known."""
-    return torch.ones_like(gaussians.opacity_logits, dtype=torch.bool) if views.ground is None else views.ground.heights(gaussians.centers) > 0
+    return (
+        torch.ones_like(gaussians.opacity_logits, dtype=torch.bool) if views.ground is None else views.ground.heights(gaussians.centers) > 0
+    )
 
 
 def drawn_in_box(views: Views, gaussians: Gaussians, radius: float, box: BuildBox) -> list[CutMask]:

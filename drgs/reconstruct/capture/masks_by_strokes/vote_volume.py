@@ -106,7 +106,9 @@ def vote_volume(
         found = torch.nn.functional.grid_sample(mask[None, None], places, align_corners=False, padding_mode="border")[0, 0, 0]
         votes = inside
         if known is not None:
-            votes = inside & (torch.nn.functional.grid_sample(known[number].float()[None, None], places, align_corners=False)[0, 0, 0] > 0.5)
+            votes = inside & (
+                torch.nn.functional.grid_sample(known[number].float()[None, None], places, align_corners=False)[0, 0, 0] > 0.5
+            )
         says_no += torch.where(votes, 1 - found, 0.0)
         asked += votes
         seen += inside

@@ -145,7 +145,10 @@ def _difference(samples: Float[Tensor, "view texel 3"], color: Float[Tensor, "te
 
 
 def ground_likelihood(
-    picture: GroundPicture, camera: Camera, image_srgb: UInt8[Tensor, "height width 3"], settings: GroundPictureSettings = GroundPictureSettings()
+    picture: GroundPicture,
+    camera: Camera,
+    image_srgb: UInt8[Tensor, "height width 3"],
+    settings: GroundPictureSettings = GroundPictureSettings(),
 ) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
     """Logarithm of the density of each pixel's colour (sRGB 0..1) if it shows the ground, and whether the ground there is known."""
     ground = picture.ground

@@ -105,7 +105,11 @@ def _refined(near: Float64[ndarray, "point 3"], normal: Float64[ndarray, "3"], o
 
 
 def _is_below(
-    plane: GroundPlane, near: Float64[ndarray, "point 3"], centers_world: Float[ndarray, "camera 3"], distance: float, settings: GroundSettings
+    plane: GroundPlane,
+    near: Float64[ndarray, "point 3"],
+    centers_world: Float[ndarray, "camera 3"],
+    distance: float,
+    settings: GroundSettings,
 ) -> bool:
     below = int((plane.heights(near) < -3 * plane.tolerance).sum())
     lowest = float(np.quantile(plane.heights(centers_world), 0.05))

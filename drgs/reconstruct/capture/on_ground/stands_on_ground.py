@@ -68,7 +68,9 @@ def stands_on_ground(views: Views, seed: int, settings: OnGroundSettings = OnGro
     finer = GroundPictureSettings(side=settings.fine_texels, most_views=16, guesses=4)
     fine = smaller_views(views, settings.fine_side)
     ground = _looked_at(plane, fine, center, radius, volume, settings, finer).ground
-    coverage = tuple(_may_show(camera, small_camera, volume, settings) for camera, small_camera in zip(views.cameras, small.cameras, strict=True))
+    coverage = tuple(
+        _may_show(camera, small_camera, volume, settings) for camera, small_camera in zip(views.cameras, small.cameras, strict=True)
+    )
     return replace(views, coverage=coverage, ground=ground)
 
 
@@ -118,5 +120,7 @@ def _volume_above(
 def _may_show(camera: Camera, small: Camera, volume: Volume, settings: OnGroundSettings) -> UInt8[Tensor, "height width"]:
     """255 where a picture may show the object."""
     near = torch.from_numpy(_near(volume, small, settings.spread)).float()
-    sized = torch.nn.functional.interpolate(near[None, None], size=(camera.height, camera.width), mode="bilinear", align_corners=False)[0, 0]
+    sized = torch.nn.functional.interpolate(near[None, None], size=(camera.height, camera.width), mode="bilinear", align_corners=False)[
+        0, 0
+    ]
     return (255 * (sized > 0.5)).to(torch.uint8)

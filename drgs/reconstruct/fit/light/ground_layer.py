@@ -33,6 +33,8 @@ def before_ground(
 ) -> Float[Tensor, "height width 3"]:
     """The ground before what is behind it."""
     places, meets = places_on_ground(ground, camera, LEAST_COSINE)
-    seen = torch.sigmoid(torch.nn.functional.grid_sample(logits, places[None], padding_mode="border", align_corners=False)[0]).permute(1, 2, 0)
+    seen = torch.sigmoid(torch.nn.functional.grid_sample(logits, places[None], padding_mode="border", align_corners=False)[0]).permute(
+        1, 2, 0
+    )
     cover = (seen[..., 3] * meets)[..., None]
     return cover * seen[..., :3] + (1 - cover) * behind
