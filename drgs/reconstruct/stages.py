@@ -18,8 +18,8 @@ from drgs.reconstruct.capture.build_box import BuildBox
 from drgs.reconstruct.capture.cut_to_box import chosen_views
 from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
 from drgs.reconstruct.capture.find_masks import find_masks
-from drgs.reconstruct.capture.on_ground.stands_on_ground import stands_on_ground
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
+from drgs.reconstruct.capture.on_ground.stands_on_ground import stands_on_ground
 from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState

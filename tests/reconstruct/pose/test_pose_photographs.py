@@ -1,6 +1,8 @@
 """Poses of pictures whose true ones are known; stopping, going on, and what is said when none are found."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import torch
 from PIL import Image, ImageFilter
 
 from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.pose import colmap_process
 from drgs.reconstruct.pose.pose_photographs import PoseSettings
 from drgs.reconstruct.pose.pose_photographs import pose_photographs as pose
 from drgs.reconstruct.pose.posed_capture import PosedCapture, read_posed_capture
@@ -109,6 +112,52 @@ def test_what_was_stopped_goes_on_and_comes_out_the_same(photographs: Path, pose
     assert (out / "transforms.json").read_text() == (Path(posed.folder) / "transforms.json").read_text(), "same seed, same poses"
     assert (out / "sparse.ply").read_bytes() == (Path(posed.folder) / "sparse.ply").read_bytes()
     assert pose(photographs, out, replace(QUICK, resume=True)) == again == read_posed_capture(out)
+
+
+@pytest.mark.slow
+def test_what_only_looks_like_a_backdrop_is_asked_too(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A table of one colour that has what features there are; and the search that was in vain is not repeated on resume."""
+    calls = []
+
+    def all_backdrop(prepared, work, should_stop):
+        calls.append(len(prepared))
+        for photo in prepared:
+            mask = np.zeros((photo.height, photo.width), np.uint8)
+            mask[200:230, 200:230] = 255
+            Image.fromarray(mask).save(work / "masks" / f"{photo.file}.png")
+        return [replace(photo, has_mask=True) for photo in prepared], {}
+
+    monkeypatch.setattr("drgs.reconstruct.pose.pose_photographs.with_backdrop_masks", all_backdrop)
+    found = pose(photographs, tmp_path / "posed", QUICK)
+    assert calls == [VIEWS] and found.masks_from == "none" and not found.masked and len(found.placed) == VIEWS
+    assert not load_views(Path(found.folder)).has_masks
+    assert pose(photographs, tmp_path / "posed", replace(QUICK, resume=True)) == found
+
+
+AT_ONCE = """
+import runpy, sys
+import pycolmap
+pycolmap.incremental_mapping = lambda *given, **named: {}
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.slow
+def test_pictures_that_one_after_the_other_have_no_place_are_placed_at_once(photographs: Path, tmp_path: Path):
+    reported: list[Progress] = []
+    with pytest.raises(BuildStopped):
+        pose(photographs, tmp_path / "posed", QUICK, reported.append, lambda: bool(reported) and reported[-1].stage == "poses")
+    work = tmp_path / "posed" / ".pose"
+    for late in ("poses.done", "undistort.done"):
+        (work / late).unlink(missing_ok=True)
+    with subprocess.Popen([sys.executable, "-c", AT_ONCE, colmap_process.PROGRAM, work / "job.json"], stdin=subprocess.PIPE) as program:
+        assert program.wait(timeout=300) == 0
+    found = pose(photographs, tmp_path / "posed", replace(QUICK, resume=True))
+    assert len(found.placed) == VIEWS and found.reprojection_error < 1
+    true, moved, _, _ = true_from_found(found)
+    turned = np.einsum("nji,njk->nik", true[:, :3, :3], moved[:, :3, :3])
+    assert np.degrees(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1))).max() < 1
 
 
 def grain(seed: int, size: int = 160) -> Image.Image:

@@ -7,7 +7,7 @@ how likely a camera's pixels are if they show it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from drgs.reconstruct.capture.on_ground.agreed_colors import Agreement, agreed_colors, color_likelihood
 from drgs.reconstruct.capture.on_ground.ground_plane import GroundPlane
 from drgs.scene.camera import Camera
 from drgs.scene.ground import Ground, places_on_ground
@@ -28,22 +29,11 @@ class GroundPictureSettings:
     """[texels]"""
     most_views: int = 32
     """That are asked."""
-    guesses: int = 6
-    """Pictures whose colour is tried as a place's own."""
-    alike: float = 0.08
-    """Colours that differ by less (root mean square of channels, sRGB 0..1) are the same place's."""
-    fewest: int = 4
-    """Pictures that must agree on a place's colour, and"""
-    agreeing: float = 0.35
-    """how many of those that look there, whether or not something hides it."""
+    agreement: Agreement = field(default_factory=Agreement)
     reach: float = 3.0
     """A place is known within so many times the usual distance between neighbouring points on the ground."""
     least_cosine: float = 0.12
     """Of the view's angle to the ground's normal: flatter ones show it too small."""
-    least_deviation: float = 0.03
-    """Of colours, by noise and blur."""
-    others: float = 0.02
-    """Share of the pixels that show the ground and look otherwise, by a shadow or a highlight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +68,13 @@ def ground_picture(
     steps = (2 * (torch.arange(settings.side) + 0.5) / settings.side - 1) * half
     texels = foot + steps[None, :, None] * axes[0] + steps[:, None, None] * axes[1]
     asked = sorted({round(number) for number in np.linspace(0, len(cameras) - 1, min(settings.most_views, len(cameras)))})
-    seen = [_seen(texels.reshape(-1, 3), normal, cameras[number], images_srgb[number], free and free[number], settings) for number in asked]
-    color, deviation, sure = _agreed(torch.stack([samples for samples, _ in seen]), torch.stack([inside for _, inside in seen]), settings)
+    seen = [
+        _seen(texels.reshape(-1, 3), normal, cameras[number], images_srgb[number], None if free is None else free[number], settings)
+        for number in asked
+    ]
+    color, deviation, sure = agreed_colors(
+        torch.stack([samples for samples, _ in seen]), torch.stack([inside for _, inside in seen]), settings.agreement
+    )
     points = torch.from_numpy(plane.points_world).float() - foot
     flat = (points @ axes.T).numpy()
     spacing = float(np.median(cKDTree(flat).query(flat, k=min(5, len(flat)))[0][:, -1]))
@@ -114,36 +109,6 @@ def _seen(
     return torch.where(shown[:, None], found[:, :3], torch.nan), inside
 
 
-def _agreed(
-    samples: Float[Tensor, "view texel 3"], looked: Bool[Tensor, "view texel"], settings: GroundPictureSettings
-) -> tuple[Float[Tensor, "texel 3"], Float[Tensor, "texel"], Bool[Tensor, "texel"]]:
-    """Of each texel the colour that most views agree on, its deviation, and whether enough of them do."""
-    seen = samples[..., 0].isfinite()
-    count = seen.sum(0)
-    # Guesses: of each texel, views spread over those that see it.
-    order = torch.argsort(~seen, dim=0, stable=True)
-    best, most = torch.zeros_like(samples[0]), torch.full(count.shape, -1)
-    for guess in range(settings.guesses):
-        rank = (count * guess) // settings.guesses
-        color = samples.gather(0, order.gather(0, rank[None])[..., None].expand(1, -1, 3))[0]
-        alike = (_difference(samples, color) < settings.alike).sum(0)
-        better = alike > most
-        best, most = torch.where(better[:, None], color, best), torch.where(better, alike, most)
-    for _ in range(2):
-        weight = (_difference(samples, best) < settings.alike).float()
-        best = (samples.nan_to_num() * weight[..., None]).sum(0) / weight.sum(0).clamp_min(1)[:, None]
-    weight = (_difference(samples, best) < settings.alike).float()
-    agreeing = weight.sum(0)
-    variance = ((samples.nan_to_num() - best).square().mean(-1) * weight).sum(0) / agreeing.clamp_min(1)
-    sure = (agreeing >= settings.fewest) & (agreeing >= settings.agreeing * looked.sum(0))
-    return best, variance.sqrt().clamp_min(settings.least_deviation), sure
-
-
-def _difference(samples: Float[Tensor, "view texel 3"], color: Float[Tensor, "texel 3"]) -> Float[Tensor, "view texel"]:
-    """Infinite where a view sees nothing."""
-    return (samples - color).square().mean(-1).sqrt().nan_to_num(torch.inf)
-
-
 def ground_likelihood(
     picture: GroundPicture,
     camera: Camera,
@@ -156,13 +121,4 @@ def ground_likelihood(
     table = torch.cat([ground.color_srgb, picture.deviation, ground.known])
     found = torch.nn.functional.grid_sample(table[None], places[None], align_corners=False)[0]
     known = (meets > 0) & (found[4] > 0.99)
-    image = image_srgb.permute(2, 0, 1).float() / 255
-    # Poses are off by up to a pixel: the best of the neighbouring places counts.
-    padded = torch.nn.functional.pad(found[None, :3], (1, 1, 1, 1), mode="replicate")[0]
-    height, width = image.shape[1:]
-    shifted = (padded[:, y : y + height, x : x + width] for y in range(3) for x in range(3))
-    square = torch.stack([(image - color).square().sum(0) for color in shifted]).amin(0)
-    deviation = found[3].clamp_min(settings.least_deviation)
-    log_density = -0.5 * square / deviation.square() - 3 * torch.log(deviation) - 1.5 * np.log(2 * np.pi)
-    likely = torch.logaddexp(log_density + np.log(1 - settings.others), torch.full_like(log_density, np.log(settings.others)))
-    return likely, known
+    return color_likelihood(found[:3], found[3], image_srgb, settings.agreement), known

@@ -20,6 +20,7 @@ from torch import Tensor
 from drgs.reconstruct.capture.find_masks import smaller_views
 from drgs.reconstruct.capture.initial_points import seen_by_all
 from drgs.reconstruct.capture.masks_by_strokes.vote_volume import Region, Volume, silhouette, vote_volume
+from drgs.reconstruct.capture.on_ground.far_picture import FarPicture, far_likelihood, far_picture
 from drgs.reconstruct.capture.on_ground.ground_picture import GroundPicture, GroundPictureSettings, ground_likelihood, ground_picture
 from drgs.reconstruct.capture.on_ground.ground_plane import GroundPlane, ground_plane
 from drgs.scene.camera import Camera
@@ -40,6 +41,12 @@ class OnGroundSettings:
     """Of the volumes, along the longest side."""
     against: float = 0.15
     """Share of the pictures that know, of which more may not say that they see the ground through a place."""
+    around: int = 1
+    """Neighbours on each side that are asked with a pixel [pixels of `side`]: where"""
+    by_chance: float = 0.7
+    """this share or fewer have the ground's colours it is not the ground, and where"""
+    all_alike: float = 0.95
+    """this share or more, it is."""
     looks: int = 3
     """How often the ground is looked at, each time without what the volume so far hides."""
     margin: float = 0.015
@@ -60,12 +67,13 @@ def stands_on_ground(views: Views, seed: int, settings: OnGroundSettings = OnGro
         return None
     volume: Volume | None = None
     for _ in range(settings.looks):
-        picture = _looked_at(plane, small, center, radius, volume, settings)
-        volume = _volume_above(plane, picture, small, center, radius, settings)
+        picture = _looked_at(plane, small, center, radius, volume, settings, GroundPictureSettings())
+        far = far_picture(small.cameras, small.images_srgb, _free(volume, small, settings))
+        volume = _volume_above(plane, picture, far, small, center, radius, settings)
         if volume is None:
             return None
     assert volume is not None
-    finer = GroundPictureSettings(side=settings.fine_texels, most_views=16, guesses=4)
+    finer = GroundPictureSettings(side=settings.fine_texels, most_views=16)
     fine = smaller_views(views, settings.fine_side)
     ground = _looked_at(plane, fine, center, radius, volume, settings, finer).ground
     coverage = tuple(
@@ -81,11 +89,16 @@ def _looked_at(
     radius: float,
     volume: Volume | None,
     settings: OnGroundSettings,
-    picture_settings: GroundPictureSettings = GroundPictureSettings(),
+    picture_settings: GroundPictureSettings,
 ) -> GroundPicture:
     """What the ground looks like where the volume hides it from few cameras."""
-    free = None if volume is None else [torch.from_numpy(~_near(volume, camera, settings.margin)) for camera in views.cameras]
-    return ground_picture(plane, views.cameras, views.images_srgb, torch.from_numpy(center).float(), radius, free, picture_settings)
+    middle, free = torch.from_numpy(center).float(), _free(volume, views, settings)
+    return ground_picture(plane, views.cameras, views.images_srgb, middle, radius, free, picture_settings)
+
+
+def _free(volume: Volume | None, views: Views, settings: OnGroundSettings) -> list[Bool[Tensor, "_height _width"]] | None:
+    """Of each picture, the pixels that the volume does not hide."""
+    return None if volume is None else [torch.from_numpy(~_near(volume, camera, settings.margin)) for camera in views.cameras]
 
 
 def _near(volume: Volume, camera: Camera, share: float) -> Bool[ndarray, "height width"]:
@@ -94,16 +107,24 @@ def _near(volume: Volume, camera: Camera, share: float) -> Bool[ndarray, "height
 
 
 def _volume_above(
-    plane: GroundPlane, picture: GroundPicture, small: Views, center: Float[ndarray, "3"], radius: float, settings: OnGroundSettings
+    plane: GroundPlane,
+    picture: GroundPicture,
+    far: FarPicture,
+    small: Views,
+    center: Float[ndarray, "3"],
+    radius: float,
+    settings: OnGroundSettings,
 ) -> Volume | None:
-    """Of what is above the ground, where few pictures see the ground through it."""
+    """Of what is above the ground, where few pictures see the ground or what is far through it."""
     foot = center - plane.heights(center[None])[0] * plane.normal_world
     half = settings.size * radius
     top = foot + 2 * half * plane.normal_world
     region = Region(np.minimum(foot, top) - half, np.maximum(foot, top) + half, settings.cells)
-    shown = [ground_likelihood(picture, camera, image) for camera, image in zip(small.cameras, small.images_srgb, strict=True)]
-    # Of what stands there, one colour is as likely as another.
-    masks, known = [torch.sigmoid(-likely) for likely, _ in shown], [known for _, known in shown]
+    shown = []
+    for camera, image in zip(small.cameras, small.images_srgb, strict=True):
+        (on_ground, known), (far_off, far_known) = ground_likelihood(picture, camera, image), far_likelihood(far, camera, image)
+        shown.append((torch.where(known, on_ground, far_off), known | far_known))
+    masks, known = [_stands_there(likely, known, settings) for likely, known in shown], [known for _, known in shown]
 
     def above(points_world: Float[Tensor, "cell 3"]) -> Bool[Tensor, "cell"]:
         return picture.ground.heights(points_world) > 0
@@ -115,6 +136,17 @@ def _volume_above(
             return None
         region = volume.around(settings.cells)
     return volume
+
+
+def _stands_there(
+    likely: Float[Tensor, "height width"], known: Bool[Tensor, "height width"], settings: OnGroundSettings
+) -> Float[Tensor, "height width"]:
+    """1 where something hides the ground, 0 where pixel and neighbours show it: of what stands there one colour is as likely as another, so some pixels
+    have the ground's by chance, but seldom all around."""
+    counted = torch.stack([known.float(), (known & (likely > 0)).float()])[:, None]
+    told, alike = torch.nn.functional.avg_pool2d(counted, 2 * settings.around + 1, 1, settings.around)[:, 0]
+    share = alike / told.clamp_min(1e-6)
+    return ((settings.all_alike - share) / (settings.all_alike - settings.by_chance)).clamp(0, 1)
 
 
 def _may_show(camera: Camera, small: Camera, volume: Volume, settings: OnGroundSettings) -> UInt8[Tensor, "height width"]:

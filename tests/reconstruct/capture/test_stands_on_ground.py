@@ -1,0 +1,173 @@
+"""A blue egg on the ground, both of one pattern: the plane, what it looks like, and the egg that stands on it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from drgs.reconstruct.capture.find_masks import find_masks
+from drgs.reconstruct.capture.initial_points import initial_points, seen_by_all
+from drgs.reconstruct.capture.on_ground.ground_picture import ground_likelihood, ground_picture
+from drgs.reconstruct.capture.on_ground.ground_plane import ground_plane
+from drgs.reconstruct.capture.on_ground.stands_on_ground import stands_on_ground
+from drgs.reconstruct.fit.light.ground_layer import COVER, before_ground, ground_logits
+from drgs.reconstruct.presets import PRESETS
+from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.ground import Ground, places_on_ground
+from drgs.scene.views import Views
+from tests.reconstruct.pose.textured_scene import FOCAL, RADII, SIZE, noise, orbit, picture
+
+GROUND_Z = -float(RADII[2])
+VIEWS = 18
+BLUE = np.array([0.5, 0.8, 1.2])
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_torch_thread():
+    """Two threads are no faster on pictures this small, and far slower on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def on_egg(count: int, random: np.random.Generator) -> np.ndarray:
+    directions = random.normal(size=(count, 3))
+    return RADII * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def on_ground(count: int, random: np.random.Generator, half: float = 4.0) -> np.ndarray:
+    """But below the egg, where nobody sees it."""
+    flat = random.uniform(-half, half, (count, 2))
+    flat = flat[np.linalg.norm(flat, axis=1) > 1.2]
+    return np.column_stack([flat, np.full(len(flat), GROUND_Z)])
+
+
+def sparse_points() -> np.ndarray:
+    """On the egg and the ground, a little off, and some mistakes anywhere above."""
+    random = np.random.default_rng(5)
+    egg, ground = on_egg(400, random), on_ground(600, random)
+    points = np.concatenate([egg, ground]) + random.normal(scale=0.008, size=(len(egg) + len(ground), 3))
+    return np.concatenate([points, random.uniform((-3, -3, GROUND_Z), (3, 3, 3), (60, 3))])
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[Views, list[np.ndarray]]:
+    poses = np.concatenate([orbit(VIEWS // 2, 2.2), orbit(VIEWS // 2, 4.5)])
+    cameras, images, masks = [], [], []
+    for number, pose in enumerate(poses):
+        color, egg = picture(pose)
+        color = np.where(egg[..., None], color * BLUE, color)
+        intrinsics = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
+        whole = Camera(torch.from_numpy(np.linalg.inv(pose)).float(), intrinsics, SIZE, SIZE, name=f"{number:02d}")
+        camera = scaled_camera(whole, 0.5)
+        cameras.append(camera)
+        images.append(torch.from_numpy(color.reshape(SIZE // 2, 2, SIZE // 2, 2, 3).mean((1, 3)).round().astype(np.uint8)))
+        masks.append(egg.reshape(SIZE // 2, 2, SIZE // 2, 2).mean((1, 3)) >= 0.5)
+    points = torch.from_numpy(sparse_points()).float()
+    all_of_it = tuple(torch.full((SIZE // 2, SIZE // 2), 255, dtype=torch.uint8) for _ in poses)
+    return Views(tuple(cameras), tuple(images), all_of_it, points, torch.full_like(points, 0.5), False, "nerfstudio"), masks
+
+
+def centers_of(views: Views) -> np.ndarray:
+    return torch.stack([camera.center_world for camera in views.cameras]).double().numpy()
+
+
+def test_the_plane_is_that_of_the_ground(scene: tuple[Views, list[np.ndarray]]) -> None:
+    views, _ = scene
+    center, radius = seen_by_all(views)
+    plane = ground_plane(sparse_points(), centers_of(views), center, radius, seed=0)
+    assert plane is not None and plane.normal_world[2] > 0.9999 and plane.offset == pytest.approx(GROUND_Z, abs=0.01)
+    assert np.abs(plane.heights(plane.points_world)).max() <= plane.tolerance
+    again = ground_plane(sparse_points(), centers_of(views), center, radius, seed=0)
+    assert again is not None and np.array_equal(again.normal_world, plane.normal_world), "same seed, same plane"
+    # Neither where the world lies nor its unit matter.
+    turn, move, unit = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]), np.array([5.0, -3, 2]), 40.0
+    moved = ground_plane(
+        unit * sparse_points() @ turn.T + move, unit * centers_of(views) @ turn.T + move, unit * turn @ center + move, unit * radius, 0
+    )
+    assert moved is not None and moved.normal_world @ turn @ plane.normal_world == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("why", ["no points", "an egg alone", "cameras below", "much below"])
+def test_without_a_ground_there_is_none(scene: tuple[Views, list[np.ndarray]], why: str) -> None:
+    views, _ = scene
+    center, radius = seen_by_all(views)
+    points, centers, random = sparse_points(), centers_of(views), np.random.default_rng(1)
+    if why == "no points":
+        points = points[:10]
+    elif why == "an egg alone":
+        points = on_egg(1000, random)
+    elif why == "cameras below":
+        centers[::3, 2] = GROUND_Z - 1
+    else:
+        points = np.concatenate([points, random.uniform((-3, -3, GROUND_Z - 2), (3, 3, GROUND_Z - 0.3), (600, 3))])
+    assert ground_plane(points, centers, center, radius, seed=0) is None
+
+
+def test_what_the_ground_looks_like_and_who_sees_it(scene: tuple[Views, list[np.ndarray]]) -> None:
+    views, masks = scene
+    center, radius = seen_by_all(views)
+    plane = ground_plane(sparse_points(), centers_of(views), center, radius, seed=0)
+    assert plane is not None
+    free = [torch.from_numpy(~mask) for mask in masks]
+    found = ground_picture(plane, views.cameras, views.images_srgb, torch.from_numpy(center).float(), radius, free)
+    ground, side = found.ground, found.ground.known.shape[-1]
+    assert float(ground.heights(torch.tensor([[0.0, 0, GROUND_Z + 1]]))) == pytest.approx(1, abs=0.02)
+    steps = (2 * (torch.arange(side) + 0.5) / side - 1) * ground.half
+    places = ground.middle + steps[None, :, None] * ground.axes[0] + steps[:, None, None] * ground.axes[1]
+    near = (ground.known[0] > 0) & (places.norm(dim=-1) < 3)
+    assert near.float().sum() > 0.05 * side**2
+    true = torch.from_numpy(0.2 + 0.6 * noise(places[near].double().numpy()) * np.array([1.0, 0.9, 0.8])).float()
+    assert float((ground.color_srgb[:, near].T - true).abs().mean()) < 0.05
+    likely, known = ground_likelihood(found, views.cameras[2], views.images_srgb[2])
+    egg = torch.from_numpy(masks[2])
+    assert float((likely[known & ~egg] > 0).float().mean()) > 0.9, "the ground is known as such"
+    assert float((likely[known & egg] > 0).float().mean()) < 0.4, "what stands before it is mostly not"
+
+
+def test_the_egg_is_where_the_ground_is_hidden(scene: tuple[Views, list[np.ndarray]]) -> None:
+    views, masks = scene
+    found = stands_on_ground(views, seed=0)
+    assert found is not None and found.ground is not None and not found.has_masks
+    for coverage, mask in zip(found.coverage, masks, strict=True):
+        may = coverage.numpy() > 127
+        assert (mask & ~may).sum() < 0.06 * mask.sum(), "no picture loses the egg"
+        assert may.sum() < 2.2 * mask.sum(), "nor keeps the ground"
+    assert stands_on_ground(dataclasses.replace(views, points_world=None), seed=0) is None
+
+
+@pytest.mark.slow
+def test_a_fit_before_the_ground_finds_the_egg(scene: tuple[Views, list[np.ndarray]]) -> None:
+    views, masks = scene
+    found = stands_on_ground(views, seed=0)
+    assert found is not None
+    points = initial_points(dataclasses.replace(found, has_masks=True), 3000, seed=0)
+    masked = find_masks(found, points, dataclasses.replace(PRESETS["draft"].fit, seed=0), CPU)
+    assert masked is not None and masked.has_masks and masked.ground is None
+    shares = [((m.numpy() > 127) & mask).sum() / ((m.numpy() > 127) | mask).sum() for m, mask in zip(masked.coverage, masks, strict=True)]
+    assert np.mean(shares) > 0.88 and min(shares) > 0.8
+
+
+def test_the_layer_shows_the_ground_below_and_what_is_behind_it_above() -> None:
+    color = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0)) * 0.9 + 0.05
+    known = torch.zeros(1, 8, 8)
+    known[:, :, :4] = 1
+    ground = Ground(torch.tensor([0.0, 0, -1]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]), 2.0, color, known)
+    down = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])  # from (0, 0, 3), four above it
+    camera = Camera(down, torch.tensor([[16.0, 0, 4], [0, 16, 4], [0, 0, 1]]), 8, 8)
+    places, meets = places_on_ground(ground, camera, 0.05)
+    assert meets.all() and places.abs().max() < 0.5
+    behind = torch.full((8, 8, 3), 0.5)
+    logits = ground_logits(ground).requires_grad_(True)
+    seen = before_ground(logits, ground, camera, behind)
+    # Column and row of the middle of the picture, of which the left half is known and the rest has the colours beside it.
+    expected = torch.sigmoid(torch.nn.functional.grid_sample(logits[:, :3], places[None], align_corners=False)[0].permute(1, 2, 0))
+    assert torch.allclose(seen[:, :3], COVER * expected[:, :3] + (1 - COVER) * 0.5, atol=1e-5)
+    seen.sum().backward()
+    assert logits.grad is not None and logits.grad.abs().sum() > 0
+    up = torch.diag(torch.tensor([1.0, -1, -1, 1])) @ down  # looks away from it
+    away = dataclasses.replace(camera, camera_from_world=up)
+    assert torch.equal(before_ground(logits, ground, away, behind), behind)
