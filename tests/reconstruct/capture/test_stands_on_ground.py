@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from drgs.reconstruct.capture import find_masks as find_masks_module
 from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import initial_points, seen_by_all
 from drgs.reconstruct.capture.on_ground.ground_picture import ground_likelihood, ground_picture
@@ -19,7 +20,7 @@ from drgs.scene.views import Views
 from tests.reconstruct.pose.textured_scene import FOCAL, RADII, SIZE, noise, orbit, picture
 
 GROUND_Z = -float(RADII[2])
-VIEWS = 18
+VIEWS = 40
 BLUE = np.array([0.5, 0.8, 1.2])
 CPU = torch.device("cpu")
 
@@ -140,11 +141,13 @@ def test_the_egg_is_where_the_ground_is_hidden(scene: tuple[Views, list[np.ndarr
 
 
 @pytest.mark.slow
-def test_a_fit_before_the_ground_finds_the_egg(scene: tuple[Views, list[np.ndarray]]) -> None:
+def test_a_fit_before_the_ground_finds_the_egg(scene: tuple[Views, list[np.ndarray]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(find_masks_module, "ITERATIONS", 300)
+    monkeypatch.setattr(find_masks_module, "SIDE", 100)
     views, masks = scene
     found = stands_on_ground(views, seed=0)
     assert found is not None
-    points = initial_points(dataclasses.replace(found, has_masks=True), 3000, seed=0)
+    points = initial_points(dataclasses.replace(found, has_masks=True), 1500, seed=0)
     masked = find_masks(found, points, dataclasses.replace(PRESETS["draft"].fit, seed=0), CPU)
     assert masked is not None and masked.has_masks and masked.ground is None
     shares = [((m.numpy() > 127) & mask).sum() / ((m.numpy() > 127) | mask).sum() for m, mask in zip(masked.coverage, masks, strict=True)]

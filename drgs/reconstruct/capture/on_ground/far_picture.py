@@ -63,7 +63,7 @@ def _seen(
     shown = torch.ones_like(picture[:1]) if free is None else free[None].float()
     places = (2 * pixels / size - 1)[None, None]
     found = torch.nn.functional.grid_sample(torch.cat([picture, shown])[None], places, align_corners=False)[0, :, 0].T
-    return torch.where((inside & (found[:, 3] > 0.99))[:, None], found[:, :3], torch.nan), inside
+    return torch.where((inside & (found[:, 3] > 0.999))[:, None], found[:, :3], torch.nan), inside
 
 
 def far_likelihood(
@@ -75,4 +75,4 @@ def far_likelihood(
     x = (uv[..., 0] * (columns - 2) + 1) / columns
     places = torch.stack([2 * x - 1, 2 * uv[..., 1] - 1], -1)
     found = torch.nn.functional.grid_sample(table[None], places[None], padding_mode="border", align_corners=False)[0]
-    return color_likelihood(found[:3], found[3], image_srgb, AGREEMENT), found[4] > 0.99
+    return color_likelihood(found[:3], found[3], image_srgb, AGREEMENT), found[4] > 0.999

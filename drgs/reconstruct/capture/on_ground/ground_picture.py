@@ -105,7 +105,7 @@ def _seen(
     if free is not None:
         picture = torch.cat([picture, free[None, None].float()], 1)
     found = torch.nn.functional.grid_sample(picture, (2 * pixels / size - 1)[None, None], align_corners=False)[0, :, 0].T
-    shown = inside if free is None else inside & (found[:, 3] > 0.99)
+    shown = inside if free is None else inside & (found[:, 3] > 0.999)
     return torch.where(shown[:, None], found[:, :3], torch.nan), inside
 
 
@@ -120,5 +120,5 @@ def ground_likelihood(
     places, meets = places_on_ground(ground, camera, settings.least_cosine)
     table = torch.cat([ground.color_srgb, picture.deviation, ground.known])
     found = torch.nn.functional.grid_sample(table[None], places[None], align_corners=False)[0]
-    known = (meets > 0) & (found[4] > 0.99)
+    known = (meets > 0) & (found[4] > 0.999)
     return color_likelihood(found[:3], found[3], image_srgb, settings.agreement), known

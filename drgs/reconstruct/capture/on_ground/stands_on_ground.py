@@ -124,14 +124,15 @@ def _volume_above(
     for camera, image in zip(small.cameras, small.images_srgb, strict=True):
         (on_ground, known), (far_off, far_known) = ground_likelihood(picture, camera, image), far_likelihood(far, camera, image)
         shown.append((torch.where(known, on_ground, far_off), known | far_known))
-    masks, known = [_stands_there(likely, known, settings) for likely, known in shown], [known for _, known in shown]
+    masks = [_stands_there(likely, told, settings) for likely, told in shown]
+    may_vote = [told for _, told in shown]
 
     def above(points_world: Float[Tensor, "cell 3"]) -> Bool[Tensor, "cell"]:
         return picture.ground.heights(points_world) > 0
 
     volume: Volume | None = None
     for _ in range(2):
-        volume = vote_volume(region, small.cameras, masks, settings.against, known=known, possible=above)
+        volume = vote_volume(region, small.cameras, masks, settings.against, known=may_vote, possible=above)
         if volume is None:
             return None
         region = volume.around(settings.cells)
