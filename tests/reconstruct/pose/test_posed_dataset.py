@@ -77,7 +77,7 @@ def test_a_build_of_a_film_chooses_frames_poses_them_and_tells_so(tmp_path: Path
     with pytest.raises(BuildStopped):  # the build itself is tested elsewhere: stopped once the capture is read
         build_asset(film, tmp_path / "asset", BuildSettings(preset="tiny", device="cpu"), told.append, lambda: "masks" in told[-1].message)
     messages = " ".join(progress.message for progress in told)
-    assert "choosing frames" in messages and "placing pictures" in messages and "looking for the object" in messages
+    assert "choosing frames" in messages and "placing pictures" in messages and "looking for what the object stands on" in messages
     fractions = [progress.fraction for progress in told]
     assert fractions == sorted(fractions)
     posed = tmp_path / "asset.build" / "posed"
