@@ -34,30 +34,18 @@ class MitsubaScene:
         Raises:
             ValueError: Mitsuba or its LLVM variant is not there.
         """
-        self._mi = mi = _mitsuba()
+        self._mi = mi = load_mitsuba()
         if brdf == "ours":
             _register_brdf(mi)
-        size = camera.width
-        world_from_camera = opengl_from_camera(camera).numpy() @ np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba looks along +z, x to the left
-        y_up = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # of Mitsuba's environment maps
-        turn = mi.ScalarTransform4f().rotate([0, 0, 1], turn_degrees)
-        fov_x = 2 * np.degrees(np.arctan(0.5 * size / float(camera.intrinsics[0, 0])))
-        film = {
-            "type": "hdrfilm", "width": size, "height": camera.height, "pixel_format": "rgba",
-            "component_format": "float32", "rfilter": {"type": "box"},
-        }  # fmt: skip
         self._scene = mi.load_dict(
             {
                 "type": "scene",
                 "integrator": {"type": "path", "max_depth": 2 + bounces, "rr_depth": 100, "hide_emitters": True},
-                "sensor": {
-                    "type": "perspective", "fov": float(fov_x), "fov_axis": "x", "to_world": mi.ScalarTransform4f(world_from_camera),
-                    "film": film, "sampler": {"type": "independent"},
-                },
-                "light": {"type": "envmap", "bitmap": mi.Bitmap(environment.astype(np.float32)), "to_world": turn @ mi.ScalarTransform4f(y_up)},
-                "object": _mitsuba_mesh(mi, mesh, brdf),
+                "sensor": mitsuba_sensor(mi, camera),
+                "light": mitsuba_light(mi, environment, turn_degrees),
+                "object": mitsuba_mesh(mi, mesh, brdf),
             }
-        )  # fmt: skip
+        )
 
     def render(self, samples: int, seed: int) -> tuple[np.ndarray, float, float]:
         """(height, width, 3) premultiplied linear picture, wall seconds, seconds summed over threads."""
@@ -79,7 +67,12 @@ def mitsuba_picture(
     return np.concatenate([srgb_from_linear((picture[..., :3] / np.maximum(alpha, 1e-9)).clip(0, 1)), alpha], -1)
 
 
-def _mitsuba() -> Any:
+def load_mitsuba() -> Any:
+    """The package, with its LLVM variant chosen.
+
+    Raises:
+        ValueError: one of them is not there.
+    """
     try:
         import mitsuba as mi
 
@@ -89,11 +82,41 @@ def _mitsuba() -> Any:
 
         dr.eval(mi.Float(1.0) + 1)
     except (ImportError, RuntimeError) as error:
-        raise ValueError(f"--mitsuba needs mitsuba 3.9.1 with LLVM 19 and DRJIT_LIBLLVM_PATH set to it: {error}") from error
+        raise ValueError(f"Mitsuba's pictures need mitsuba 3.9.1 with LLVM 19 and DRJIT_LIBLLVM_PATH set to it: {error}") from error
     return mi
 
 
-def _mitsuba_mesh(mi: Any, mesh: TriangleMesh, brdf: Brdf) -> Any:
+def sensor_transform(mi: Any, camera: Camera) -> Any:
+    """Mitsuba looks along +z, with x to the left."""
+    return mi.ScalarTransform4f(opengl_from_camera(camera).numpy() @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+
+
+def mitsuba_sensor(mi: Any, camera: Camera) -> dict[str, Any]:
+    """Looks through the middle of its picture, pixels are square and not filtered."""
+    fov_x = 2 * np.degrees(np.arctan(0.5 * camera.width / float(camera.intrinsics[0, 0])))
+    film = {
+        "type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgba",
+        "component_format": "float32", "rfilter": {"type": "box"},
+    }  # fmt: skip
+    return {
+        "type": "perspective", "fov": float(fov_x), "fov_axis": "x", "to_world": sensor_transform(mi, camera),
+        "film": film, "sampler": {"type": "independent"},
+    }  # fmt: skip
+
+
+def mitsuba_light(mi: Any, environment: np.ndarray, turn_degrees: float = 0.0) -> dict[str, Any]:
+    """An environment map; Mitsuba's are y up.
+
+    Args:
+        turn_degrees: counter-clockwise seen from above.
+    """
+    y_up = mi.ScalarTransform4f(np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]]))
+    turn = mi.ScalarTransform4f().rotate([0, 0, 1], turn_degrees)
+    return {"type": "envmap", "bitmap": mi.Bitmap(environment.astype(np.float32)), "to_world": turn @ y_up}
+
+
+def mitsuba_mesh(mi: Any, mesh: TriangleMesh, brdf: Brdf) -> Any:
+    """With the mesh's normals and materials."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "drgs_brdf"} if brdf == "ours" else _principled())
     result = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
