@@ -9,9 +9,10 @@ import torch
 from drgs.reconstruct.capture import find_masks as find_masks_module
 from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import initial_points, seen_by_all
+from drgs.reconstruct.capture.masks_by_strokes.vote_volume import Region, Volume
 from drgs.reconstruct.capture.on_ground.ground_picture import ground_likelihood, ground_picture
 from drgs.reconstruct.capture.on_ground.ground_plane import ground_plane
-from drgs.reconstruct.capture.on_ground.stands_on_ground import stands_on_ground
+from drgs.reconstruct.capture.on_ground.stands_on_ground import standing_parts, stands_on_ground
 from drgs.reconstruct.fit.light.ground_layer import COVER, before_ground, ground_logits
 from drgs.reconstruct.presets import PRESETS
 from drgs.scene.camera import Camera, scaled_camera
@@ -138,6 +139,17 @@ def test_the_egg_is_where_the_ground_is_hidden(scene: tuple[Views, list[np.ndarr
         assert (mask & ~may).sum() < 0.06 * mask.sum(), "no picture loses the egg"
         assert may.sum() < 2.2 * mask.sum(), "nor keeps the ground"
     assert stands_on_ground(dataclasses.replace(views, points_world=None), seed=0) is None
+
+
+def test_what_floats_is_none_of_it() -> None:
+    flat = Ground(torch.tensor([0.0, 0, -1]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]), 2.0, torch.zeros(3, 4, 4), torch.ones(1, 4, 4))
+    region = Region(np.array([-1.0, -1, -1]), np.array([1.0, 1, 1]), 20)
+    centers = region.centers().reshape(-1, 3)
+    column, cloud = (centers[:, :2].abs().amax(-1) < 0.25) & (centers[:, 2] < 0.25), (centers[:, 0] > 0.5) & (centers[:, 2] > 0.65)
+    volume = Volume(centers[column | cloud], region.cell, region.low, region.high)
+    standing = standing_parts(volume, flat, 0.3)
+    assert standing is not None and torch.equal(standing.centers, centers[column])
+    assert standing_parts(dataclasses.replace(volume, centers=centers[cloud]), flat, 0.3) is None
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from drgs.reconstruct.capture.on_ground.far_picture import FarPicture, far_likel
 from drgs.reconstruct.capture.on_ground.ground_picture import GroundPicture, GroundPictureSettings, ground_likelihood, ground_picture
 from drgs.reconstruct.capture.on_ground.ground_plane import GroundPlane, ground_plane
 from drgs.scene.camera import Camera
+from drgs.scene.ground import Ground
 from drgs.scene.views import Views
 
 
@@ -51,6 +52,8 @@ class OnGroundSettings:
     """How often the ground is looked at, each time without what the volume so far hides."""
     margin: float = 0.015
     """Around the volume's silhouette nobody is asked for the ground, as a share of the picture's longer side."""
+    floats: float = 0.25
+    """Parts of the volume of which nothing is this near the ground are not the object's, as a share of the sphere that all cameras see."""
     spread: float = 0.01
     """How far outside the silhouette a picture may show the object, the same way."""
 
@@ -133,10 +136,26 @@ def _volume_above(
     volume: Volume | None = None
     for _ in range(2):
         volume = vote_volume(region, small.cameras, masks, settings.against, known=may_vote, possible=above)
+        volume = None if volume is None else standing_parts(volume, picture.ground, settings.floats * radius)
         if volume is None:
             return None
         region = volume.around(settings.cells)
     return volume
+
+
+def standing_parts(volume: Volume, ground: Ground, floats: float) -> Volume | None:
+    """What of a volume hangs together with what is near the ground; None where nothing does.
+
+    Args:
+        floats: a part of which nothing is lower than this floats [world units]: surroundings that no picture sees past it.
+    """
+    cells = torch.round((volume.centers.double() - torch.from_numpy(volume.low)) / volume.cell - 0.5).long().numpy()
+    grid = np.zeros(cells.max(0) + 1, bool)
+    grid[tuple(cells.T)] = True
+    parts = ndimage.label(grid)[0][tuple(cells.T)]
+    lowest = ndimage.minimum(ground.heights(volume.centers).numpy(), parts, np.arange(1, parts.max() + 1))
+    stands = torch.from_numpy((lowest < floats)[parts - 1])
+    return replace(volume, centers=volume.centers[stands]) if stands.any() else None
 
 
 def _stands_there(
