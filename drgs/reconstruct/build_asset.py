@@ -158,6 +158,7 @@ def build_stages(
         yield
         seconds[stage] = round(time.monotonic() - started, 2)
 
+    found_by: dict[str, str] = {}
     with timed("read"):
         reporter.report("read", 0.0, "reading the capture")
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
@@ -173,6 +174,7 @@ def build_stages(
         fit_settings = replace(preset.fit, seed=settings.seed)
         if not views.has_masks:
             views = ground_stage(place, views, settings.seed)
+            found_by = {"object_found_by": "surroundings" if views.ground is None else "ground"}
             points = points_on_ground(views, points, preset.points, settings.seed, settings.box)
             masked = masks_stage(place, views, points, fit_settings, device, settings.box)
             views = views_of(views, masked)  # without those in which the box's content is hidden
@@ -206,7 +208,7 @@ def build_stages(
     asset, thumbnail = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
-    provenance |= poses | {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
+    provenance |= poses | found_by | {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
     provenance["light"] = {key: value for key, value in asdict(light).items() if value is not None}
     asset = replace(asset, provenance=provenance, cameras=views.cameras, light_frame=light.frame)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))

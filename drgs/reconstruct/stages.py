@@ -118,7 +118,9 @@ def ground_stage(place: Workplace, views: Views, seed: int) -> Views:
 
     def made() -> dict[str, Tensor]:
         place.reporter.report("read", 0.0, "no masks: looking for what the object stands on")
-        found = stands_on_ground(views, seed)
+        found = stands_on_ground(views, seed, place.should_stop)
+        if place.should_stop():
+            raise BuildStopped
         if found is None or found.ground is None:
             return {"found": torch.zeros(1)}
         ground = found.ground

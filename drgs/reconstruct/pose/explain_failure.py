@@ -1,6 +1,6 @@
 """Why poses were not found, or not for enough pictures: one sentence with what was found, what was expected and what helps.
 
-Every check returns quietly or raises ValueError; `reasons_left_out` says it picture by picture.
+Every check returns quietly or raises ValueError, those of what was found in pictures NoPoses; `reasons_left_out` says it picture by picture.
 """
 
 from pathlib import Path
@@ -22,6 +22,10 @@ LEAST_BASELINE = 0.02
 """Spread of the cameras (standard deviation) over their distance from the points: less shows no depth."""
 MOST_NAMED = 6
 TAKE_BETTER = "Take more pictures with small steps between them (10 degrees), sharp, of something with texture, and let still surroundings with texture be seen."
+
+
+class NoPoses(ValueError):
+    """What the pictures show gives no poses, or too few."""
 
 
 def blurred_photos(prepared: list[PreparedPhoto]) -> list[str]:
@@ -53,11 +57,11 @@ def check_features(folder: Path, prepared: list[PreparedPhoto], features: dict[s
     names = few([photo.name for photo in poor])
     found = f"{folder}: {len(poor)} of {len(prepared)} pictures have fewer than {FEWEST_FEATURES} features"
     if all(photo.has_mask for photo in prepared):
-        raise ValueError(
+        raise NoPoses(
             f"{found} inside their masks ({names}), expected texture on the object: pose the pictures without masks, with the surroundings "
             "in view (not on a turntable), and add the masks afterwards."
         )
-    raise ValueError(
+    raise NoPoses(
         f"{found} ({names}): blurred, or of something without texture; put textured things, such as a newspaper, around the object."
     )
 
@@ -65,7 +69,7 @@ def check_features(folder: Path, prepared: list[PreparedPhoto], features: dict[s
 def check_baseline(folder: Path, median_move: float | None) -> None:
     """The pictures differ in view."""
     if median_move is not None and median_move < SAME_VIEW_MOVE:
-        raise ValueError(
+        raise NoPoses(
             f"{folder}: what the pictures show moves by {100 * median_move:.2f} % of their width from one to another, expected several: "
             "they are taken from one place; walk around the object."
         )
@@ -77,7 +81,7 @@ def check_depth(folder: Path, found_from_camera: Float64[ndarray, "camera 4 4"],
     spread = float(np.sqrt(((centers - centers.mean(0)) ** 2).sum(1).mean()))
     distance = float(np.linalg.norm(np.median(points_found, axis=0) - centers.mean(0)))
     if spread < LEAST_BASELINE * distance:
-        raise ValueError(
+        raise NoPoses(
             f"{folder}: the cameras lie within {100 * spread / distance:.2g} % of their distance from what they see, expected more than "
             f"{100 * LEAST_BASELINE:.0f} %: they are taken from one place; walk around the object."
         )
@@ -93,7 +97,7 @@ def check_placed(folder: Path, placed: int, given: int, left_out: dict[str, str]
     why = "; ".join(f"{reason}: {few(names)}" for reason, names in sorted(by_reason.items(), key=lambda item: -len(item[1]))[:3])
     soft = f" {len(blurred)} are blurred ({few(blurred)})." if blurred else ""
     wanted = max(int(np.ceil(least_share * given)), FEWEST_PHOTOS)
-    raise ValueError(f"{folder}: {placed} of {given} pictures could be placed, expected at least {wanted} ({why}).{soft} {TAKE_BETTER}")
+    raise NoPoses(f"{folder}: {placed} of {given} pictures could be placed, expected at least {wanted} ({why}).{soft} {TAKE_BETTER}")
 
 
 def reasons_left_out(

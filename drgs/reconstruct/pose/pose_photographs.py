@@ -23,6 +23,7 @@ from numpy import ndarray
 from drgs.installation import missing_package
 from drgs.reconstruct.pose.colmap_process import colmap_process
 from drgs.reconstruct.pose.explain_failure import (
+    NoPoses,
     blurred_photos,
     check_baseline,
     check_depth,
@@ -131,7 +132,7 @@ def pose_photographs(
         try:
             found = _found_poses(photos, work, prepared, settings, report, should_stop)
             break
-        except ValueError:
+        except NoPoses:
             if masks_from != "backdrop":
                 raise
         # What looked like paper may be a table that stands still with the object, and has the features that the object lacks.
@@ -329,12 +330,15 @@ class _Reporter:
 
     def __init__(self, progress: Callable[[Progress], None] | None) -> None:
         self._progress = progress
+        self._most = 0.0
 
     def __call__(self, step: str, done: int, total: int) -> None:
         if self._progress is None:
             return
         names = list(POSE_SHARES)
         fraction = sum(POSE_SHARES[name] for name in names[: names.index(step)]) + POSE_SHARES[step] * done / max(total, 1)
+        # A second search begins with features again.
+        self._most = max(self._most, fraction)
         self._progress(
-            Progress(step, done, total, fraction, message=f"{STEP_MESSAGES[step]}: {done} of {total}" if done else STEP_MESSAGES[step])
+            Progress(step, done, total, self._most, message=f"{STEP_MESSAGES[step]}: {done} of {total}" if done else STEP_MESSAGES[step])
         )

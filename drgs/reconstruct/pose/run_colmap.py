@@ -149,7 +149,7 @@ def _map(job: dict[str, Any], work: Path) -> None:
     pycolmap.set_random_seed(job["seed"])
     models = dict(pycolmap.incremental_mapping(work / "database.db", work / "images", sparse, options, next_image_callback=next_image))
     most = max((model.num_reg_images() for model in models.values()), default=0)
-    if most < total:
+    if most <= (1 - MORE_PLACED) * total:
         whole = _all_at_once(job, work, sparse / "at_once")
         if whole is not None and whole.num_reg_images() >= most + MORE_PLACED * total:
             models[max(models, default=-1) + 1] = whole
@@ -187,7 +187,11 @@ def _all_at_once(job: dict[str, Any], work: Path, sparse: Path) -> Any | None:
     options.min_model_size = LEAST_MODEL
     options.num_threads, options.random_seed = 1, job["seed"]
     pycolmap.set_random_seed(job["seed"])
-    models = pycolmap.global_mapping(work / "database.db", work / "images", sparse, options)
+    try:
+        models = pycolmap.global_mapping(work / "database.db", work / "images", sparse, options)
+    except (RuntimeError, ValueError) as error:  # pictures that have places need not lose them
+        print(f"placing all pictures at once failed: {error}", file=sys.stderr)
+        return None
     model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     return model if model is not None and model.compute_mean_reprojection_error() <= MOST_PIXELS_OFF else None
 

@@ -19,19 +19,11 @@ from drgs.reconstruct.presets import PRESETS
 from drgs.scene.camera import pixel_rays_world
 from drgs.scene.environment import uv_from_direction
 from drgs.scene.views import Views
+from tests.one_torch_thread import one_torch_thread  # noqa: F401
 from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS, asset_tensors
 from tests.reconstruct.tiny_capture import FEW_VIEWS, HEIGHT, WIDTH, TinyView, sphere_views, write_nerf_synthetic
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _one_torch_thread():
-    """Two threads are no faster on pictures this small, and far slower on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def before_surroundings(view: TinyView) -> TinyView:
@@ -99,7 +91,9 @@ def test_a_build_without_masks_stops_while_it_looks_and_resumes(tmp_path: Path, 
     monkeypatch.setitem(PRESETS, "tiny", WITHOUT_HOLLOWS)
     monkeypatch.setattr(find_masks_module, "ITERATIONS", 20)
     settings, heard = BuildSettings(preset="tiny", device="cpu"), []
-    whole = asset_tensors(build_asset(folder, tmp_path / "whole", settings, heard.append))
+    built = build_asset(folder, tmp_path / "whole", settings, heard.append)
+    assert built.provenance["object_found_by"] == "surroundings"
+    whole = asset_tensors(built)
     assert any(isinstance(line, Progress) and "looking for the object" in line.message for line in heard)
     with pytest.raises(BuildStopped):
         build_asset(folder, tmp_path / "stopped", settings, should_stop=lambda: True)

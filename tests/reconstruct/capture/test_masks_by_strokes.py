@@ -25,6 +25,7 @@ from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.presets import PRESETS
 from drgs.scene.strokes import Stroke, plain_strokes, read_strokes
 from drgs.scene.views import Views
+from tests.one_torch_thread import one_torch_thread  # noqa: F401
 from tests.reconstruct.capture.test_find_masks import before_surroundings
 from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS
 from tests.reconstruct.tiny_capture import HEIGHT, SPHERE_CENTER, SPHERE_RADIUS, WIDTH, TinyView, sphere_views, write_nerf_synthetic
@@ -40,15 +41,6 @@ def before_blue(view: TinyView) -> TinyView:
     grey = before_surroundings(view).rgba.mean(-1, keepdims=True) * np.ones(3)
     picture = view.rgba[..., :3] * alpha + grey * BLUE * (1 - alpha)
     return TinyView(view.name, np.round(picture).astype(np.uint8), view.camera_from_world)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _one_torch_thread():
-    """Two threads are no faster on pictures this small, and far slower on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,13 @@
 """A blue egg on the ground, both of one pattern: the plane, what it looks like, and the egg that stands on it."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from drgs.reconstruct import stages
 from drgs.reconstruct.capture import find_masks as find_masks_module
 from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import initial_points, seen_by_all
@@ -15,24 +17,18 @@ from drgs.reconstruct.capture.on_ground.ground_plane import ground_plane
 from drgs.reconstruct.capture.on_ground.stands_on_ground import standing_parts, stands_on_ground
 from drgs.reconstruct.fit.light.ground_layer import COVER, before_ground, ground_logits
 from drgs.reconstruct.presets import PRESETS
+from drgs.reconstruct.progress import BuildStopped
+from drgs.reconstruct.report_progress import BuildReporter
 from drgs.scene.camera import Camera, scaled_camera
 from drgs.scene.ground import Ground, places_on_ground
 from drgs.scene.views import Views
+from tests.one_torch_thread import one_torch_thread  # noqa: F401
 from tests.reconstruct.pose.textured_scene import FOCAL, RADII, SIZE, noise, orbit, picture
 
 GROUND_Z = -float(RADII[2])
 VIEWS = 40
 BLUE = np.array([0.5, 0.8, 1.2])
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _one_torch_thread():
-    """Two threads are no faster on pictures this small, and far slower on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def on_egg(count: int, random: np.random.Generator) -> np.ndarray:
@@ -139,6 +135,38 @@ def test_the_egg_is_where_the_ground_is_hidden(scene: tuple[Views, list[np.ndarr
         assert (mask & ~may).sum() < 0.06 * mask.sum(), "no picture loses the egg"
         assert may.sum() < 2.2 * mask.sum(), "nor keeps the ground"
     assert stands_on_ground(dataclasses.replace(views, points_world=None), seed=0) is None
+    assert stands_on_ground(views, seed=0, should_stop=lambda: True) is None
+    assert views.points_world is not None
+    lost = dataclasses.replace(views, points_world=torch.full_like(views.points_world, torch.nan))
+    assert stands_on_ground(lost, seed=0) is None
+
+
+def test_the_ground_is_kept_for_a_build_that_goes_on(
+    scene: tuple[Views, list[np.ndarray]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, masks = scene
+    ground = Ground(torch.tensor([0.0, 0, -1]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]), 2.0, torch.rand(3, 4, 4), torch.ones(1, 4, 4))
+    coverage = tuple(torch.from_numpy(mask.astype(np.uint8) * 255) for mask in masks)
+    found = [dataclasses.replace(views, ground=ground, coverage=coverage), None]
+    monkeypatch.setattr(stages, "stands_on_ground", lambda *given: found.pop(0))
+    for number, expected in enumerate(list(found)):
+        reporter = BuildReporter(None, {"read": 1.0})
+        place = stages.Workplace(tmp_path / str(number), {"seed": "0"}, False, reporter, lambda: False)
+        made = stages.ground_stage(place, views, 0)
+        kept = stages.ground_stage(dataclasses.replace(place, resume=True), views, 0)  # found is empty by now: it is not looked for again
+        for given in (made, kept):
+            assert all(torch.equal(a, b) for a, b in zip(given.coverage, (expected or views).coverage, strict=True))
+            assert (given.ground is None) == (expected is None) and not given.has_masks
+            if given.ground is not None:
+                assert all(
+                    torch.equal(getattr(given.ground, name), getattr(ground, name)) for name in ("middle", "axes", "color_srgb", "known")
+                )
+                assert given.ground.half == ground.half
+    stopped = stages.Workplace(tmp_path / "stopped", {"seed": "0"}, False, BuildReporter(None, {"read": 1.0}), lambda: True)
+    found.append(None)
+    with pytest.raises(BuildStopped):
+        stages.ground_stage(stopped, views, 0)
+    assert not (tmp_path / "stopped" / stages.GROUND).exists(), "what was not looked at is not said to be without a ground"
 
 
 def test_what_floats_is_none_of_it() -> None:

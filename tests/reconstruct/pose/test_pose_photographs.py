@@ -134,6 +134,24 @@ def test_what_only_looks_like_a_backdrop_is_asked_too(photographs: Path, tmp_pat
     assert pose(photographs, tmp_path / "posed", replace(QUICK, resume=True)) == found
 
 
+@pytest.mark.slow
+def test_a_search_that_broke_off_is_not_taken_for_one_in_vain(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It goes on with --resume: what it finished stays, though a backdrop was found."""
+
+    def ended(job: Path, told, should_stop):
+        (job.parent / "features.done").write_text('{"seconds": 1}')
+        raise ValueError("pycolmap was ended by signal 9 (too little memory?)")
+
+    def all_object(prepared, work, should_stop):
+        return [replace(photo, has_mask=True) for photo in prepared], {}
+
+    monkeypatch.setattr("drgs.reconstruct.pose.pose_photographs.with_backdrop_masks", all_object)
+    monkeypatch.setattr("drgs.reconstruct.pose.pose_photographs.colmap_process", ended)
+    with pytest.raises(ValueError, match="ended by signal 9"):
+        pose(photographs, tmp_path / "posed", QUICK)
+    assert (tmp_path / "posed" / ".pose" / "features.done").exists()
+
+
 AT_ONCE = """
 import runpy, sys
 import pycolmap

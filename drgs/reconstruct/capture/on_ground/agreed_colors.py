@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from drgs.scene.camera import Camera
+
 
 @dataclass(frozen=True)
 class Agreement:
@@ -25,6 +27,33 @@ class Agreement:
     """Of colours, by noise and blur."""
     others: float = 0.02
     """Share of the pixels that show a place and look otherwise, by a shadow or a highlight."""
+
+
+def asked_views(count: int, most: int) -> list[int]:
+    """Numbers of at most so many views, spread over all."""
+    return sorted({round(number) for number in np.linspace(0, count - 1, min(most, count))})
+
+
+def seen_colors(
+    projected: Float[Tensor, "place 3"],
+    camera: Camera,
+    image_srgb: UInt8[Tensor, "height width 3"],
+    free: Bool[Tensor, "height width"] | None,
+) -> tuple[Float[Tensor, "place 3"], Bool[Tensor, "place"]]:
+    """A picture's colours (sRGB 0..1) at places, NaN where it does not see them free; and which of them it looks at.
+
+    Args:
+        projected: pixels times depth, and depth. free: pixels that may show them; None: all.
+    """
+    depth = projected[:, 2:]
+    pixels = projected[:, :2] / torch.where(depth > 0, depth, 1.0)
+    size = pixels.new_tensor([camera.width, camera.height])
+    inside = (depth[:, 0] > 0) & (pixels >= 0.5).all(-1) & (pixels <= size - 0.5).all(-1)
+    picture = image_srgb.permute(2, 0, 1).float() / 255
+    may_show = torch.ones_like(picture[:1]) if free is None else free[None].float()
+    places = (2 * pixels / size - 1)[None, None]
+    found = torch.nn.functional.grid_sample(torch.cat([picture, may_show])[None], places, align_corners=False)[0, :, 0].T
+    return torch.where((inside & (found[:, 3] > 0.999))[:, None], found[:, :3], torch.nan), inside
 
 
 def agreed_colors(

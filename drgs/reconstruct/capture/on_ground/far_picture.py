@@ -11,11 +11,13 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from drgs.reconstruct.capture.on_ground.agreed_colors import Agreement, agreed_colors, color_likelihood
+from drgs.reconstruct.capture.on_ground.agreed_colors import Agreement, agreed_colors, asked_views, color_likelihood, seen_colors
 from drgs.scene.camera import Camera, pixel_rays_world
 from drgs.scene.environment import direction_from_uv, uv_from_direction
 
 ROWS = 128
+MOST_VIEWS = 150
+"""That are asked: each direction is in the picture of few."""
 AGREEMENT = Agreement(agreeing=0.5)
 """More than for the ground: no sparse points tell where an object hides a direction from all."""
 
@@ -40,30 +42,14 @@ def far_picture(
     """
     v, u = torch.meshgrid((torch.arange(ROWS) + 0.5) / ROWS, (torch.arange(2 * ROWS) + 0.5) / (2 * ROWS), indexing="ij")
     directions = direction_from_uv(torch.stack([u, v], -1)).reshape(-1, 3)
-    seen = [
-        _seen(directions, camera, image, None if free is None else free[number])
-        for number, (camera, image) in enumerate(zip(cameras, images_srgb, strict=True))
-    ]
-    color, deviation, sure = agreed_colors(
-        torch.stack([samples for samples, _ in seen]), torch.stack([inside for _, inside in seen]), AGREEMENT
-    )
+    seen = []
+    for number in asked_views(len(cameras), MOST_VIEWS):
+        camera = cameras[number]
+        projected = directions @ (camera.intrinsics @ camera.camera_from_world[:3, :3]).T
+        seen.append(seen_colors(projected, camera, images_srgb[number], None if free is None else free[number]))
+    samples, inside = (torch.stack(part) for part in zip(*seen, strict=True))
+    color, deviation, sure = agreed_colors(samples, inside, AGREEMENT)
     return FarPicture(torch.cat([color, deviation[:, None], sure[:, None].float()], 1).T.reshape(5, ROWS, 2 * ROWS))
-
-
-def _seen(
-    directions: Float[Tensor, "texel 3"], camera: Camera, image: UInt8[Tensor, "height width 3"], free: Bool[Tensor, "height width"] | None
-) -> tuple[Float[Tensor, "texel 3"], Bool[Tensor, "texel"]]:
-    """The picture's colours by direction, NaN where it does not see them free; and which directions it looks in."""
-    projected = directions @ (camera.intrinsics @ camera.camera_from_world[:3, :3]).T
-    depth = projected[:, 2:]
-    pixels = projected[:, :2] / torch.where(depth > 0, depth, 1.0)
-    size = pixels.new_tensor([camera.width, camera.height])
-    inside = (depth[:, 0] > 0) & (pixels >= 0.5).all(-1) & (pixels <= size - 0.5).all(-1)
-    picture = image.permute(2, 0, 1).float() / 255
-    shown = torch.ones_like(picture[:1]) if free is None else free[None].float()
-    places = (2 * pixels / size - 1)[None, None]
-    found = torch.nn.functional.grid_sample(torch.cat([picture, shown])[None], places, align_corners=False)[0, :, 0].T
-    return torch.where((inside & (found[:, 3] > 0.999))[:, None], found[:, :3], torch.nan), inside
 
 
 def far_likelihood(

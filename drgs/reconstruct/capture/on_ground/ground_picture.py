@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from drgs.reconstruct.capture.on_ground.agreed_colors import Agreement, agreed_colors, color_likelihood
+from drgs.reconstruct.capture.on_ground.agreed_colors import Agreement, agreed_colors, asked_views, color_likelihood, seen_colors
 from drgs.reconstruct.capture.on_ground.ground_plane import GroundPlane
 from drgs.scene.camera import Camera
 from drgs.scene.ground import Ground, places_on_ground
@@ -67,14 +67,16 @@ def ground_picture(
     axes, half = torch.stack([first, torch.linalg.cross(normal, first)]), settings.extent * radius
     steps = (2 * (torch.arange(settings.side) + 0.5) / settings.side - 1) * half
     texels = foot + steps[None, :, None] * axes[0] + steps[:, None, None] * axes[1]
-    asked = sorted({round(number) for number in np.linspace(0, len(cameras) - 1, min(settings.most_views, len(cameras)))})
-    seen = [
-        _seen(texels.reshape(-1, 3), normal, cameras[number], images_srgb[number], None if free is None else free[number], settings)
-        for number in asked
-    ]
-    color, deviation, sure = agreed_colors(
-        torch.stack([samples for samples, _ in seen]), torch.stack([inside for _, inside in seen]), settings.agreement
-    )
+    places, seen = texels.reshape(-1, 3), []
+    for number in asked_views(len(cameras), settings.most_views):
+        camera = cameras[number]
+        pixel_from_world = (camera.intrinsics.double() @ camera.camera_from_world.double()[:3]).float()
+        projected = places @ pixel_from_world[:, :3].T + pixel_from_world[:, 3]
+        samples, inside = seen_colors(projected, camera, images_srgb[number], None if free is None else free[number])
+        steep = torch.nn.functional.normalize(camera.center_world - places, dim=-1) @ normal > settings.least_cosine
+        seen.append((torch.where(steep[:, None], samples, torch.nan), inside & steep))
+    samples, looked = (torch.stack(part) for part in zip(*seen, strict=True))
+    color, deviation, sure = agreed_colors(samples, looked, settings.agreement)
     points = torch.from_numpy(plane.points_world).float() - foot
     flat = (points @ axes.T).numpy()
     spacing = float(np.median(cKDTree(flat).query(flat, k=min(5, len(flat)))[0][:, -1]))
@@ -83,30 +85,6 @@ def ground_picture(
     size = (settings.side, settings.side)
     ground = Ground(foot, axes, half, color.T.reshape(3, *size), known.reshape(1, *size))
     return GroundPicture(ground, deviation.reshape(1, *size))
-
-
-def _seen(
-    points: Float[Tensor, "texel 3"],
-    normal: Float[Tensor, "3"],
-    camera: Camera,
-    image: UInt8[Tensor, "height width 3"],
-    free: Bool[Tensor, "height width"] | None,
-    settings: GroundPictureSettings,
-) -> tuple[Float[Tensor, "texel 3"], Bool[Tensor, "texel"]]:
-    """The picture's colours at places of the ground, NaN where it does not see them free; and which places it looks at."""
-    pixel_from_world = (camera.intrinsics.double() @ camera.camera_from_world.double()[:3]).float()
-    projected = points @ pixel_from_world[:, :3].T + pixel_from_world[:, 3]
-    depth = projected[:, 2:]
-    pixels = projected[:, :2] / torch.where(depth > 0, depth, 1.0)
-    size = pixels.new_tensor([camera.width, camera.height])
-    towards = torch.nn.functional.normalize(camera.center_world - points, dim=-1)
-    inside = (depth[:, 0] > 0) & (pixels >= 0.5).all(-1) & (pixels <= size - 0.5).all(-1) & (towards @ normal > settings.least_cosine)
-    picture = image.permute(2, 0, 1)[None].float() / 255
-    if free is not None:
-        picture = torch.cat([picture, free[None, None].float()], 1)
-    found = torch.nn.functional.grid_sample(picture, (2 * pixels / size - 1)[None, None], align_corners=False)[0, :, 0].T
-    shown = inside if free is None else inside & (found[:, 3] > 0.999)
-    return torch.where(shown[:, None], found[:, :3], torch.nan), inside
 
 
 def ground_likelihood(

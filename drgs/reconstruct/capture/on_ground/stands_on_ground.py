@@ -8,6 +8,7 @@ In: Views with sparse points. Out: the same Views with the ground, and as covera
 or nothing on it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,8 +59,13 @@ class OnGroundSettings:
     """How far outside the silhouette a picture may show the object, the same way."""
 
 
-def stands_on_ground(views: Views, seed: int, settings: OnGroundSettings = OnGroundSettings()) -> Views | None:
-    """The capture with the ground; None where there is none with something on it."""
+def stands_on_ground(
+    views: Views,
+    seed: int,
+    should_stop: Callable[[], bool] = lambda: False,
+    settings: OnGroundSettings = OnGroundSettings(),
+) -> Views | None:
+    """The capture with the ground; None where there is none with something on it, or should_stop() said so."""
     if views.points_world is None or len(views.points_world) == 0:
         return None
     small = smaller_views(views, settings.side)
@@ -70,12 +76,16 @@ def stands_on_ground(views: Views, seed: int, settings: OnGroundSettings = OnGro
         return None
     volume: Volume | None = None
     for _ in range(settings.looks):
+        if should_stop():
+            return None
         picture = _looked_at(plane, small, center, radius, volume, settings, GroundPictureSettings())
         far = far_picture(small.cameras, small.images_srgb, _free(volume, small, settings))
         volume = _volume_above(plane, picture, far, small, center, radius, settings)
         if volume is None:
             return None
     assert volume is not None
+    if should_stop():
+        return None
     finer = GroundPictureSettings(side=settings.fine_texels, most_views=16)
     fine = smaller_views(views, settings.fine_side)
     ground = _looked_at(plane, fine, center, radius, volume, settings, finer).ground

@@ -26,20 +26,12 @@ from drgs.reconstruct.fit.surfels.fit_gaussians import (
 )
 from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.scene.views import Views
+from tests.one_torch_thread import one_torch_thread  # noqa: F401
 from tests.reconstruct.capture.test_exposures import exposed, some_stops
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, write_nerf_synthetic
 
 CPU = torch.device("cpu")
 SHORT = FitSettings(iterations=26, densify=DensifySettings(every=5, growth=0.2, budget=420), seed=3)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _one_torch_thread():
-    """torch's own sums may be split by its threads; two threads are no faster on pictures this small."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
