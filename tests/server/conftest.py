@@ -3,6 +3,7 @@
 import json
 import uuid
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,14 @@ class Service:
         self.anonymous = TestClient(self.app, base_url="http://127.0.0.1:8000")
         self.client = TestClient(self.app, base_url="http://127.0.0.1:8000", headers={"Authorization": f"Bearer {self.token}"})
 
+    @contextmanager
+    def running(self) -> Iterator["Service"]:
+        """Both clients on one event loop, as of a real server: what a session's streams wait for belongs to that."""
+        with self.client:
+            self.anonymous.portal = self.client.portal
+            yield self
+            self.anonymous.portal = None
+
     def add_asset(self, asset_id: str = "a" * 32, name: str = "ball") -> str:
         folder = self.context.directory.asset(asset_id)
         folder.mkdir()
@@ -60,14 +69,12 @@ class Service:
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[Service]:
-    service = Service(tmp_path)
-    with service.client:
+    with Service(tmp_path).running() as service:
         yield service
 
 
 @pytest.fixture(scope="module")
 def lasting_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """One for all tests of a module that are refused, or change nothing that others see: to begin and end a service takes longer than to ask it."""
-    service = Service(tmp_path_factory.mktemp("service"))
-    with service.client:
+    with Service(tmp_path_factory.mktemp("service")).running() as service:
         yield service
