@@ -58,6 +58,7 @@ from drgs.reconstruct.stages import (
     capture_digest,
     fit_stage,
     forget_checkpoints,
+    ground_again_stage,
     ground_stage,
     hollows_stage,
     masks_stage,
@@ -178,6 +179,8 @@ def build_stages(
             points = points_on_ground(views, points, preset.points, settings.seed, settings.box)
             masked = masks_stage(place, views, points, fit_settings, device, settings.box)
             views = views_of(views, masked)  # without those in which the box's content is hidden
+            if views.ground is not None:
+                views, masked = ground_again_stage(place, views, masked, settings.seed)
             points = points_of_found_masks(masked, points, preset.points, settings.seed, settings.box)
         else:
             masked = views

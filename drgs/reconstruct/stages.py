@@ -19,7 +19,7 @@ from drgs.reconstruct.capture.cut_to_box import chosen_views
 from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
 from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
-from drgs.reconstruct.capture.on_ground.stands_on_ground import stands_on_ground
+from drgs.reconstruct.capture.on_ground.stands_on_ground import look_again, stands_on_ground
 from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
@@ -49,8 +49,8 @@ from drgs.scene.views import Views
 
 MASKS = "masks.safetensors"
 """Of a capture that has none of its own."""
-GROUND = "ground.safetensors"
-"""What the object stands on, where it has no masks."""
+GROUND, GROUND_AGAIN = "ground.safetensors", "ground_again.safetensors"
+"""What the object stands on, where it has no masks; and as the masks that were found show it."""
 HOLLOWS = "hollows.safetensors"
 """Points without the hull's hollows; those of the hull where it has none."""
 FIT, MESH, SURFACE, MATERIALS = "stage1.safetensors", "mesh.safetensors", "surface.safetensors", "stage2.safetensors"
@@ -89,7 +89,7 @@ def capture_digest(views: Views, box: BuildBox | None = None) -> str:
 
 def forget_checkpoints(place: Workplace) -> None:
     """Else a later build that resumes would take them for this one's."""
-    for stale in (GROUND, MASKS, *CHECKPOINTS):
+    for stale in (GROUND, MASKS, GROUND_AGAIN, *CHECKPOINTS):
         (place.folder / stale).unlink(missing_ok=True)
 
 
@@ -121,15 +121,44 @@ def ground_stage(place: Workplace, views: Views, seed: int) -> Views:
         found = stands_on_ground(views, seed, place.should_stop)
         if place.should_stop():
             raise BuildStopped
-        if found is None or found.ground is None:
-            return {"found": torch.zeros(1)}
-        ground = found.ground
-        kept = {name: value for name, value in vars(ground).items() if isinstance(value, Tensor)} | {"half": torch.tensor([ground.half])}
-        return {"found": torch.ones(1)} | kept | {f"coverage.{number}": mask for number, mask in enumerate(found.coverage)}
+        return {"found": torch.zeros(1)} if found is None else {"found": torch.ones(1)} | _ground_tensors(found)
 
     kept = _kept_or_made(place, GROUND, torch.device("cpu"), made)
+    return _with_ground(views, kept) if kept["found"] else views
+
+
+def ground_again_stage(place: Workplace, views: Views, masked: Views, seed: int) -> tuple[Views, Views]:
+    """look_again: both as they were where nothing is found any more.
+
+    Args:
+        views: of ground_stage, those with masks alone. masked: of masks_stage.
+    """
+
+    def made() -> dict[str, Tensor]:
+        place.reporter.report("read", 1.0, "no masks: looking once more for what the object stands on")
+        found = look_again(views, masked.coverage, seed, place.should_stop)
+        if place.should_stop():
+            raise BuildStopped
+        if found is None:
+            return {"found": torch.zeros(1)}
+        return {"found": torch.ones(1)} | _ground_tensors(found[0]) | {f"mask.{number}": mask for number, mask in enumerate(found[1])}
+
+    kept = _kept_or_made(place, GROUND_AGAIN, torch.device("cpu"), made)
     if not kept["found"]:
-        return views
+        return views, masked
+    masks = tuple(kept[f"mask.{number}"] for number in range(len(masked.cameras)))
+    return _with_ground(views, kept), replace(masked, coverage=masks)
+
+
+def _ground_tensors(views: Views) -> dict[str, Tensor]:
+    """What _with_ground reads."""
+    assert views.ground is not None
+    ground = {name: value for name, value in vars(views.ground).items() if isinstance(value, Tensor)}
+    coverage = {f"coverage.{number}": mask for number, mask in enumerate(views.coverage)}
+    return ground | {"half": torch.tensor([views.ground.half])} | coverage
+
+
+def _with_ground(views: Views, kept: dict[str, Tensor]) -> Views:
     ground = Ground(kept["middle"], kept["axes"], float(kept["half"]), kept["color_srgb"], kept["known"])
     return replace(views, ground=ground, coverage=tuple(kept[f"coverage.{number}"] for number in range(len(views.cameras))))
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from drgs.reconstruct import stages
 from drgs.reconstruct.capture import find_masks as find_masks_module
@@ -14,7 +15,7 @@ from drgs.reconstruct.capture.initial_points import initial_points, seen_by_all
 from drgs.reconstruct.capture.masks_by_strokes.vote_volume import Region, Volume
 from drgs.reconstruct.capture.on_ground.ground_picture import ground_likelihood, ground_picture
 from drgs.reconstruct.capture.on_ground.ground_plane import ground_plane
-from drgs.reconstruct.capture.on_ground.stands_on_ground import standing_parts, stands_on_ground
+from drgs.reconstruct.capture.on_ground.stands_on_ground import look_again, standing_parts, stands_on_ground
 from drgs.reconstruct.fit.light.ground_layer import COVER, before_ground, ground_logits
 from drgs.reconstruct.presets import PRESETS
 from drgs.reconstruct.progress import BuildStopped
@@ -141,6 +142,29 @@ def test_the_egg_is_where_the_ground_is_hidden(scene: tuple[Views, list[np.ndarr
     assert stands_on_ground(lost, seed=0) is None
 
 
+def overlap(found: list[np.ndarray], true: list[np.ndarray]) -> float:
+    return float(np.mean([(a & b).sum() / (a | b).sum() for a, b in zip(found, true, strict=True)]))
+
+
+@pytest.mark.slow
+def test_masks_that_are_too_wide_are_cut_where_the_ground_is_seen_beside_the_egg(scene: tuple[Views, list[np.ndarray]]) -> None:
+    views, masks = scene
+    wide = [ndimage.binary_dilation(mask, iterations=4) for mask in masks]
+    given = [torch.from_numpy(255 * mask.astype(np.uint8)) for mask in wide]
+    again = look_again(views, given, seed=0)
+    assert again is not None
+    found, cut = again
+    assert found.ground is not None and not found.has_masks
+    after = [mask.numpy() > 127 for mask in cut]
+    assert all((a & ~b).sum() == 0 for a, b in zip(after, wide, strict=True)), "nothing is added"
+    assert overlap(after, masks) > overlap(wide, masks) + 0.02
+    assert all((b & ~a).sum() < 0.05 * b.sum() for a, b in zip(after, masks, strict=True)), "no picture loses the egg"
+    for coverage, mask in zip(found.coverage, after, strict=True):
+        assert (mask & (coverage.numpy() < 128)).sum() == 0, "where the masks are, the egg may be"
+    assert look_again(views, given, seed=0, should_stop=lambda: True) is None
+    assert look_again(dataclasses.replace(views, points_world=None), given, seed=0) is None
+
+
 def test_the_ground_is_kept_for_a_build_that_goes_on(
     scene: tuple[Views, list[np.ndarray]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,6 +191,30 @@ def test_the_ground_is_kept_for_a_build_that_goes_on(
     with pytest.raises(BuildStopped):
         stages.ground_stage(stopped, views, 0)
     assert not (tmp_path / "stopped" / stages.GROUND).exists(), "what was not looked at is not said to be without a ground"
+
+
+def test_the_ground_of_the_second_look_is_kept_as_well(
+    scene: tuple[Views, list[np.ndarray]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, masks = scene
+    coverage = tuple(torch.from_numpy(mask.astype(np.uint8) * 255) for mask in masks)
+    ground = Ground(torch.tensor([0.0, 0, -1]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]), 2.0, torch.rand(3, 4, 4), torch.ones(1, 4, 4))
+    first, second = (dataclasses.replace(views, ground=dataclasses.replace(ground, half=half)) for half in (2.0, 3.0))
+    masked = dataclasses.replace(views, has_masks=True)
+    found = [(dataclasses.replace(second, coverage=coverage), [mask.clone() for mask in coverage]), None]
+    monkeypatch.setattr(stages, "look_again", lambda *given: found.pop(0))
+    for number, expected in enumerate(list(found)):
+        place = stages.Workplace(tmp_path / str(number), {"seed": "0"}, False, BuildReporter(None, {"read": 1.0}), lambda: False)
+        for resume in (False, True):  # found is empty when it is resumed
+            with_ground, with_masks = stages.ground_again_stage(dataclasses.replace(place, resume=resume), first, masked, 0)
+            assert with_masks.has_masks and not with_ground.has_masks and with_ground.ground is not None
+            assert with_ground.ground.half == (2 if expected is None else 3)
+            wanted = masked.coverage if expected is None else coverage
+            assert all(torch.equal(a, b) for a, b in zip(with_masks.coverage, wanted, strict=True))
+    found.append(None)
+    stopped = stages.Workplace(tmp_path / "stopped", {"seed": "0"}, False, BuildReporter(None, {"read": 1.0}), lambda: True)
+    with pytest.raises(BuildStopped):
+        stages.ground_again_stage(stopped, first, masked, 0)
 
 
 def test_what_floats_is_none_of_it() -> None:
