@@ -34,7 +34,7 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.surface.surface_passes import SurfaceFit
-from drgs.reconstruct.fit.surfels.fit_gaussians import drawn_object, gaussians_from_state
+from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, gaussians_from_state
 from drgs.reconstruct.fit.surfels.fit_materials import gaussians_from_materials
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import gaussians_from_mesh_fit
 from drgs.reconstruct.fit.view_targets import view_targets
@@ -174,14 +174,8 @@ def build_stages(
             forget_checkpoints(place)
         fit_settings = replace(preset.fit, seed=settings.seed)
         if not views.has_masks:
-            views = ground_stage(place, views, settings.seed)
+            views, masked, points = _with_found_masks(place, views, points, fit_settings, device, settings, preset)
             found_by = {"object_found_by": "surroundings" if views.ground is None else "ground"}
-            points = points_on_ground(views, points, preset.points, settings.seed, settings.box)
-            masked = masks_stage(place, views, points, fit_settings, device, settings.box)
-            views = views_of(views, masked)  # without those in which the box's content is hidden
-            if views.ground is not None:
-                views, masked = ground_again_stage(place, views, masked, settings.seed)
-            points = points_of_found_masks(masked, points, preset.points, settings.seed, settings.box)
         else:
             masked = views
         light = _light(settings, preset, found, masked, points)
@@ -250,6 +244,25 @@ def _by_strokes(strokes: tuple[Stroke, ...], reporter: BuildReporter, should_sto
         return found
 
     return masked
+
+
+def _with_found_masks(
+    place: Workplace,
+    views: Views,
+    points: InitialPoints,
+    fit_settings: FitSettings,
+    device: torch.device,
+    settings: BuildSettings,
+    preset: Preset,
+) -> tuple[Views, Views, InitialPoints]:
+    """Views without masks, but with the ground where there is one; the same with masks, for what looks at the object; points on those."""
+    views = ground_stage(place, views, settings.seed)
+    points = points_on_ground(views, points, preset.points, settings.seed, settings.box)
+    masked = masks_stage(place, views, points, fit_settings, device, settings.box)
+    views = views_of(views, masked)  # without those in which the box's content is hidden
+    if views.ground is not None:
+        views, masked = ground_again_stage(place, views, masked, settings.seed)
+    return views, masked, points_of_found_masks(masked, points, preset.points, settings.seed, settings.box)
 
 
 def _light(settings: BuildSettings, preset: Preset, capture: Capture, views: Views, points: InitialPoints) -> LightFound:
