@@ -25,6 +25,8 @@ class Agreement:
     """how many of those that look there, whether or not something hides it."""
     least_deviation: float = 0.03
     """Of colours, by noise and blur."""
+    noise_around: float = 0.5
+    """Of a pixel and its neighbours together, over that of one: a third, were it noise alone, and not poses and blur as well."""
     others: float = 0.02
     """Share of the pixels that show a place and look otherwise, by a shadow or a highlight."""
 
@@ -92,8 +94,25 @@ def color_likelihood(
     image_srgb: UInt8[Tensor, "height width 3"],
     settings: Agreement = Agreement(),
 ) -> Float[Tensor, "height width"]:
-    """Logarithm of the density of each pixel's colour (sRGB 0..1) if it shows what is expected there."""
+    """Logarithm of the density of each pixel's colour (sRGB 0..1) if it shows what is expected there, or of its surroundings' if that is less: noise may
+    make one pixel of another colour likely, but not all around."""
     image = image_srgb.permute(2, 0, 1).float() / 255
+    alone = _log_density(color, deviation, image, settings)
+    together = _log_density(_around(color), settings.noise_around * deviation, _around(image), settings)
+    return torch.minimum(alone, together)
+
+
+def _around(picture: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:
+    """Means of pixels and their neighbours."""
+    return torch.nn.functional.avg_pool2d(picture[None].nan_to_num(), 3, 1, 1, count_include_pad=False)[0]
+
+
+def _log_density(
+    color: Float[Tensor, "3 height width"],
+    deviation: Float[Tensor, "height width"],
+    image: Float[Tensor, "3 height width"],
+    settings: Agreement,
+) -> Float[Tensor, "height width"]:
     # Poses are off by up to a pixel: the best of the neighbouring places counts.
     padded = torch.nn.functional.pad(color[None], (1, 1, 1, 1), mode="replicate")[0]
     height, width = image.shape[1:]
