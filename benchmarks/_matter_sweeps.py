@@ -10,12 +10,12 @@ import trimesh
 from torch import Tensor
 
 from benchmarks.simulate import falling_cube
-from drgs.deform.arap import ArapHandles
-from drgs.deform.carry_gaussians import carry_normals, carry_tangents, decompose_tangents
-from drgs.deform.drive_mesh import vertex_gradients
-from drgs.deform.gmls import build_weights, interpolate
-from drgs.deform.mpm import LAWS, Material, Model, MpmSettings, State, advance, measure_balance, rest_state
-from drgs.deform.mpm.records import Law
+from drgs.deform.carry.carry_gaussians import carry_normals, carry_tangents, decompose_tangents
+from drgs.deform.carry.drive_mesh import vertex_gradients
+from drgs.deform.carry.gmls import build_weights, interpolate
+from drgs.deform.displace.arap import ArapHandles
+from drgs.deform.matter.mpm import LAWS, Material, Model, MpmSettings, State, advance, measure_balance, rest_state
+from drgs.deform.matter.mpm.records import Law
 
 DETERMINANTS = (-1.0, -1e-3, -1e-6, 0.0, 1e-6, 1e-3, 1.0, 1e3)
 SPACING = 1 / 16
@@ -177,7 +177,7 @@ def room_rows(particles: int, seconds: float) -> list[Row]:
     outside[0, 0] = 50.0
 
     def build() -> Model:
-        from drgs.deform.mpm import make_model
+        from drgs.deform.matter.mpm import make_model
 
         return make_model(outside, model.volumes, (Material(),), torch.zeros(len(outside), dtype=torch.int32), model.grid)
 

@@ -19,7 +19,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from drgs.deform.arap import ArapHandles, ArapSettings
+from drgs.deform.displace.arap import ArapHandles, ArapSettings
 from drgs.warp_torch import thread_count
 
 

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from drgs.deform.carry_gaussians import carry_tangents
-from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
-from drgs.deform.maps import evaluate_map
+from drgs.deform.carry.carry_gaussians import carry_tangents
+from drgs.deform.carry.drive_mesh import drive_surfels, vertex_gradients
+from drgs.deform.displace.maps import evaluate_map
 from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.metrics import picture_figures, score_renders, truth_folders
 from drgs.maths.color import srgb_from_linear

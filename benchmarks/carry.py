@@ -17,9 +17,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from drgs.deform.carry_gaussians import carry_normals, carry_tangents
-from drgs.deform.gmls import GmlsSettings, build_weights, interpolate
-from drgs.deform.maps import evaluate_map
+from drgs.deform.carry.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.carry.gmls import GmlsSettings, build_weights, interpolate
+from drgs.deform.displace.maps import evaluate_map
 from drgs.scene.edits import BendMap
 from drgs.warp_torch import device_from_name, thread_count
 

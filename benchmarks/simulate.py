@@ -13,7 +13,7 @@ import time
 
 import torch
 
-from drgs.deform.mpm import (
+from drgs.deform.matter.mpm import (
     LAWS,
     Condition,
     GridSettings,

@@ -39,7 +39,7 @@ LIMITS = """
 - **Surfels** feel singular values of F between 1/100 and 100, with det F > 0: flat, folded and inverted gradients are moved to the nearest
   such matrix. What a simulation hands to surfels is limited to stretches of 1/10 to 10, on sand and fluids to 1/3 to 3.
 - **Meshes** with holes, flipped faces, overlaps and floaters are filled with matter all the same, 98 % of it inside and its volume within 2 %,
-  5 % where a bottom is missing (tests/deform/test_fill_particles.py); a sheet encloses nothing and is refused.
+  5 % where a bottom is missing (tests/deform/matter/test_fill_particles.py); a sheet encloses nothing and is refused.
 - **Neighbourhoods** of any rank carry affine motions; a point far from all particles is carried too, and a simulation lets it go rigidly with
   the nearest beyond three cells. Far off the origin float32 positions cost the digits, not the weights.
 - **Handles** go up to 1000 sizes of the object away; further is refused. Where targets contradict a shape (a half turn, one end through the

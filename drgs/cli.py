@@ -265,8 +265,8 @@ def simulate(
 ) -> None:
     """Drop, squash and shake an asset; play the clip with a 'pose' edit."""
     from drgs.cli_progress import frame_progress
-    from drgs.deform.simulate import simulate as run_simulation
-    from drgs.deform.simulation_scene import SimulationScene, parse_simulation_scene
+    from drgs.deform.matter.simulate import simulate as run_simulation
+    from drgs.deform.matter.simulation_scene import SimulationScene, parse_simulation_scene
 
     setting = SimulationScene() if scene is None else parse_simulation_scene(scene.read_bytes())
     with frame_progress("Simulating", None) as advance:

@@ -152,16 +152,27 @@ def test_no_modules_import_each_other_in_a_circle():
     assert [sorted(cycle) for cycle in cycles({module: imported_modules(module) for module in MODULES})] == []
 
 
-def test_the_renderers_folders_import_each_other_in_no_circle():
-    def folder(module: str) -> str:
-        return ".".join(module.split(".")[:3])
+def parts_graph(package: str) -> dict[str, set[str]]:
+    """Which of a package's folders and files import which others of them."""
 
-    inside = {module for module in MODULES if module.startswith("drgs.render.")}
-    graph: dict[str, set[str]] = {folder(module): set() for module in inside}
+    def part(module: str) -> str:
+        return ".".join(module.split(".")[: package.count(".") + 2])
+
+    inside = {module for module in MODULES if module.startswith(f"{package}.")}
+    graph: dict[str, set[str]] = {part(module): set() for module in inside}
     for module in inside:
-        graph[folder(module)] |= {folder(found) for found in imported_modules(module) & inside} - {folder(module)}
-    assert [sorted(cycle) for cycle in cycles(graph)] == []
-    assert "drgs.render.progressive" in graph["drgs.render.film"], "the film reads the frame, not the other way round"
+        graph[part(module)] |= {part(found) for found in imported_modules(module) & inside} - {part(module)}
+    return graph
+
+
+@pytest.mark.parametrize("package", ["drgs.deform", "drgs.render"])
+def test_the_parts_of_a_package_import_each_other_in_no_circle(package: str):
+    assert [sorted(cycle) for cycle in cycles(parts_graph(package))] == []
+
+
+def test_the_film_reads_the_frame_and_posing_reads_what_moves():
+    assert "drgs.render.progressive" in parts_graph("drgs.render")["drgs.render.film"]
+    assert {f"drgs.deform.{part}" for part in ("displace", "rig", "matter", "carry")} < parts_graph("drgs.deform")["drgs.deform.pose_scene"]
 
 
 def test_cycles_are_found():
@@ -238,14 +249,18 @@ def loaded_with(module: str) -> set[str]:
     [
         ("drgs_worker.jobs.file_tool", {"torch", "warp", "scipy", "PIL", "pydantic", "sqlalchemy", "drgs.exchange"}),
         ("drgs.scene.asset", {"warp", "scipy", "trimesh"}),
-        ("drgs.deform.pose_scene", {"warp", "scipy", "igl", "drgs.deform.mpm", "drgs.deform.arap", "drgs.exchange.gltf_rig"}),
+        (
+            "drgs.deform.pose_scene",
+            {"warp", "scipy", "igl", "drgs.deform.matter", "drgs.deform.displace.arap", "drgs.deform.rig", "drgs.exchange.gltf_rig"},
+        ),
         ("drgs.render.render_frame", {"scipy", "drgs.deform", "drgs.render.integrate.wavefront"}),
-        ("drgs.convert.export_asset", {"igl", "trimesh", "drgs.deform.mpm", "drgs.convert.page", "drgs.reconstruct"}),
+        ("drgs.convert.export_asset", {"igl", "trimesh", "drgs.deform.matter.mpm", "drgs.convert.page", "drgs.reconstruct"}),
         ("drgs.evaluate.look_at_capture", {"trimesh", "scipy.stats", "skimage.color", "skimage.filters", "drgs.render"}),
     ],
 )
 def test_a_process_for_one_file_loads_what_it_needs_and_no_more(module: str, late: set[str]):
     # Each look, upload and export is a process: what it imports its caller waits for, where it is not forked off one that has loaded all.
+    assert {name for name in late if name.startswith("drgs")} <= set(MODULES), "what is moved is named here as it is called now"
     assert loaded_with(module) & late == set()
 
 

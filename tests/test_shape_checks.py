@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int, Shaped, TypeCheckError
 from jaxtyping._storage import get_shape_memo, pop_shape_memo, push_shape_memo
 
-from drgs.deform.maps import evaluate_map
+from drgs.deform.displace.maps import evaluate_map
 from drgs.reconstruct.fit.densify import ScreenGradientStats
 from drgs.reconstruct.fit.losses import mask_loss
 from drgs.reconstruct.geometry.bind_gaussians import query_closest_faces

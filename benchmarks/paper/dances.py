@@ -29,8 +29,8 @@ from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant
 from drgs.convert.import_mesh import import_mesh
 from drgs.deform.pose_scene import pose_scene
-from drgs.deform.rig_clip import find_animation
-from drgs.deform.skeleton import pose_rig
+from drgs.deform.rig.rig_clip import find_animation
+from drgs.deform.rig.skeleton import pose_rig
 from drgs.evaluate.metrics import light_scale, on_white, psnr, scale_light, ssim
 from drgs.exchange.gltf_rig import read_gltf_rig
 from drgs.exchange.rig import Rig, RigAnimation

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.deform.drive_mesh import drive_points, vertex_gradients
-from drgs.deform.maps import evaluate_map
+from drgs.deform.carry.drive_mesh import drive_points, vertex_gradients
+from drgs.deform.displace.maps import evaluate_map
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians
 from drgs.scene.edits import DeformEdit, parse_edits
 from drgs.scene.mesh import TriangleMesh

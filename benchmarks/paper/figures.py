@@ -28,8 +28,8 @@ from benchmarks.paper.tables import SceneEvidence
 from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant
 from benchmarks.paper.wires import with_wires
+from drgs.deform.matter.simulation_scene import make_material, parse_simulation_scene
 from drgs.deform.pose_scene import pose_scene
-from drgs.deform.simulation_scene import make_material, parse_simulation_scene
 from drgs.evaluate.metrics import normal_error_degrees, on_white, psnr
 from drgs.maths.color_numpy import srgb_from_linear
 from drgs.maths.constants import STILL_BOUNCES

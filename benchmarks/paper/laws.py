@@ -21,9 +21,9 @@ from benchmarks.paper.sheets import Array, film_picture, halved, object_window, 
 from benchmarks.paper.tables import SceneEvidence
 from benchmarks.paper.variant import AbstractVariant
 from drgs.deform.clip import ClipFrame
-from drgs.deform.show_grains import grains_of, show_grains
-from drgs.deform.simulate import Simulation
-from drgs.deform.simulation_scene import SimulationScene, parse_simulation_scene
+from drgs.deform.matter.show_grains import grains_of, show_grains
+from drgs.deform.matter.simulate import Simulation
+from drgs.deform.matter.simulation_scene import SimulationScene, parse_simulation_scene
 from drgs.evaluate.metrics import on_white, psnr
 from drgs.reference.trace_spheres import trace_spheres
 from drgs.render.records import Frame, RenderSettings

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.deform.carry_gaussians import guard_gradient
-from drgs.deform.gmls import polar_rotation
+from drgs.deform.carry.carry_gaussians import guard_gradient
+from drgs.deform.carry.gmls import polar_rotation
 from drgs.maths.constants import MIN_COVERAGE
 from drgs.render.visible.rasterize import RasterMaps, RasterSettings, rasterize
 from drgs.render.visible.rasterize.near_plane import near_plane_of

@@ -20,12 +20,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.deform.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.carry.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.carry.drive_mesh import drive_surfels, vertex_gradients
 from drgs.deform.clip import ClipFrame, Parted, frame_at, open_clip
-from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
-from drgs.deform.maps import check_map, evaluate_map
+from drgs.deform.displace.maps import check_map, evaluate_map
+from drgs.deform.displace.vertex_sequence import vertices_at
 from drgs.deform.sort_edits import EditFiles, EditSteps, ShapeEdit, SortedEdits, file_names, sort_edits
-from drgs.deform.vertex_sequence import vertices_at
 from drgs.scene.asset import Asset
 from drgs.scene.edits import DeformEdit, Edit, MaterialEdit, PoseEdit, SimulateEdit, split_rig_clip
 from drgs.scene.environment import Environment
@@ -88,7 +88,7 @@ def pose_scene(
 
 
 def _with_grains(asset: Asset, scene: PosedScene, parted: Parted, by_kind: SortedEdits) -> PosedScene:
-    from drgs.deform.show_grains import grains_of, show_grains
+    from drgs.deform.matter.show_grains import grains_of, show_grains
 
     shape, material = _key("shape", by_kind.shape), _key("material", by_kind.material)
     grains = _remembered(asset, ("grains", shape), lambda: grains_of(scene.mesh, scene.surfels, parted))
@@ -283,7 +283,7 @@ def _deformed(
     elif edit.handles is not None and edit.handles.drag:
         handles, places = edit.handles, [vertices, centers, None if parted is None else parted.centers]
         points, sizes = torch.cat([part for part in places if part is not None]), [0 if part is None else len(part) for part in places]
-        from drgs.deform.hold_handles import HeldObject
+        from drgs.deform.displace.hold_handles import HeldObject
 
         # What is held is prepared once for all targets that a drag passes through.
         grips = ("handles", digest_before, _text_of_grips(edit))
@@ -304,18 +304,18 @@ def _moment(asset: Asset, edit: PoseEdit | SimulateEdit, files: EditFiles, go_on
     centers, tangents = (None, None) if asset.gaussians is None else (asset.gaussians.centers, _rest(asset).tangents)
     rest = ClipFrame(asset.mesh.vertices, asset.mesh.normals, centers, tangents)
     if isinstance(edit, SimulateEdit):
-        from drgs.deform.simulation_scene import parse_simulation_scene
+        from drgs.deform.matter.simulation_scene import parse_simulation_scene
 
         scene = parse_simulation_scene(edit.scene)
         if edit.time == 0:
             return rest
-        from drgs.deform.simulate import Simulation
+        from drgs.deform.matter.simulate import Simulation
 
         scene_key = ("simulation", scene.model_dump_json(), *map(files.stamp, file_names(edit)))
         simulation = _remembered(asset, scene_key, lambda: Simulation(asset, scene, lambda name: files.path(name, or_folder=True), go_on))
         frame = simulation.at(edit.time, go_on)
     elif (rig := split_rig_clip(edit.clip)) is not None:
-        from drgs.deform.rig_clip import bind_rig
+        from drgs.deform.rig.rig_clip import bind_rig
 
         rig_key = ("rig", files.stamp(rig[0]), edit.model_dump_json(exclude={"time"}))
         bound = _remembered(asset, rig_key, lambda: bind_rig(files.path(rig[0]), rig[1], asset, rest, edit.rig))

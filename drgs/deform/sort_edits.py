@@ -150,7 +150,7 @@ class _SortedList:
                 named = (*(name for name in named if name != edit.file), edit.file)
             self.sums.append(last._replace(light=Light(edit.rotation, edit.intensity, named)))
         elif isinstance(edit, MatterEdit):
-            from drgs.deform.simulation_scene import parse_simulation_scene
+            from drgs.deform.matter.simulation_scene import parse_simulation_scene
 
             parse_simulation_scene(edit.scene)  # refused here, not when somebody simulates
             self.sums.append(last)
@@ -224,7 +224,7 @@ def _word(edit: MaterialEdit | ShapeEdit, files: EditFiles) -> bytes:
 def file_names(edit: ShapeEdit) -> list[str]:
     """Of all files that an edit reads: whoever changes one must be noticed."""
     if isinstance(edit, SimulateEdit):
-        from drgs.deform.simulation_scene import mesh_files, parse_simulation_scene
+        from drgs.deform.matter.simulation_scene import mesh_files, parse_simulation_scene
 
         return list(mesh_files(parse_simulation_scene(edit.scene)))
     return [] if (name := _file(edit)) is None else [name]

@@ -2,7 +2,7 @@
 
 In: a .glb or .gltf file. Out: a `Rig`, in the file's own axes and units (y up, metres), everything checked: indices exist, the node tree is
 a tree, keys rise in time. Materials, textures, cameras, lights, points and lines are passed over. Nothing is evaluated here
-(drgs/deform/skeleton.py does that). Source: glTF 2.0 specification, Khronos.
+(drgs/deform/rig/skeleton.py does that). Source: glTF 2.0 specification, Khronos.
 """
 
 from pathlib import Path

@@ -1,6 +1,6 @@
 """What moves in a file: nodes, skins, meshes with joints and weights, morph targets and animations, as plain arrays.
 
-`gltf_rig.py` and `fbx_rig.py` read them, drgs/deform/skeleton.py evaluates them. Axes and units are glTF's: y up, metres.
+`gltf_rig.py` and `fbx_rig.py` read them, drgs/deform/rig/skeleton.py evaluates them. Axes and units are glTF's: y up, metres.
 """
 
 from dataclasses import dataclass

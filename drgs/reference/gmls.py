@@ -1,4 +1,4 @@
-"""Twin of deform/gmls: every point against all particles, in float64, in the form that shows the Taylor correction."""
+"""Twin of deform/carry/gmls: every point against all particles, in float64, in the form that shows the Taylor correction."""
 
 import torch
 from torch import Tensor

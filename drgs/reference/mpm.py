@@ -1,7 +1,7 @@
 """Twins of the simulation's laws and of one of its steps: closed forms in float64, every particle against every node.
 
 Source of the formulas: docs/sources.md (stomakhin2012, stomakhin2013, klar2016); the stresses are checked against the derivatives of
-`drgs.deform.mpm.diagnostics.energy_density` by autograd, so that no factor can slip in.
+`drgs.deform.matter.mpm.diagnostics.energy_density` by autograd, so that no factor can slip in.
 """
 
 import torch

@@ -17,7 +17,7 @@ from benchmarks.paper.figures import STRIP, young_modulus
 from benchmarks.paper.films import FPS, WAY_THERE, shares, write_film
 from benchmarks.paper.pages import honesty, score_rows
 from benchmarks.paper.variants import VARIANTS
-from drgs.deform.simulation_scene import make_material, parse_simulation_scene
+from drgs.deform.matter.simulation_scene import make_material, parse_simulation_scene
 from drgs.exchange.exr import encode_environment
 from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.reconstruct.geometry.face_surfels import surfels_on_faces_of

@@ -14,7 +14,7 @@ from benchmarks.paper.character.rigged_glb import CLIP, write_character
 from benchmarks.paper.character.skeleton import INDEX, JOINTS, PARENTS, rest_positions
 from benchmarks.paper.character.skin_weights import SkinWeights, skin_weights
 from drgs.convert.import_mesh import import_mesh
-from drgs.deform.skeleton import pose_rig
+from drgs.deform.rig.skeleton import pose_rig
 from drgs.exchange.gltf_rig import read_gltf_rig
 from drgs.exchange.rig import Rig
 

@@ -8,9 +8,9 @@ import torch
 import trimesh
 
 from benchmarks.paper.laws import FPS, HELD, LAWS, MOMENTS, SIDE, Clips, against_balls, balls, film_pictures, picture_at
-from drgs.deform.simulate import Simulation
+from drgs.deform.matter.simulate import Simulation
 from drgs.scene.asset import Asset
-from tests.deform.test_show_grains import looking_down
+from tests.deform.matter.test_show_grains import looking_down
 from tests.render.closed_form_scenes import constant_sky, sphere_mesh
 
 

@@ -21,7 +21,7 @@ from benchmarks.paper.variants.mani_gs import drive_in_frames, frame_lengths
 from benchmarks.paper.variants.ours import OursVariant
 from benchmarks.paper.variants.physgaussian import drive_particles
 from benchmarks.paper.variants.sugar import drive_with_faces
-from drgs.deform.gmls import polar_rotation
+from drgs.deform.carry.gmls import polar_rotation
 from drgs.maths.constants import MIN_ALPHA
 from drgs.maths.spherical_harmonics import rotate_sh, sh_basis
 from drgs.reconstruct.geometry.face_surfels import surfels_on_faces_of

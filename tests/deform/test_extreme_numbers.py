@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
+from drgs.deform.matter.simulation_scene import make_material, parse_simulation_scene
 from drgs.deform.pose_scene import pose_scene
-from drgs.deform.simulation_scene import make_material, parse_simulation_scene
 from drgs.scene.edits import parse_edits
 from tests.deform.test_pose_scene import plate_asset
 

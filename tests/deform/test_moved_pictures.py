@@ -12,9 +12,9 @@ from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.scene.camera import camera_from_opengl
 from drgs.scene.environment import Environment
-from tests.deform.test_hold_handles import handles
+from tests.deform.displace.test_hold_handles import handles
+from tests.deform.matter.test_simulate import ball_asset
 from tests.deform.test_pose_scene import plate_asset, pose
-from tests.deform.test_simulate import ball_asset
 
 DEGREES = 40.0
 TURN = rotation_from_quat_wxyz(torch.tensor([math.cos(math.radians(DEGREES / 2)), 0, 0, math.sin(math.radians(DEGREES / 2))]))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from drgs.deform import pose_scene as pose_module
-from drgs.deform.maps import evaluate_map
+from drgs.deform.displace.maps import evaluate_map
 from drgs.deform.pose_scene import pose_scene
 from drgs.exchange.exr import encode_environment
 from drgs.maths.frames import rotation_from_quat_wxyz

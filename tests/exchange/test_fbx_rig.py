@@ -3,12 +3,12 @@ import pytest
 import torch
 
 from drgs.deform.pose_scene import pose_scene
-from drgs.deform.skeleton import pose_rig
+from drgs.deform.rig.skeleton import pose_rig
 from drgs.exchange import fbx_rig
 from drgs.exchange.fbx_rig import read_fbx_rig
 from drgs.exchange.gltf_rig import read_gltf_rig
 from drgs.scene.edits import parse_edits
-from tests.deform.test_proxy import column_asset
+from tests.deform.rig.test_proxy import column_asset
 from tests.exchange.write_fbx import STEP, FbxWriter, two_bones_in_fbx
 from tests.exchange.write_rig import two_bones
 

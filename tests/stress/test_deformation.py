@@ -6,7 +6,7 @@ import torch
 from benchmarks import _matter_sweeps as sweeps
 from benchmarks import stability_deformation
 from benchmarks._matter_sweeps import Row
-from drgs.deform.mpm import LAWS
+from drgs.deform.matter.mpm import LAWS
 
 
 def assert_contained(rows: list[Row]) -> None:

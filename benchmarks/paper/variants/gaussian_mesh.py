@@ -14,8 +14,8 @@ from benchmarks.paper.fields import Field
 from benchmarks.paper.harmonics import bake_harmonics, even_colors, gathered, harmonic_colors, missing_light
 from benchmarks.paper.splats import Splats, moved_splats, resting
 from benchmarks.paper.variant import Bound, FaceAnchors, SplatVariant, Subject, baked
-from drgs.deform.drive_mesh import vertex_gradients
-from drgs.deform.gmls import polar_rotation
+from drgs.deform.carry.drive_mesh import vertex_gradients
+from drgs.deform.carry.gmls import polar_rotation
 from drgs.reconstruct.geometry.bind_gaussians import foot_and_normal
 from drgs.reconstruct.geometry.face_surfels import WIDTH
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels

@@ -13,10 +13,10 @@ from torch import Tensor
 from benchmarks.paper.fields import Field, at_rest
 from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant, Draw, Subject
-from drgs.deform.carry_gaussians import carry_normals, carry_tangents
-from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
-from drgs.deform.fill_particles import FillSettings, fill_particles
-from drgs.deform.gmls import GmlsSettings, build_weights, interpolate
+from drgs.deform.carry.carry_gaussians import carry_normals, carry_tangents
+from drgs.deform.carry.drive_mesh import drive_surfels, vertex_gradients
+from drgs.deform.carry.gmls import GmlsSettings, build_weights, interpolate
+from drgs.deform.matter.fill_particles import FillSettings, fill_particles
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.render_frame import render_frame
 from drgs.scene.camera import Camera

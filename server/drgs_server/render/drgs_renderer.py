@@ -84,7 +84,10 @@ class DrgsRenderer(AbstractRenderer):
         self._light.forget_unused()
 
     def prepare(self) -> None:
-        from drgs.deform import hold_handles, pose_scene, rig_clip, simulate  # noqa: F401 -- the first drag shall not wait for them
+        from drgs.deform import pose_scene  # noqa: F401 -- the first drag shall not wait for it and these
+        from drgs.deform.displace import hold_handles  # noqa: F401
+        from drgs.deform.matter import simulate  # noqa: F401
+        from drgs.deform.rig import rig_clip  # noqa: F401
         from drgs.render import render_frame  # noqa: F401
         from drgs.scene import asset  # noqa: F401
 

@@ -181,7 +181,7 @@ def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
         kept |= {name: built.parameters[name] for name in ("up", "box", "strokes") if name in built.parameters}
         row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed} | kept
     elif isinstance(asked, SimulateRequest):
-        from drgs.deform.simulation_scene import parse_simulation_scene
+        from drgs.deform.matter.simulation_scene import parse_simulation_scene
 
         try:
             parse_simulation_scene(asked.scene)

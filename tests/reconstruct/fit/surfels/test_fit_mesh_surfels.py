@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from drgs.deform.drive_mesh import drive_surfels, vertex_gradients
+from drgs.deform.carry.drive_mesh import drive_surfels, vertex_gradients
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.checkpoints import fit_tensors, restore_fit

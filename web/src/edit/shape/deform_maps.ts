@@ -1,4 +1,4 @@
-/** Where deform edits move points: the twin of drgs/deform/maps.py, for the local picture and for sliders. */
+/** Where deform edits move points: the twin of drgs/deform/displace/maps.py, for the local picture and for sliders. */
 
 import type { BendMap, Edit, LatticeMap, StretchMap, TwistMap } from '../../session/protocol.gen';
 import type { Vec3 } from '../../session/view';

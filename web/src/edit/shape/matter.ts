@@ -12,7 +12,7 @@ import { bounds } from '../mesh';
 
 export const MATTERS = ['jelly', 'rubber', 'clay', 'sand', 'snow', 'honey'] as const;
 export type Matter = (typeof MATTERS)[number];
-/** Density [t/m³] and Poisson's ratio of each (drgs/deform/simulation_scene.py). A fluid has neither ratio nor stiffness. */
+/** Density [t/m³] and Poisson's ratio of each (drgs/deform/matter/simulation_scene.py). A fluid has neither ratio nor stiffness. */
 const MATTER_VALUES: Record<Matter, { density: number; poisson: number | null }> = {
   jelly: { density: 1, poisson: 0.3 },
   rubber: { density: 1.1, poisson: 0.4 },
@@ -28,7 +28,7 @@ export const FPS = 24;
 const DROP_HEIGHT = 0.5;
 const SECONDS = 1.5;
 
-/** As drgs/deform/simulation_scene.py has it; what the panel does not show of it stays as it is. */
+/** As drgs/deform/matter/simulation_scene.py has it; what the panel does not show of it stays as it is. */
 interface Scene {
   matter: { preset?: string; young_modulus?: number; density?: number; poisson_ratio?: number };
   floor: { height?: number | null; friction?: number } | null;

@@ -28,8 +28,8 @@ class SimulateRun(AbstractJobRun):
         retry_while_unavailable(lambda: share_artifact(job.directory, "clips", job.job_id, out), job.should_stop)
 
     def _simulate(self, out: Path) -> None:
-        from drgs.deform.simulate import simulate
-        from drgs.deform.simulation_scene import parse_simulation_scene
+        from drgs.deform.matter.simulate import simulate
+        from drgs.deform.matter.simulation_scene import parse_simulation_scene
         from drgs.scene.asset import load_asset
         from drgs.warp_torch import device_from_name
 
