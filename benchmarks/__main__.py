@@ -7,10 +7,12 @@ from pathlib import Path
 from drgs.openmp import spin_briefly
 
 HERE = Path(__file__).parent
-MODULES = {path.stem: path.stem for path in HERE.glob("*.py") if not path.stem.startswith("_")}
+FOLDERS = ("reconstruct", "deform", "render", "convert", "serve")
+"""Each file in them is a benchmark with a `main(arguments)`, but for those whose names begin with _."""
+MODULES = {path.stem: f"{folder}.{path.stem}" for folder in FOLDERS for path in (HERE / folder).glob("[!_]*.py")}
 MODULES |= {path.parent.name: f"{path.parent.name}.command" for path in HERE.glob("*/command.py")}
+"""And so is each folder whose command.py has one."""
 NAMES = tuple(sorted(MODULES))
-"""Each file here is a benchmark with a `main(arguments)`, and each folder whose command.py has one."""
 
 
 def main(arguments: list[str]) -> None:

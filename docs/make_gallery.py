@@ -125,7 +125,7 @@ def first_view(asset: Asset, side: int) -> Camera:
 
 
 def beside_three(folder: Path) -> Image.Image:
-    """Our picture and three.js' of one light, over white, of rows that benchmarks/gltf.py wrote."""
+    """Our picture and three.js' of one light, over white, of rows that benchmarks/convert/gltf.py wrote."""
     rows = []
     for light in ("overcast", "studio"):
         row = Image.open(folder / f"{light}-0.png").convert("RGBA")

@@ -116,11 +116,11 @@ def module_name(path: str) -> str:
     return dotted_name(path).removesuffix(".__init__")
 
 
-MODULES = {module_name(name): name for name in PRODUCT}
+MODULES = {module_name(name): name for name in PYTHON if name in PRODUCT or name.startswith("benchmarks/")}
 
 
 def imported_modules(module: str) -> set[str]:
-    """Modules of the product that this one imports, inside functions and for type checkers too.
+    """Modules of the product and of the benchmarks that this one imports, inside functions and for type checkers too.
 
     A module that names its neighbour runs their package's `__init__` as well; that is how packages work, and not counted.
     """
@@ -165,7 +165,7 @@ def parts_graph(package: str) -> dict[str, set[str]]:
     return graph
 
 
-@pytest.mark.parametrize("package", ["drgs.deform", "drgs.render"])
+@pytest.mark.parametrize("package", ["drgs.deform", "drgs.render", "benchmarks"])
 def test_the_parts_of_a_package_import_each_other_in_no_circle(package: str):
     assert [sorted(cycle) for cycle in cycles(parts_graph(package))] == []
 

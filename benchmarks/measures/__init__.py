@@ -1,1 +1,1 @@
-"""What `quality` and `ablate` measure, one figure or family of figures a file; none of them knows how an asset was made."""
+"""What `quality`, `ablate` and their like measure, one figure or family of figures a file; none of them knows how an asset was made."""

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from benchmarks.measures.bench_scene import Array, TrueMaps
+from benchmarks.scenes.bench_scene import Array, TrueMaps
 from drgs.evaluate.metrics import on_white
 from drgs.maths.color import linear_from_srgb, luminance
 from drgs.reconstruct.capture.visual_hull import VisualHull

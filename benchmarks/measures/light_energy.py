@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from benchmarks.measures.bench_scene import Array
+from benchmarks.scenes.bench_scene import Array
 from drgs.maths.color import luminance, srgb_from_linear
 from drgs.scene.environment import Environment
 

@@ -12,7 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measures.bench_scene import (
+from benchmarks.measures.error_regions import TestView, region_figures
+from benchmarks.measures.light_energy import light_figures
+from benchmarks.measures.mesh_accuracy import COUNT, mesh_figures
+from benchmarks.measures.outline_distance import mesh_coverages, outline_figures, surfel_coverages
+from benchmarks.measures.swap_parts import Subject, swap_rows
+from benchmarks.scenes.bench_scene import (
     BenchScene,
     has_true_maps,
     has_true_materials,
@@ -23,11 +28,6 @@ from benchmarks.measures.bench_scene import (
     read_true_mesh,
     training_cameras,
 )
-from benchmarks.measures.error_regions import TestView, region_figures
-from benchmarks.measures.light_energy import light_figures
-from benchmarks.measures.mesh_accuracy import COUNT, mesh_figures
-from benchmarks.measures.outline_distance import mesh_coverages, outline_figures, surfel_coverages
-from benchmarks.measures.swap_parts import Subject, swap_rows
 from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.evaluate_asset import EvaluationSettings, evaluate_asset
 from drgs.evaluate.metrics import picture_figures

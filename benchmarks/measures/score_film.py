@@ -28,10 +28,10 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from benchmarks.measures.bench_scene import read_rgba
-from benchmarks.measures.draw_film import read_film_cameras
 from benchmarks.measures.mesh_accuracy import DENSE, SurfaceSamples, count_cameras, mesh_radius, sample_surface
 from benchmarks.measures.outline_distance import mesh_coverages
+from benchmarks.scenes.bench_scene import read_rgba
+from benchmarks.scenes.draw_film import read_film_cameras
 from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.metrics import on_white, psnr
 from drgs.maths.constants import STILL_BOUNCES

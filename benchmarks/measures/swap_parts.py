@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from benchmarks.measures.bench_scene import Array
 from benchmarks.measures.mesh_accuracy import SurfaceSamples, sample_surface
+from benchmarks.scenes.bench_scene import Array
 from drgs.evaluate.metrics import picture_figures
 from drgs.maths.color import srgb_from_linear
 from drgs.render.film.resolve_frame import linear_picture

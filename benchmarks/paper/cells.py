@@ -15,7 +15,7 @@ from pathlib import Path
 import safetensors.torch
 from torch import Tensor
 
-from benchmarks.ablate import commit
+from benchmarks.reconstruct.ablate import commit
 
 
 class NotMade(Exception):

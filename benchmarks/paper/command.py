@@ -17,8 +17,7 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from benchmarks.measures.bench_scene import open_scene
-from benchmarks.measures.build_process import built_asset, cli_command
+from benchmarks.builds.build_process import built_asset, cli_command
 from benchmarks.measures.lpips import read_lpips
 from benchmarks.paper.cells import CellFolder, NotMade
 from benchmarks.paper.character.photograph import NAME, CaptureSettings, photograph
@@ -29,6 +28,7 @@ from benchmarks.paper.perceptual import with_lpips
 from benchmarks.paper.tables import EvidenceSettings, SceneEvidence, bound_tensors, deformed_cell, static_cell
 from benchmarks.paper.variant import AbstractVariant
 from benchmarks.paper.variants import VARIANTS
+from benchmarks.scenes.bench_scene import open_scene
 from drgs.reconstruct.presets import PRESETS
 
 PARTS = ("static", "deformed", "figures")
@@ -53,7 +53,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--budget", type=int, help="Gaussians of ways that put them on faces of their own")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of builds")
     parser.add_argument(
-        "--mitsuba", action="store_true", help="the character's photographs and its true dance by Mitsuba (benchmarks/_mitsuba.py)"
+        "--mitsuba", action="store_true", help="the character's photographs and its true dance by Mitsuba (benchmarks/render/_mitsuba.py)"
     )
     parser.add_argument("--finished", action="store_true", help="build and draw nothing: write the pages of what is finished")
     parser.add_argument(

@@ -17,16 +17,16 @@ import igl
 import numpy as np
 import torch
 
-from benchmarks._mitsuba import mitsuba_picture
 from benchmarks._plot import Curve, linear_svg
-from benchmarks.draw_scene import BOUNCES, Renderer
-from benchmarks.measures.bench_scene import read_light, read_rgba
 from benchmarks.paper.cells import write_whole
 from benchmarks.paper.films import FPS, write_film
 from benchmarks.paper.sheets import Array, film_picture, object_window, sheet
 from benchmarks.paper.tables import SceneEvidence, write_picture
 from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant
+from benchmarks.reconstruct.draw_scene import BOUNCES, Renderer
+from benchmarks.render._mitsuba import mitsuba_picture
+from benchmarks.scenes.bench_scene import read_light, read_rgba
 from drgs.convert.import_mesh import import_mesh
 from drgs.deform.pose_scene import pose_scene
 from drgs.deform.rig.rig_clip import find_animation

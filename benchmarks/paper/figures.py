@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.measures.bench_scene import has_true_maps, read_light, read_rgba, read_true_maps
 from benchmarks.measures.peak_memory import measured
 from benchmarks.paper.cells import NotMade
 from benchmarks.paper.danced_ways import dance_ways
@@ -28,6 +27,7 @@ from benchmarks.paper.tables import SceneEvidence
 from benchmarks.paper.traced import traced_settings
 from benchmarks.paper.variant import AbstractVariant
 from benchmarks.paper.wires import with_wires
+from benchmarks.scenes.bench_scene import has_true_maps, read_light, read_rgba, read_true_maps
 from drgs.deform.matter.simulation_scene import make_material, parse_simulation_scene
 from drgs.deform.pose_scene import pose_scene
 from drgs.evaluate.metrics import normal_error_degrees, on_white, psnr

@@ -11,11 +11,11 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.measures.bench_scene import read_rgba
 from benchmarks.measures.lpips import LpipsNetwork, lpips
 from benchmarks.paper.cells import NotMade
 from benchmarks.paper.tables import SceneEvidence, drawn_cameras
 from benchmarks.paper.variant import AbstractVariant
+from benchmarks.scenes.bench_scene import read_rgba
 from drgs.evaluate.metrics import light_scale, on_white, psnr, scale_light
 
 SAME_PSNR = 1e-6

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.binding import VARIANTS, figures_of_fit, picture_of_fit, tables_of_fit
-from benchmarks.measures.bench_scene import read_rgba
+from benchmarks.deform.binding import VARIANTS, figures_of_fit, picture_of_fit, tables_of_fit
 from benchmarks.paper.sheets import object_window, sheet
 from benchmarks.paper.tables import SceneEvidence
 from benchmarks.paper.variant import AbstractVariant
 from benchmarks.paper.wires import with_wires
+from benchmarks.scenes.bench_scene import read_rgba
 from drgs.evaluate.metrics import on_white, psnr
 from drgs.reconstruct.checkpoints import read_tensors
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, fit_mesh_surfels, start_mesh_fit, surfels_on_faces

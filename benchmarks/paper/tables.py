@@ -16,13 +16,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.measures.bench_scene import BenchScene, read_light, read_rgba
 from benchmarks.measures.lpips import LpipsNetwork
 from benchmarks.measures.peak_memory import measured
 from benchmarks.paper.cells import CellFolder, write_tensors
 from benchmarks.paper.fields import at_rest, field_of_map
 from benchmarks.paper.harmonics import BakeSettings
 from benchmarks.paper.variant import AbstractVariant, Draw, Subject
+from benchmarks.scenes.bench_scene import BenchScene, read_light, read_rgba
 from drgs.evaluate.metrics import picture_figures, truth_folders
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.scene.asset import load_asset

@@ -50,12 +50,12 @@ COPIED_IN_RENDER = {0.03: "MIN_ROUGHNESS", 1e-4: "MIN_TRANSMITTANCE"}
 SOUGHT = COPIED.keys() | COPIED_IN_RENDER.keys()
 OTHERS = {
     ("benchmarks/_plot.py", 0.04): "the margin of a plot's axes",
-    ("benchmarks/abuse.py", 0.99): "a percentile",
-    ("benchmarks/measures/embossed_urn.py", 0.04): "half the width of a band of beads",
+    ("benchmarks/serve/abuse.py", 0.99): "a percentile",
+    ("benchmarks/scenes/embossed_urn.py", 0.04): "half the width of a band of beads",
     ("benchmarks/paper/character/body.py", 0.04): "radii of a character's parts",
     ("benchmarks/paper/character/skeleton.py", 0.04): "places of a character's joints",
-    ("benchmarks/service.py", 0.99): "a percentile",
-    ("benchmarks/trials/uploads.py", 1e30): "a place far away",
+    ("benchmarks/serve/service.py", 0.99): "a percentile",
+    ("benchmarks/serve/trials/uploads.py", 1e30): "a place far away",
     ("drgs/deform/matter/mpm/conditions.py", 1e30): "the end of conditions that never end [s]",
     ("drgs/deform/matter/mpm/records.py", 1e30): "the yield stress of matter that never yields [Pa]",
     ("drgs/exchange/gltf_accessors.py", 1e30): "a bound on the numbers of a file",

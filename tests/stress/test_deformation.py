@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from benchmarks import _matter_sweeps as sweeps
-from benchmarks import stability_deformation
-from benchmarks._matter_sweeps import Row
+from benchmarks.deform import _matter_sweeps as sweeps
+from benchmarks.deform import stability_deformation
+from benchmarks.deform._matter_sweeps import Row
 from drgs.deform.matter.mpm import LAWS
 
 

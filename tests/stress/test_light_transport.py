@@ -5,10 +5,11 @@ import re
 import pytest
 import torch
 
-from benchmarks import _light_sweeps as sweeps
-from benchmarks import stability, stability_deformation
-from benchmarks._light_sweeps import Row
 from benchmarks._stability_page import PAGE, rewritten
+from benchmarks.deform import stability_deformation
+from benchmarks.render import _light_sweeps as sweeps
+from benchmarks.render import stability
+from benchmarks.render._light_sweeps import Row
 from drgs.render.integrate.environment_table import MAX_RADIANCE, build_environment_table
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.records import SampleCounts

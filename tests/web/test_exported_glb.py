@@ -15,7 +15,7 @@ from numpy import ndarray
 from PIL import Image
 from playwright.sync_api import Browser
 
-from benchmarks.measures.three_picture import SeenByThree, ThreePage
+from benchmarks.convert._three_picture import SeenByThree, ThreePage
 from drgs.convert.bake_edits import bake_edits
 from drgs.convert.export_asset import export_asset
 from drgs.deform.pose_scene import pose_scene

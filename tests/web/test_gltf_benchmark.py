@@ -7,8 +7,8 @@ import torch
 from PIL import Image
 from playwright.sync_api import Browser
 
-from benchmarks.gltf import LIGHTS, measure
-from benchmarks.measures.shade_open import shade_open
+from benchmarks.convert._shade_open import shade_open
+from benchmarks.convert.gltf import LIGHTS, measure
 from drgs.convert.import_mesh import import_mesh
 from drgs.deform.pose_scene import pose_scene
 from drgs.scene.asset import Asset

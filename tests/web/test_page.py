@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
-from benchmarks.page import camera_of
+from benchmarks.convert.page import camera_of
 from drgs.convert.export_asset import export_asset
 from drgs.convert.import_mesh import import_mesh
 from drgs.deform.pose_scene import pose_scene

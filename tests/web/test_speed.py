@@ -6,7 +6,7 @@ nothing but a ball; the renderer without server and browser), since the machines
 
 import pytest
 
-from benchmarks.viewer import bundle_bytes, measure_bare_local, measure_bare_traced, measure_edits_and_local, measure_traced, started
+from benchmarks.serve.viewer import bundle_bytes, measure_bare_local, measure_bare_traced, measure_edits_and_local, measure_traced, started
 
 ATTEMPTS = 3
 """Of a measurement on a machine that others may use too: one that keeps a promise shows that the code does."""

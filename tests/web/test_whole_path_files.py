@@ -21,7 +21,7 @@ from numpy import ndarray
 from playwright.sync_api import Browser
 from scipy.spatial import cKDTree
 
-from benchmarks.measures.three_picture import SeenByThree, ThreePage
+from benchmarks.convert._three_picture import SeenByThree, ThreePage
 from blender.build import build_extension
 from drgs.convert import bake_transfer
 from drgs.convert.bake_edits import bake_edits

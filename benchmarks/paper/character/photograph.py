@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.draw_scene import Drawing, Renderer, draw_scene
 from benchmarks.paper.character.rigged_glb import CELL, CLIP, write_character
+from benchmarks.reconstruct.draw_scene import Drawing, Renderer, draw_scene
 from drgs.convert.import_mesh import import_mesh
 
 NAME = "character"

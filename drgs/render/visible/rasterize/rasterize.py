@@ -38,7 +38,7 @@ FILTER_SIGMA = 0.3
 """[pixels] of the low-pass. Near outlines surfels stand edge-on and are drawn at least so wide, and the fit pulls the surface inwards until that
 matches the masks: narrower than published, the surface lies half as far inside (docs/decisions/0003-fitting.md)."""
 PUBLISHED_FILTER_SIGMA = 0.5**0.5
-"""[pixels] of Huang et al. 2024; what benchmarks/rasterize.py measures with."""
+"""[pixels] of Huang et al. 2024; what benchmarks/render/rasterize.py measures with."""
 
 
 @dataclass(frozen=True)

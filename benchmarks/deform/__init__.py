@@ -1,0 +1,1 @@
+"""What moves an object: time, error, and where its limits are."""
