@@ -100,7 +100,11 @@ class Subject:
 
     def _mesh(self, recipe: Recipe, shape: Source, normals: Source) -> TriangleMesh:
         parts = {name: self.attributes(shape, getattr(recipe, name))[name] for name in MATERIALS}
-        return replace(self.meshes[shape], normals=self.attributes(shape, normals)["normals"], **parts)
+        mesh = self.meshes[shape]
+        # What lies between the vertices is of their own albedo.
+        detail = mesh.detail if recipe.albedo == shape else None
+        normals_of = self.attributes(shape, normals)["normals"]
+        return TriangleMesh(mesh.vertices, mesh.faces, normals_of, parts["albedo"], parts["roughness"], parts["metallic"], detail=detail)
 
 
 def transfer_attributes(source: TriangleMesh, target: TriangleMesh) -> dict[str, Tensor]:

@@ -103,7 +103,7 @@ def read_true_mesh(scene: BenchScene) -> TriangleMesh:
         return mesh
     with np.load(scene.folder / "gt_materials.npz", allow_pickle=False) as stored:
         materials = {name: torch.from_numpy(stored[name].astype(np.float32)) for name in ("albedo", "roughness", "metallic")}
-    return replace(mesh, **materials)
+    return replace(mesh, albedo=materials["albedo"], roughness=materials["roughness"], metallic=materials["metallic"])
 
 
 def read_light(scene: BenchScene, name: str) -> Environment:

@@ -1,7 +1,8 @@
 """Textures of an exported mesh: materials, occlusion and, where faces were left out, the normals of the mesh that they were left out of.
 
 In: a mesh with materials at its vertices. Out: the mesh to be exported, its atlas, and pictures as bytes. A mesh with too many faces for charts is
-shrunk, and each texel looks from the small surface to the large one: materials, normals and occlusion are those of the point it meets.
+shrunk, and each texel looks from the small surface to the large one: materials, normals and occlusion are those of the point it meets. So it is done, too,
+where albedo is finer than vertices.
 
 Occlusion is how bright a white sky that is brighter above than below, as most are, would make a place, with the light that the object throws onto itself,
 as a share of its brightness in the open. Without that light, as the word is often meant, white hollows would come out far too dark where programs multiply by it what an environment
@@ -26,12 +27,17 @@ from drgs.exchange.texture_atlas import TEXELS_PER_FACE, Atlas, paint, unwrap
 from drgs.maths.color import srgb_from_linear
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.albedo_detail import detailed_albedo
 from drgs.scene.mesh import TriangleMesh
 
 TEXELS_PER_VERTEX = 16
 """Of the large mesh: four from one to the next along either side."""
 LEAST_CORNERS = 5_000
 """Coarser meshes are divided before their occlusion is traced at vertices."""
+TEXELS_PER_SAMPLE = 2
+"""Of a detail between the vertices, of which there are parts^2 for each."""
+MOST_TEXELS = 1 << 24
+"""That a detail may want."""
 REACH = 0.01
 """How far the large surface is looked for from the small one, as a share of the mesh's extent."""
 TEXELS_AT_ONCE = 1 << 16
@@ -70,7 +76,7 @@ def bake_textures(mesh: TriangleMesh, most_faces: int = DEFAULT_FACES, variants:
         variants: the same mesh in other materials.
     """
     small = shrink_mesh(mesh, most_faces)
-    if small is mesh:
+    if small is mesh and mesh.detail is None:
         atlas = unwrap(_array(mesh.vertices), _array(mesh.faces))
 
         def picture_at_corners(of: TriangleMesh) -> UInt8[ndarray, "height width 6"]:
@@ -80,7 +86,9 @@ def bake_textures(mesh: TriangleMesh, most_faces: int = DEFAULT_FACES, variants:
 
         picture, *others = (picture_at_corners(of) for of in (mesh, *variants))
         return TexturedMesh(mesh, atlas, picture[..., :3], picture[..., 3:], None, None, _parts(others))
-    texels = max(TEXELS_PER_FACE, TEXELS_PER_VERTEX * len(mesh.vertices) // len(small.faces))
+    parts = 1 if mesh.detail is None else mesh.detail.parts
+    wanted = max(TEXELS_PER_VERTEX, TEXELS_PER_SAMPLE * parts**2) * len(mesh.vertices)
+    texels = max(TEXELS_PER_FACE, min(wanted, MOST_TEXELS) // len(small.faces))
     atlas = unwrap(_array(small.vertices), _array(small.faces), texels)
     tangents = atlas_tangents(atlas, small)
     corners = torch.from_numpy(atlas.vertex_of)
@@ -137,7 +145,9 @@ class _LargeSurface:
         given = torch.from_numpy(np.ascontiguousarray(places))
         normals = torch.nn.functional.normalize(given[:, 3:6], dim=-1)
         face, weights = self._meet(given[:, :3].contiguous(), normals)
-        values = (self._values[self._mesh.faces.long()[face]] * weights[..., None]).sum(1)
+        mesh = self._mesh
+        values = (self._values[mesh.faces.long()[face]] * weights[..., None]).sum(1)
+        values[:, :3] = detailed_albedo(values[:, :3], mesh.detail, mesh.faces, face, weights[:, 1:])
         tangents = torch.nn.functional.normalize(given[:, 6:9], dim=-1)
         up = torch.linalg.cross(normals, tangents) * given[:, 9:].sign()
         frame = torch.stack([tangents, torch.nn.functional.normalize(up, dim=-1), normals], -1)

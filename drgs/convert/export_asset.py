@@ -174,7 +174,7 @@ def _with_usd_colors(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _usd_scene(asset: Asset, textured: TexturedMesh) -> UsdScene:
-    mesh = {key: _array(values) for key, values in vars(textured.mesh).items()}
+    mesh = {key: _array(values) for key, values in textured.mesh.columns.items()}
     mesh["normals"] = _array(torch.nn.functional.normalize(textured.mesh.normals, dim=-1))
     textures = {BASE_COLOR: encode_png(textured.base_color), SURFACE: encode_png(textured.surface)}
     if textured.normal is not None:

@@ -124,7 +124,8 @@ def _mesh_from_parts(parts: list[_Part], name: str) -> TriangleMesh:
             "give such sheets a thickness or keep one side",
             stacklevel=3,
         )
-    mesh = TriangleMesh(vertices, faces, normals, **{key: values.clamp(0, 1) for key, values in materials.items()})
+    albedo, roughness, metallic = (materials[name].clamp(0, 1) for name in ("albedo", "roughness", "metallic"))
+    mesh = TriangleMesh(vertices, faces, normals, albedo, roughness, metallic)
     refuse_unusable(mesh, name)
     return mesh
 

@@ -4,7 +4,6 @@ In and out: a TriangleMesh. Corners at one place are joined first, so that faces
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import fast_simplification
 import numpy as np
@@ -50,7 +49,7 @@ def shrink_worn(worn: Sequence[TriangleMesh], most_faces: int) -> list[TriangleM
         torch.nn.functional.normalize(normals, dim=-1),
         *_channels(means[0]),
     )
-    return [small, *(replace(small, **dict(zip(("albedo", "roughness", "metallic"), _channels(mean), strict=True))) for mean in means[1:])]
+    return [small, *(TriangleMesh(small.vertices, small.faces, small.normals, *_channels(mean)) for mean in means[1:])]
 
 
 def _channels(material: Float[Tensor, "vertex 5"]) -> tuple[Tensor, Tensor, Tensor]:

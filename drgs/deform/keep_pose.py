@@ -68,9 +68,12 @@ def _fits(asset: Asset, parts: dict[str, Tensor]) -> bool:
     """Whether the arrays are this object's, finite, and all there."""
     sizes = {"mesh": len(asset.mesh.vertices), "surfel": 0 if asset.gaussians is None else len(asset.gaussians.centers)}
     tails = {"albedo": (3,), "roughness": (), "metallic": (), "vertices": (3,), "normals": (3,), "centers": (3,), "tangents": (3, 2)}
+    tails |= {"detail_share": ()}
     wanted = {f"mesh.{name}" for name in ("albedo", "roughness", "metallic", "vertices", "normals")}
     wanted |= {f"surfel.{name}" for name in ("albedo", "roughness", "metallic", "centers", "tangents")} if sizes["surfel"] else set()
-    if set(parts) != wanted:
+    # All of a detail is worn where nothing was painted over.
+    optional = set() if asset.mesh.detail is None else {"mesh.detail_share"}
+    if set(parts) - optional != wanted:
         return False
     return all(
         values.shape == (sizes[name.split(".")[0]], *tails[name.split(".")[1]])

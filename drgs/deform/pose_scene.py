@@ -26,6 +26,7 @@ from drgs.deform.clip import ClipFrame, Parted, frame_at, open_clip
 from drgs.deform.displace.maps import check_map, evaluate_map
 from drgs.deform.displace.vertex_sequence import vertices_at
 from drgs.deform.sort_edits import EditFiles, EditSteps, ShapeEdit, SortedEdits, file_names, sort_edits
+from drgs.scene.albedo_detail import worn_by
 from drgs.scene.asset import Asset
 from drgs.scene.edits import DeformEdit, Edit, MaterialEdit, PoseEdit, SimulateEdit, split_rig_clip
 from drgs.scene.environment import Environment
@@ -69,16 +70,16 @@ def pose_scene(
     files = EditFiles(base_directory, confine)
     by_kind = sort_edits(asset, edits, files)
 
-    vertex_materials, surfel_materials = _materials_after(asset, by_kind.material, files, go_on)
+    worn = _materials_after(asset, by_kind.material, files, go_on)
     shape = _shape_after(asset, by_kind.shape, files, go_on)
 
     mesh, surfels = asset.mesh, None
     if by_kind.material.count:
-        mesh = replace(mesh, albedo=vertex_materials.albedo, roughness=vertex_materials.roughness, metallic=vertex_materials.metallic)
+        mesh = replace(mesh, **vars(worn.of_vertices), detail=worn_by(mesh.detail, worn.detail_share))
     if by_kind.shape.count:
         mesh = replace(mesh, vertices=shape.vertices, normals=shape.normals)
-    if surfel_materials is not None and shape.centers is not None and shape.tangents is not None:
-        surfels = PosedSurfels(shape.centers, shape.tangents, _rest(asset).opacities, surfel_materials)
+    if worn.of_surfels is not None and shape.centers is not None and shape.tangents is not None:
+        surfels = PosedSurfels(shape.centers, shape.tangents, _rest(asset).opacities, worn.of_surfels)
     environment, light = asset.environment, by_kind.light
     for name in light.files:
         environment = _environment(asset, name, files, environments)
@@ -121,7 +122,7 @@ PoseParts = dict[str, Tensor]
 
 def known_parts(asset: Asset, by_kind: SortedEdits) -> PoseParts | None:
     """What these edits have made of the asset, where it is still remembered and hangs together."""
-    materials: tuple[Materials, Materials | None] | None = _materials_at_rest(asset)
+    materials: _Worn | None = _materials_at_rest(asset)
     shape: _Shape | None = _shape_at_rest(asset)
     with _lock:
         kept = _memory.get(asset, OrderedDict())
@@ -131,15 +132,15 @@ def known_parts(asset: Asset, by_kind: SortedEdits) -> PoseParts | None:
             shape = kept.get(_key("shape", by_kind.shape))
     if materials is None or shape is None or shape.parted is not None:
         return None
-    of_mesh, of_surfels = materials
-    parts = {f"mesh.{name}": values for name, values in vars(of_mesh).items()} | {
+    of_surfels = materials.of_surfels
+    parts = {f"mesh.{name}": values for name, values in vars(materials.of_vertices).items()} | {
         "mesh.vertices": shape.vertices,
         "mesh.normals": shape.normals,
     }
     if of_surfels is not None:
         parts |= {f"surfel.{name}": values for name, values in vars(of_surfels).items()}
         parts |= {"surfel.centers": shape.centers, "surfel.tangents": shape.tangents}
-    return parts
+    return parts if materials.detail_share is None else parts | {"mesh.detail_share": materials.detail_share}
 
 
 def remember_parts(asset: Asset, counts: dict[str, int], by_kind: SortedEdits, parts: PoseParts) -> None:
@@ -153,10 +154,10 @@ def remember_parts(asset: Asset, counts: dict[str, int], by_kind: SortedEdits, p
         return Materials(parts[f"{of}.albedo"], parts[f"{of}.roughness"], parts[f"{of}.metallic"])
 
     shape = _Shape(parts["mesh.vertices"], parts["mesh.normals"], parts.get("surfel.centers"), parts.get("surfel.tangents"))
-    both = materials("mesh"), materials("surfel") if "surfel.albedo" in parts else None
+    worn = _Worn(materials("mesh"), materials("surfel") if "surfel.albedo" in parts else None, parts.get("mesh.detail_share"))
     # Of no edits it is the asset's own tensors, by which a renderer sees that nothing has changed.
     if counts["material"]:
-        _remembered(asset, _key("material", by_kind.material, counts["material"]), lambda: both)
+        _remembered(asset, _key("material", by_kind.material, counts["material"]), lambda: worn)
     if counts["shape"]:
         _remembered(asset, _key("shape", by_kind.shape, counts["shape"]), lambda: shape)
 
@@ -186,11 +187,21 @@ def _rest(asset: Asset) -> _Rest:
     return _remembered(asset, ("rest",), lambda: _Rest(surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)))
 
 
-def _materials_at_rest(asset: Asset) -> tuple[Materials, Materials | None]:
-    """Of the mesh's vertices and of the surfels."""
+@dataclass(frozen=True, eq=False)
+class _Worn:
+    """What everything is made of."""
+
+    of_vertices: Materials
+    of_surfels: Materials | None
+    detail_share: Float[Tensor, "vertex"] | None
+    """AlbedoDetail.share of the mesh's."""
+
+
+def _materials_at_rest(asset: Asset) -> _Worn:
     mesh, gaussians = asset.mesh, asset.gaussians
-    of_mesh = Materials(mesh.albedo, mesh.roughness, mesh.metallic)
-    return of_mesh, None if gaussians is None else Materials(gaussians.albedo, gaussians.roughness, gaussians.metallic)
+    of_surfels = None if gaussians is None else Materials(gaussians.albedo, gaussians.roughness, gaussians.metallic)
+    share = None if mesh.detail is None else mesh.detail.share
+    return _Worn(Materials(mesh.albedo, mesh.roughness, mesh.metallic), of_surfels, share)
 
 
 def _shape_at_rest(asset: Asset) -> _Shape:
@@ -199,19 +210,17 @@ def _shape_at_rest(asset: Asset) -> _Shape:
     return _Shape(mesh.vertices, mesh.normals, centers, tangents)
 
 
-def _materials_after(
-    asset: Asset, edits: EditSteps[MaterialEdit], files: EditFiles, go_on: Callable[[], None] | None
-) -> tuple[Materials, Materials | None]:
-    """Materials of the mesh's vertices and of the surfels."""
+def _materials_after(asset: Asset, edits: EditSteps[MaterialEdit], files: EditFiles, go_on: Callable[[], None] | None) -> _Worn:
     mesh, gaussians = asset.mesh, asset.gaussians
 
-    def apply(before: tuple[Materials, Materials | None], index: int) -> tuple[Materials, Materials | None]:
-        edit, (of_vertices, of_surfels) = edits.edit(index), before
+    def apply(before: _Worn, index: int) -> _Worn:
+        edit, of_surfels = edits.edit(index), before.of_surfels
         file = edit.select.weights_file
         weights = select_vertices(mesh, edit.select) if file is None else read_weights(files.path(file), mesh)
         if gaussians is not None and of_surfels is not None:
             of_surfels = _edited(of_surfels, edit, select_surfels(gaussians.centers, mesh, asset.binding, edit.select, weights))
-        return _edited(of_vertices, edit, weights), of_surfels
+        share = None if mesh.detail is None else _detail_left(before.detail_share, edit, weights)
+        return _Worn(_edited(before.of_vertices, edit, weights), of_surfels, share)
 
     return _applied_in_turn(asset, "material", edits, _materials_at_rest(asset), apply, go_on)
 
@@ -233,6 +242,13 @@ def _edited(materials: Materials, edit: MaterialEdit, weights: Float[Tensor, "n"
         changed(materials.roughness, values.roughness),
         changed(materials.metallic, values.metallic),
     )
+
+
+def _detail_left(share: Tensor | None, edit: MaterialEdit, weights: Float[Tensor, "vertex"]) -> Tensor | None:
+    """What is painted over loses its pattern; what is multiplied keeps it."""
+    if edit.set.albedo is None or edit.mode == "multiply":
+        return share
+    return (torch.ones_like(weights) if share is None else share) * (1 - weights)
 
 
 def _shape_after(asset: Asset, edits: EditSteps[ShapeEdit], files: EditFiles, go_on: Callable[[], None] | None) -> _Shape:
@@ -353,7 +369,8 @@ def _text_of_grips(edit: DeformEdit) -> str:
 
 
 def _is_optimised(asset: Asset) -> bool:
-    return any(value.requires_grad for record in (asset.gaussians, asset.mesh) if record is not None for value in vars(record).values())
+    columns = [*vars(asset.gaussians).values()] if asset.gaussians is not None else []
+    return any(value.requires_grad for value in [*columns, *asset.mesh.columns.values()])
 
 
 def _applied_in_turn(

@@ -27,7 +27,8 @@ from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
 from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
 from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
-from drgs.reconstruct.fit.evidence.albedo_detail import RINGS, albedo_detail
+from drgs.reconstruct.fit.evidence.photographs_as_taken import PhotographsAsTaken
+from drgs.reconstruct.fit.evidence.solve_albedo import RINGS, parts_for, solve_albedo
 from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
@@ -201,7 +202,7 @@ def build_stages(
     if place.should_stop():
         raise BuildStopped
 
-    built = _Built(place, views, points, preset, settings, fit, gaussians, mesh, timed)
+    built = _Built(place, found, views, points, preset, settings, fit, gaussians, mesh, timed)
     asset, thumbnail = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
@@ -279,7 +280,9 @@ class _Built:
     """What the stages up to `mesh` gave, and what those after it need."""
 
     place: Workplace
+    capture: Capture
     views: Views
+    """Of it, as the fits see them."""
     points: InitialPoints
     preset: Preset
     settings: BuildSettings
@@ -336,7 +339,7 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         # Meshing anew rounds the box's edges, a little to either side.
         vertices = decoupled.state.parameters["vertices"]
         vertices.data = whole_or_within(built.settings.box, vertices.data)
-        mesh, certainty = _detailed(views, decoupled)
+        mesh, certainty = _detailed(built, decoupled)
         under, environment = decoupled.undivided_mesh, Environment(environment_table(decoupled.state.parameters).detach())
         # Faces moved once more with the materials; surfels stay where they are on them: one on each face of before the division.
         surfels, binding = surfels_on_faces_of(under) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=under))
@@ -384,15 +387,19 @@ def _horizons(mesh: TriangleMesh) -> UInt8[Tensor, "face 8"]:
 
 
 @torch.no_grad()
-def _detailed(views: Views, fit: SurfaceFit) -> tuple[TriangleMesh, Certainty]:
-    """The fitted mesh with the albedo that photographs show at each of its vertices; how certain it is."""
-    mesh, parameters = fit.mesh, fit.state.parameters
+def _detailed(built: _Built, fit: SurfaceFit) -> tuple[TriangleMesh, Certainty]:
+    """The fitted mesh with the albedo that photographs show at each of its vertices, and between them; how certain it is."""
+    views, mesh, parameters = built.views, fit.mesh, fit.state.parameters
     tracer, targets = build_tracer(mesh), view_targets(views, 1.0, mesh.vertices.device)
     sky = None if views.light_from_world is None else seen_sky(tracer)
     light_of = light_of_views(filter_environment(environment_table(parameters)), parameters["open_share"], mesh.albedo, sky)
     certainty = vertex_certainty(tracer, targets, light_of, parameters["metal"])
-    albedo = albedo_detail(tracer, targets, light_of, mesh_edges(mesh.faces), RINGS * 4**fit.divided)
-    return replace(mesh, albedo=albedo), certainty
+    edges, rings = mesh_edges(mesh.faces), RINGS * 4**fit.divided
+    settings = built.preset.detail
+    photographs = PhotographsAsTaken(built.capture, views, targets, settings.side)
+    parts = parts_for(mesh, photographs.cameras, settings)
+    solved = solve_albedo(tracer, targets, photographs.target, light_of, edges, rings, parts)
+    return replace(mesh, albedo=solved.albedo, detail=solved.detail), certainty
 
 
 def _check(settings: BuildSettings) -> None:

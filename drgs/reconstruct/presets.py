@@ -9,6 +9,7 @@ from typing import Literal
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.fit.densify import DensifySettings
+from drgs.reconstruct.fit.evidence.solve_albedo import DetailSettings
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings
@@ -31,6 +32,8 @@ class Preset:
     mesh: MeshSettings
     surface: PassSettings = field(default_factory=PassSettings)
     materials: MeshMaterialSettings = field(default_factory=MeshMaterialSettings)
+    detail: DetailSettings = field(default_factory=DetailSettings)
+    """Of the albedo between vertices."""
     hollows: HollowSettings = field(default_factory=HollowSettings)
     mesh_surfels: MeshFitSettings = field(default_factory=MeshFitSettings)
     """For binding mesh: its fine-tuning."""
@@ -55,6 +58,7 @@ PRESETS = {
             division=DivisionSettings(most_faces=0),
         ),
         MeshMaterialSettings(iterations=80, points_a_step=1024),
+        DetailSettings(most_samples=500_000, side=1024),
         HollowSettings(RadianceGridSettings(levels=())),
         MeshFitSettings(iterations=150),
         surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
@@ -66,6 +70,7 @@ PRESETS = {
         FAST_MESH,
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carve_after=(2,)),
         MeshMaterialSettings(iterations=180),
+        DetailSettings(),
         HollowSettings(),
         MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
@@ -83,6 +88,7 @@ PRESETS = {
             division=DivisionSettings(most_faces=400_000),
         ),
         MeshMaterialSettings(iterations=1200, rounds=3, points_a_step=4096),
+        DetailSettings(most_samples=6_000_000, side=4096),
         HollowSettings(),
         MeshFitSettings(iterations=500),
         surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),

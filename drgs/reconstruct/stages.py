@@ -7,7 +7,7 @@ checkpoint and raises BuildStopped. What the stages compute is in the steps' own
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -234,7 +234,8 @@ def mesh_stage(
         # Those outside still hide what is behind them.
         mesh = mesh_from_gaussians(gaussians, views.cameras, points, settings, box)
         gaussians = gaussians if box is None else chosen_surfels(gaussians, box.holds(gaussians.centers))
-        return {f"{type(record).__name__}.{name}": value for record in (gaussians, mesh) for name, value in vars(record).items()}
+        records = {"Gaussians": vars(gaussians), "TriangleMesh": mesh.columns}
+        return {f"{record}.{name}": value for record, columns in records.items() for name, value in columns.items()}
 
     return _geometry(_kept_or_made(place, MESH, fit.parameters["centers"].device, made))
 
@@ -249,10 +250,10 @@ def read_geometry(path: Path, device: torch.device) -> tuple[Gaussians, Triangle
 
 
 def _geometry(tensors: dict[str, Tensor]) -> tuple[Gaussians, TriangleMesh]:
-    def fields_of(record: type[Gaussians] | type[TriangleMesh]) -> dict[str, Tensor]:
-        return {entry.name: tensors[f"{record.__name__}.{entry.name}"] for entry in fields(record)}
+    def columns_of(record: str) -> dict[str, Any]:
+        return {name.removeprefix(f"{record}."): values for name, values in tensors.items() if name.startswith(f"{record}.")}
 
-    return Gaussians(**fields_of(Gaussians)), TriangleMesh(**fields_of(TriangleMesh))
+    return Gaussians(**columns_of("Gaussians")), TriangleMesh(**columns_of("TriangleMesh"))
 
 
 def surface_stage(

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drgs.scene.albedo_detail import detailed_albedo
 from drgs.scene.mesh import TriangleMesh
 
 
@@ -37,7 +38,7 @@ def surfaces_at(mesh: TriangleMesh, face: Tensor, barycentric: Tensor) -> Surfac
         blend(mesh.vertices),
         unit(normal, dim=-1),
         unit(face_normal, dim=-1),
-        blend(mesh.albedo),
+        detailed_albedo(blend(mesh.albedo), mesh.detail, mesh.faces, face, barycentric),
         blend(mesh.roughness),
         blend(mesh.metallic),
     )
@@ -48,4 +49,4 @@ def mesh_in(dtype: torch.dtype, mesh: TriangleMesh) -> TriangleMesh:
     vertices, normals, albedo, roughness, metallic = (
         values.to(dtype) for values in (mesh.vertices, mesh.normals, mesh.albedo, mesh.roughness, mesh.metallic)
     )
-    return TriangleMesh(vertices, mesh.faces, normals, albedo, roughness, metallic)
+    return TriangleMesh(vertices, mesh.faces, normals, albedo, roughness, metallic, detail=mesh.detail)

@@ -18,6 +18,7 @@ from drgs.exchange.glb import GlbMesh, decode_glb, encode_glb
 from drgs.exchange.package import read_package, write_package
 from drgs.exchange.photographs import PHOTOGRAPHS
 from drgs.maths.frames import rotation_from_quat_wxyz
+from drgs.scene.albedo_detail import MOST_PARTS, AlbedoDetail, parts_of
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, opengl_from_camera
 from drgs.scene.certainty import Certainty
@@ -49,6 +50,7 @@ _FILES = (
     "cameras.json",
     "horizons.safetensors",
     "certainty.safetensors",
+    "detail.safetensors",
 )
 _REQUIRED = ("mesh.glb", "environment.exr", "cameras.json")
 THUMBNAIL = "thumb.jpg"
@@ -108,6 +110,9 @@ def save_asset(asset: Asset, path: Path | str, thumbnail_jpeg: bytes | None = No
         files["horizons.safetensors"] = safetensors.numpy.save({"sine": _array(asset.horizons)})
     if asset.certainty is not None:
         files["certainty.safetensors"] = safetensors.numpy.save(_arrays(asset.certainty))
+    if mesh.detail is not None:
+        share = {} if mesh.detail.share is None else {"share": _array(mesh.detail.share)}
+        files["detail.safetensors"] = safetensors.numpy.save({"codes": _array(mesh.detail.codes)} | share)
     files["environment.exr"] = encode_environment(_array(asset.environment.radiance))
     files["cameras.json"] = json.dumps({"camera_model": "PINHOLE", "frames": [_camera_json(c) for c in asset.cameras]}, indent=1).encode()
     if thumbnail_jpeg is not None:
@@ -146,7 +151,8 @@ def load_asset(path: Path | str, device: torch.device | str = "cpu") -> Asset:
     if missing:
         raise ValueError(f"{path}: mesh.glb lacks the vertex attribute {missing[0]}")
     tensors = {key: torch.from_numpy(glb.attributes[name]).to(device) for key, name in names.items()}
-    mesh = TriangleMesh(faces=torch.from_numpy(glb.faces).to(device), **tensors)
+    detail = _read_detail(files["detail.safetensors"], path, device) if "detail.safetensors" in files else None
+    mesh = TriangleMesh(faces=torch.from_numpy(glb.faces).to(device), **tensors, detail=detail)
     if "binding.safetensors" in files:
         binding = _read_binding(files["binding.safetensors"], path, device)
     horizons = _read_horizons(files["horizons.safetensors"], path, device) if "horizons.safetensors" in files else None
@@ -198,6 +204,8 @@ def _check(asset: Asset, name: str) -> None:
         raise ValueError(f"{name}: the mesh has no faces, or a face names a vertex that does not exist ({vertices} vertices)")
     if any(len(values) != vertices for values in (mesh.normals, mesh.albedo, mesh.roughness, mesh.metallic)):
         raise ValueError(f"{name}: the mesh's vertex attributes differ in length ({vertices} vertices)")
+    if mesh.detail is not None:
+        _check_detail(mesh.detail, len(faces), vertices, name)
     if asset.horizons is not None and asset.horizons.shape != (len(faces), 8):
         raise ValueError(f"{name}: the horizons are of {len(asset.horizons)} faces, there are {len(faces)}")
     for entry in fields(Certainty) if asset.certainty is not None else ():
@@ -219,6 +227,16 @@ def _check(asset: Asset, name: str) -> None:
             raise ValueError(f"{name}: the binding names a face that does not exist ({len(faces)} faces)")
 
 
+def _check_detail(detail: AlbedoDetail, faces: int, vertices: int, name: str) -> None:
+    if len(detail.codes) != faces:
+        raise ValueError(f"{name}: the detail is of {len(detail.codes)} faces, there are {faces}")
+    share = detail.share
+    if share is not None and (len(share) != vertices or not bool(((share >= 0) & (share <= 1)).all())):
+        raise ValueError(
+            f"{name}: the detail's share is of {len(share)} vertices or beyond 0 to 1; expected {vertices} numbers from 0 to 1"
+        )
+
+
 def _read_binding(data: bytes, path: Path, device: torch.device | str) -> Binding:
     try:
         arrays = safetensors.numpy.load(data)
@@ -238,6 +256,25 @@ def _read_horizons(data: bytes, path: Path, device: torch.device | str) -> Tenso
     if sine.dtype != np.uint8 or sine.ndim != 2:
         raise ValueError(f"{path}: horizons.safetensors holds an array of the wrong shape")
     return torch.from_numpy(sine.copy()).to(device)
+
+
+def _read_detail(data: bytes, path: Path, device: torch.device | str) -> AlbedoDetail:
+    try:
+        arrays = safetensors.numpy.load(data)
+        codes, share = arrays["codes"], arrays.get("share")
+    except (safetensors.SafetensorError, KeyError) as error:
+        raise ValueError(f"{path}: detail.safetensors is damaged ({error})") from error
+    right_share = share is None or (share.dtype == np.float32 and share.ndim == 1)
+    if codes.dtype != np.uint8 or codes.ndim != 3 or codes.shape[2] != 3 or not right_share:
+        raise ValueError(f"{path}: detail.safetensors holds arrays of the wrong shape or type")
+    try:
+        parts = parts_of(codes.shape[1])
+    except ValueError as error:
+        raise ValueError(f"{path}: detail.safetensors: {error}") from error
+    if parts > MOST_PARTS:
+        raise ValueError(f"{path}: detail.safetensors cuts each side of a face into {parts} parts; expected at most {MOST_PARTS}")
+    worn = None if share is None else torch.from_numpy(share.copy()).to(device)
+    return AlbedoDetail(torch.from_numpy(codes.copy()).to(device), worn)
 
 
 def _read_certainty(data: bytes, path: Path, device: torch.device | str) -> Certainty:

@@ -1,11 +1,13 @@
 """A triangle mesh whose vertices carry materials."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from drgs.scene.albedo_detail import AlbedoDetail
 from drgs.scene.edits import LARGEST
 
 MOST_BOXES_MET = 5000
@@ -25,11 +27,21 @@ class TriangleMesh:
     """Base colour, linear, 0..1."""
     roughness: Float[Tensor, "vertex"]
     metallic: Float[Tensor, "vertex"]
+    detail: AlbedoDetail | None = field(default=None, kw_only=True)
+    """Of the albedo between the vertices, as fine as photographs show it; None: there is none."""
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """The tensors by name: all but the detail."""
+        return {name: values for name, values in vars(self).items() if name != "detail"}
 
 
 def on_cpu(mesh: TriangleMesh) -> TriangleMesh:
     """The same on the CPU, without gradients."""
-    return TriangleMesh(**{key: values.detach().cpu() for key, values in vars(mesh).items()})
+    detail = mesh.detail
+    if detail is not None:
+        detail = AlbedoDetail(detail.codes.cpu(), None if detail.share is None else detail.share.detach().cpu())
+    return TriangleMesh(**{key: values.detach().cpu() for key, values in mesh.columns.items()}, detail=detail)
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -186,7 +186,7 @@ def colourful_mesh(divisions: int) -> TriangleMesh:
 def with_faces_apart(mesh: TriangleMesh) -> TriangleMesh:
     """No two faces share a corner any more."""
     corners = mesh.faces.reshape(-1).long()
-    values = {name: tensor[corners] for name, tensor in vars(mesh).items() if name != "faces"}
+    values = {name: tensor[corners] for name, tensor in mesh.columns.items() if name != "faces"}
     return TriangleMesh(faces=torch.arange(len(corners), dtype=torch.int32).reshape(-1, 3), **values)
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_pose_scene import material, plate_asset, twist
+from test_pose_scene import detailed_plate, material, plate_asset, twist
 
 from drgs.deform import pose_scene as pose_module
 from drgs.deform.keep_pose import recall_pose, save_pose
@@ -62,3 +62,17 @@ def test_a_damaged_or_missing_file_is_as_good_as_none(kept: Path, damage: bytes)
 def test_what_is_no_longer_remembered_is_not_written(tmp_path: Path) -> None:
     assert not save_pose(plate_asset(), edits(3), tmp_path / "pose.safetensors")
     assert not (tmp_path / "pose.safetensors").exists()
+
+
+def test_what_is_left_of_a_pattern_comes_back_too(tmp_path: Path) -> None:
+    half = {"box": {"minimum": [0, -1, 0], "maximum": [1, 1, 1]}}
+    list_of_edits = parse_edits([material(half, albedo=[0.1, 0.2, 0.3]), twist(0.1)])
+    asset, path = detailed_plate(), tmp_path / "pose.safetensors"
+    whole = pose_scene(asset, list_of_edits)
+    assert save_pose(asset, list_of_edits, path)
+    again = detailed_plate()
+    assert recall_pose(again, list_of_edits, path) == 2
+    found = pose_scene(again, list_of_edits)
+    assert whole.mesh.detail is not None and found.mesh.detail is not None and whole.mesh.detail.share is not None
+    assert 0 < int((whole.mesh.detail.share == 0).sum()) < len(whole.mesh.vertices)
+    assert torch.equal(found.mesh.detail.share, whole.mesh.detail.share)

@@ -1,5 +1,5 @@
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from drgs.deform.displace.maps import evaluate_map
 from drgs.deform.pose_scene import pose_scene
 from drgs.exchange.exr import encode_environment
 from drgs.maths.frames import rotation_from_quat_wxyz
+from drgs.scene.albedo_detail import AlbedoDetail
 from drgs.scene.asset import Asset
 from drgs.scene.binding import Binding
 from drgs.scene.edits import TwistMap, parse_edits
@@ -89,6 +90,28 @@ def test_setting_a_material_everywhere_changes_that_number_and_no_tensor_else():
     for name in ("centers", "tangents", "opacities"):
         assert getattr(after.surfels, name) is getattr(before.surfels, name), name
     assert after.surfels.materials.albedo is asset.gaussians.albedo and after.environment is asset.environment
+
+
+def detailed_plate() -> Asset:
+    plate = plate_asset()
+    codes = torch.randint(256, (len(plate.mesh.faces), 6, 3), generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
+    return replace(plate, mesh=replace(plate.mesh, detail=AlbedoDetail(codes)))
+
+
+def test_what_is_painted_over_loses_its_pattern_and_the_rest_keeps_it():
+    asset = detailed_plate()
+    ball = {"sphere": {"center": [0.4, 0, 0.2], "radius": 0.3, "falloff": 0.2}}
+    weights = select_vertices(asset.mesh, parse_edits([material(ball, albedo=[0.9, 0.1, 0.1])])[0].select)
+    assert bool(((weights > 0) & (weights < 1)).any())
+    painted = pose(asset, material(ball, albedo=[0.9, 0.1, 0.1])).mesh.detail
+    assert painted is not None and painted.codes is asset.mesh.detail.codes
+    torch.testing.assert_close(painted.share, 1 - weights)
+    twice = pose(asset, material(ball, albedo=[0.9, 0.1, 0.1]), material(ball, albedo=[0.2, 0.2, 0.2])).mesh.detail
+    torch.testing.assert_close(twice.share, (1 - weights) ** 2)
+    for kept in (material(ball, roughness=0.1), material(ball, mode="multiply", albedo=[0.5, 0.5, 2.0]), twist(0.3)):
+        assert pose(asset, kept).mesh.detail.share is None
+    bent = pose(asset, twist(0.3), material({"all": True}, albedo=[0.5, 0.5, 0.5])).mesh.detail
+    assert not bool(bent.share.any())
 
 
 def test_a_deformed_scene_keeps_its_geometry_tensors_while_its_material_and_light_change():
@@ -305,7 +328,7 @@ def test_nothing_is_remembered_while_an_assets_tensors_are_being_optimised():
 
 def test_posing_leaves_the_asset_as_it_was():
     asset = plate_asset()
-    copies = {entry.name: getattr(asset.mesh, entry.name).clone() for entry in fields(asset.mesh)}
+    copies = {name: values.clone() for name, values in asset.mesh.columns.items()}
     pose(asset, TWIST, material({"all": True}, albedo=[0, 0, 0]))
     assert all(torch.equal(getattr(asset.mesh, name), values) for name, values in copies.items())
 

@@ -70,6 +70,7 @@ def _tiny_preset(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(PRESETS, "tiny", TINY)
     monkeypatch.setitem(PRESETS, "other", TINY)
     monkeypatch.setitem(PRESETS, "surfels", ON_SURFELS)
+    monkeypatch.setattr(report_progress, "REPORT_SECONDS", 0.0)  # every step is told: some tests stop at one
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +102,10 @@ def stop_when(stage: str, progress: list[Progress], after: int = 1):
 
 
 def asset_tensors(asset: Asset) -> dict[str, torch.Tensor]:
-    parts = {"gaussians": asset.gaussians, "mesh": asset.mesh, "binding": asset.binding, "environment": asset.environment}
-    parts |= {"certainty": asset.certainty}
-    return {f"{part}.{f.name}": getattr(record, f.name) for part, record in parts.items() for f in fields(record)}
+    assert asset.mesh.detail is not None and asset.mesh.detail.share is None, "photographs are finer than so few faces"
+    parts = {"gaussians": asset.gaussians, "binding": asset.binding, "environment": asset.environment, "certainty": asset.certainty}
+    tensors = {f"{part}.{f.name}": getattr(record, f.name) for part, record in parts.items() for f in fields(record)}
+    return tensors | {f"mesh.{name}": values for name, values in asset.mesh.columns.items()} | {"detail": asset.mesh.detail.codes}
 
 
 @pytest.mark.slow
@@ -206,7 +208,6 @@ def test_a_build_stopped_in_every_stage_leaves_checkpoints_and_resumes_to_the_sa
     build: Build, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """One build, stopped five times: what any stop loses, the end lacks."""
-    monkeypatch.setattr(report_progress, "REPORT_SECONDS", 0.0)  # every step is told
     out = tmp_path / "sphere"
     told: list[Progress] = []
     stops = (("fit", 1, "stage1"), ("mesh", 1, "stage1"), ("surface", 1, "surface"), ("surface", 3, "surface"), ("materials", 1, "stage2"))
@@ -262,7 +263,7 @@ def test_bound_to_the_mesh_a_build_goes_on_from_the_fit_of_particles_and_resumes
     # Material and light do not depend on where surfels lie: those of the particles' build are taken.
     assert fractions == sorted(fractions) and "bind" in {p.stage for p in progress} and "materials" not in {p.stage for p in progress}
     mesh, gaussians, binding = asset.mesh, asset.gaussians, asset.binding
-    assert all(torch.equal(value, getattr(build.asset.mesh, name)) for name, value in vars(mesh).items())
+    assert all(torch.equal(value, getattr(build.asset.mesh, name)) for name, value in mesh.columns.items())
     assert len(binding.face.unique()) == len(binding.face) == len(gaussians.centers) <= TINY.surface.mesh.face_limit
     assert len(mesh.faces) in {4 * len(binding.face), 16 * len(binding.face)}  # divided, with a surfel on each face from before
     assert torch.allclose(points_from_binding(binding, mesh.vertices, mesh.faces), gaussians.centers, atol=1e-6)

@@ -10,6 +10,7 @@ import safetensors.numpy
 import torch
 
 from drgs.deform.pose_scene import pose_scene
+from drgs.scene.albedo_detail import AlbedoDetail
 from drgs.scene.asset import Asset, load_asset, save_asset
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, camera_from_opengl
@@ -294,3 +295,37 @@ def test_values_that_are_not_finite_and_indices_that_point_nowhere_are_not_saved
         with pytest.raises(ValueError, match=sentence):
             save_asset(bad, tmp_path / "bad")
     assert os.listdir(tmp_path) == []
+
+
+def detailed_asset(share: bool) -> Asset:
+    asset, random = small_asset(), torch.Generator().manual_seed(5)
+    codes = torch.randint(256, (4, 10, 3), generator=random, dtype=torch.uint8)
+    return replace(asset, mesh=replace(asset.mesh, detail=AlbedoDetail(codes, torch.rand(4, generator=random) if share else None)))
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_what_lies_between_the_vertices_survives_saving_and_loading(tmp_path, share):
+    asset = detailed_asset(share)
+    save_asset(asset, tmp_path / "a.zip")
+    assert_equal_bits(load_asset(tmp_path / "a.zip"), asset)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"share": np.ones(4, np.float32)}, "damaged"),
+        ({"codes": np.ones((4, 10, 3), np.float32)}, "wrong shape or type"),
+        ({"codes": np.ones((4, 9, 3), np.uint8)}, "samples of detail"),
+        ({"codes": np.ones((4, 55, 3), np.uint8)}, "at most 8"),
+        ({"codes": np.ones((3, 10, 3), np.uint8)}, "of 3 faces, there are 4"),
+        ({"codes": np.ones((4, 10, 3), np.uint8), "share": np.ones(3, np.float32)}, "share"),
+        ({"codes": np.ones((4, 10, 3), np.uint8), "share": np.full(4, 1.5, np.float32)}, "share"),
+        ({"codes": np.ones((4, 10, 3), np.uint8), "share": np.full(4, np.nan, np.float32)}, "share"),
+    ],
+)
+def test_a_wrong_detail_is_refused_in_a_sentence(tmp_path, arrays, said):
+    path = tmp_path / "a"
+    save_asset(detailed_asset(False), path)
+    rewrite_file(path, "detail.safetensors", safetensors.numpy.save(arrays))
+    with pytest.raises(ValueError, match=said):
+        load_asset(path)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.deform.clip import Parted
+from drgs.scene.albedo_detail import chosen_faces
 from drgs.scene.materials import Materials
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedScene, PosedSurfels
@@ -32,6 +33,9 @@ class ShownGrains:
     vertices: Float[Tensor, "all_vertices 3"]
     normals: Float[Tensor, "all_vertices 3"]
     faces: Int[Tensor, "shown_face 3"]
+    """Those of the object that are left, then the grains'."""
+    face_source: Int[Tensor, "kept_face"]
+    """Of those that are left, the asset's faces."""
     vertex_source: Int[Tensor, "all_vertices"]
     surfels: tuple[Float[Tensor, "all_surfels 3"], Float[Tensor, "all_surfels 3 2"], Float[Tensor, "all_surfels"]] | None
     """Centres, tangents and opacities."""
@@ -52,22 +56,26 @@ def grains_of(mesh: TriangleMesh, surfels: PosedSurfels | None, parted: Parted) 
     offsets = count + len(corners) * torch.arange(len(chosen), device=chosen.device, dtype=mesh.faces.dtype)
     vertices = torch.cat([mesh.vertices, placed])
     normals = torch.cat([mesh.normals, torch.nn.functional.normalize(corners, dim=-1).repeat(len(chosen), 1)])
-    faces = torch.cat([mesh.faces[~parted.cut], (offsets[:, None, None] + triangles.to(mesh.faces.dtype)).reshape(-1, 3)])
+    kept = (~parted.cut).nonzero().flatten()
+    faces = torch.cat([mesh.faces[kept], (offsets[:, None, None] + triangles.to(mesh.faces.dtype)).reshape(-1, 3)])
     vertex_source = torch.cat([torch.arange(count, device=own.device), own.repeat_interleave(len(corners))])
     surfel_source = own.repeat_interleave(len(disc_centers))
     if surfels is None or parted.gone is None:
-        return ShownGrains(vertices, normals, faces, vertex_source, None, surfel_source)
+        return ShownGrains(vertices, normals, faces, kept, vertex_source, None, surfel_source)
     discs = (centers[:, None] + size[:, None, None] * disc_centers).reshape(-1, 3)
     tangents = (size[:, None, None, None] * disc_tangents).reshape(-1, 3, 2)
     opacities = torch.cat([surfels.opacities.masked_fill(parted.gone, 0.0), surfels.opacities.new_full((len(discs),), GRAIN_OPACITY)])
     shown = torch.cat([surfels.centers, discs]), torch.cat([surfels.tangents, tangents]), opacities
-    return ShownGrains(vertices, normals, faces, vertex_source, shown, surfel_source)
+    return ShownGrains(vertices, normals, faces, kept, vertex_source, shown, surfel_source)
 
 
 def show_grains(scene: PosedScene, grains: ShownGrains) -> PosedScene:
     """The scene with its grains, which wear the materials of its mesh."""
     mesh, surfels, source = scene.mesh, scene.surfels, grains.vertex_source
-    shown = TriangleMesh(grains.vertices, grains.faces, grains.normals, mesh.albedo[source], mesh.roughness[source], mesh.metallic[source])
+    shown = TriangleMesh(
+        grains.vertices, grains.faces, grains.normals, mesh.albedo[source], mesh.roughness[source], mesh.metallic[source],
+        detail=None if mesh.detail is None else chosen_faces(mesh.detail, grains.face_source, len(grains.faces), source),
+    )  # fmt: skip
     if surfels is not None and grains.surfels is not None:
         new, worn = grains.surfel_source, surfels.materials
         worn = Materials(

@@ -28,6 +28,12 @@ class MeshArrays:
     """How far ray origins stand off the surface [world units]."""
     horizon: wp.array[float]
     """Eight of each face (horizon_sector); empty where none is known."""
+    detail_parts: int
+    """Of each side of a face, AlbedoDetail's grid; 0: there is no detail."""
+    detail_codes: wp.array[wp.uint8]
+    """Three of each sample."""
+    detail_share: wp.array[float]
+    """Of each vertex; empty: all wear all of it."""
 
 
 def mesh_arrays(mesh: TriangleMesh, lift: float, horizon: Tensor | None = None) -> Any:
@@ -44,7 +50,12 @@ def mesh_arrays(mesh: TriangleMesh, lift: float, horizon: Tensor | None = None) 
     arrays.roughness = warp_array(mesh.roughness.float())
     arrays.metallic = warp_array(mesh.metallic.float())
     arrays.lift = lift
-    arrays.horizon = warp_array(mesh.roughness[:0].float() if horizon is None else horizon.reshape(-1))
+    none = mesh.roughness[:0].float()
+    arrays.horizon = warp_array(none if horizon is None else horizon.reshape(-1))
+    detail = mesh.detail
+    arrays.detail_parts = 0 if detail is None else detail.parts
+    arrays.detail_codes = warp_array(none.to(torch.uint8) if detail is None else detail.codes.reshape(-1))
+    arrays.detail_share = warp_array(none if detail is None or detail.share is None else detail.share.float())
     return arrays
 
 
@@ -59,6 +70,46 @@ class Surface:
     albedo: wp.vec3
     roughness: float
     metallic: float
+
+
+@wp.func
+def detail_factor(mesh: MeshArrays, face: int, sample: int) -> wp.vec3:
+    """Of one sample of a face; twin of factors_of."""
+    parts = mesh.detail_parts
+    at = 3 * (face * (((parts + 1) * (parts + 2)) / 2) + sample)
+    root = wp.vec3(float(mesh.detail_codes[at]), float(mesh.detail_codes[at + 1]), float(mesh.detail_codes[at + 2])) / 128.0
+    return wp.cw_mul(root, root)
+
+
+@wp.func
+def detailed_albedo(mesh: MeshArrays, face: int, y: float, z: float, albedo: wp.vec3, share: float) -> wp.vec3:
+    """Twin of drgs/scene/albedo_detail.py's."""
+    parts = mesh.detail_parts
+    row = parts + 1
+    u = wp.clamp(y, 0.0, 1.0) * float(parts)
+    v = wp.clamp(z, 0.0, 1.0) * float(parts)
+    i = wp.min(int(u), parts - 1)
+    j = wp.min(wp.min(int(v), parts - 1), parts - 1 - i)
+    f = u - float(i)
+    g = v - float(j)
+    beside = j * row - (j * (j - 1)) / 2 + i + 1
+    above = (j + 1) * row - (j * (j + 1)) / 2 + i
+    factor = wp.vec3(0.0, 0.0, 0.0)
+    if f + g > 1.0 and i + j < parts - 1:
+        factor = (
+            (f + g - 1.0) * detail_factor(mesh, face, above + 1)
+            + (1.0 - g) * detail_factor(mesh, face, beside)
+            + (1.0 - f) * detail_factor(mesh, face, above)
+        )
+    else:
+        factor = (
+            (1.0 - f - g) * detail_factor(mesh, face, beside - 1)
+            + f * detail_factor(mesh, face, beside)
+            + g * detail_factor(mesh, face, above)
+        )
+    one = wp.vec3(1.0, 1.0, 1.0)
+    detailed = wp.cw_mul(albedo, one + share * (factor - one))
+    return wp.min(wp.max(detailed, wp.vec3(0.0, 0.0, 0.0)), one)
 
 
 @wp.func
@@ -77,6 +128,11 @@ def surface_at(mesh: MeshArrays, face: int, barycentric: wp.vec2) -> Surface:
     surface.normal = wp.normalize(x * mesh.normals[a] + y * mesh.normals[b] + z * mesh.normals[c])
     surface.face_normal = wp.normalize(wp.cross(pb - pa, pc - pa))
     surface.albedo = x * mesh.albedo[a] + y * mesh.albedo[b] + z * mesh.albedo[c]
+    if mesh.detail_parts > 0:
+        share = float(1.0)
+        if mesh.detail_share.shape[0] > 0:
+            share = x * mesh.detail_share[a] + y * mesh.detail_share[b] + z * mesh.detail_share[c]
+        surface.albedo = detailed_albedo(mesh, face, y, z, surface.albedo, share)
     surface.roughness = x * mesh.roughness[a] + y * mesh.roughness[b] + z * mesh.roughness[c]
     surface.metallic = x * mesh.metallic[a] + y * mesh.metallic[b] + z * mesh.metallic[c]
     return surface

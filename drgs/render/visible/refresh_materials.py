@@ -6,6 +6,7 @@ import torch
 
 from drgs.render.records import GBuffer, PrimaryPoints, ShadingPoints
 from drgs.render.visible.rasterize import rasterize_gbuffer
+from drgs.scene.albedo_detail import detailed_albedo
 from drgs.scene.camera import Camera
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedSurfels
@@ -39,5 +40,6 @@ def refresh_primary(primary: PrimaryPoints, mesh: TriangleMesh) -> PrimaryPoints
     y, z = primary.barycentric.unbind(-1)
     weights = torch.stack([1 - y - z, y, z], -1)
     albedo = (weights[..., None] * mesh.albedo.detach()[corner]).sum(1)
+    albedo = detailed_albedo(albedo, mesh.detail, mesh.faces, primary.starts.face, primary.barycentric)
     roughness, metallic = ((weights * values.detach()[corner]).sum(1) for values in (mesh.roughness, mesh.metallic))
     return replace(primary, points=replace(primary.points, albedo=albedo, roughness=roughness, metallic=metallic))

@@ -20,6 +20,7 @@ from drgs.render.progressive.invalidate import changed_in_scene
 from drgs.render.records import RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.render.visible.paint_certainty import certainty_colors, paint_certainty
+from drgs.scene.albedo_detail import ONE, AlbedoDetail
 from drgs.scene.asset import Asset, load_asset, save_asset
 from drgs.scene.binding import Binding
 from drgs.scene.camera import Camera, pixel_rays_world
@@ -39,7 +40,8 @@ def asset() -> Asset:
     ball = ball_asset()
     count, vertices = len(ball.mesh.faces), ball.mesh.vertices
     paint = (vertices - vertices.amin(0)) / (vertices.amax(0) - vertices.amin(0))
-    mesh = replace(ball.mesh, albedo=paint, roughness=paint[:, 0].contiguous())
+    codes = torch.randint(64, 192, (count, 3, 3), generator=torch.Generator().manual_seed(9), dtype=torch.uint8)
+    mesh = replace(ball.mesh, albedo=paint, roughness=paint[:, 0].contiguous(), detail=AlbedoDetail(codes))
     binding = Binding(torch.arange(count, dtype=torch.int32), torch.full((count, 3), 1 / 3), torch.zeros(count))
     known = Certainty(*(torch.rand(len(vertices), generator=torch.Generator().manual_seed(k)).half() for k in range(4)))
     return replace(ball, mesh=mesh, binding=binding, certainty=known)
@@ -53,6 +55,11 @@ def test_cut_faces_are_left_out_and_grains_wear_what_is_nearest_to_them(asset):
     own = scene.mesh.faces[(scene.mesh.faces < count).all(1)]
     grains = scene.mesh.faces[(scene.mesh.faces >= count).all(1)]
     assert len(own) + len(grains) == len(scene.mesh.faces) and 0 < len(own) < len(asset.mesh.faces) and len(grains) % 20 == 0
+    detail, kept = scene.mesh.detail, asset.mesh.detail
+    assert kept is not None and detail is not None and detail.codes.shape == (len(scene.mesh.faces), *kept.codes.shape[1:])
+    numbers = {tuple(face): number for number, face in enumerate(asset.mesh.faces.tolist())}
+    assert torch.equal(detail.codes[: len(own)], kept.codes[[numbers[tuple(face)] for face in own.tolist()]]), "faces keep their pattern"
+    assert torch.equal(detail.codes[len(own) :], torch.full_like(detail.codes[len(own) :], ONE)), "grains have none"
     assert torch.equal(scene.mesh.albedo, asset.mesh.albedo[source]) and torch.equal(scene.mesh.roughness, asset.mesh.roughness[source])
     assert scene.horizons is None
     # Grains are closed, and face outward.

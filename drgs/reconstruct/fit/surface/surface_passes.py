@@ -94,7 +94,7 @@ class SurfaceFit:
         for _ in range(self.divided):
             faces = undivided_faces(faces)
         count = int(faces.max()) + 1 if self.divided else len(mesh.vertices)
-        return TriangleMesh(**{name: value[:count] for name, value in vars(mesh).items() if name != "faces"}, faces=faces)
+        return TriangleMesh(**{name: value[:count] for name, value in mesh.columns.items() if name != "faces"}, faces=faces)
 
 
 def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
