@@ -63,12 +63,12 @@ def write_test_cameras(capture: Path) -> Path:
 
 @pytest.mark.slow
 def test_without_masks_the_surfels_in_the_box_are_the_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "tiny", replace(WITHOUT_HOLLOWS, fit=replace(WITHOUT_HOLLOWS.fit, iterations=80)))
-    monkeypatch.setattr(find_masks_module, "ITERATIONS", 120)
+    monkeypatch.setitem(PRESETS, "tiny", replace(WITHOUT_HOLLOWS, fit=replace(WITHOUT_HOLLOWS.fit, iterations=40)))
+    monkeypatch.setattr(find_masks_module, "ITERATIONS", 100)
     capture = write_nerf_synthetic(tmp_path / "capture", [before_surroundings(view) for view in sphere_views(24, square=True)])
     asked = iter(range(10**6))
     with pytest.raises(BuildStopped):  # between two steps of stage 1, after the search
-        build_asset(capture, tmp_path / "half", SETTINGS, should_stop=lambda: next(asked) > 160)
+        build_asset(capture, tmp_path / "half", SETTINGS, should_stop=lambda: next(asked) > 120)
     asset = build_asset(capture, tmp_path / "half", replace(SETTINGS, resume=True))
     assert bool(UPPER.holds(asset.mesh.vertices).all())
     top = asset.mesh.vertices.amax(0) - torch.tensor([X, Y, Z])

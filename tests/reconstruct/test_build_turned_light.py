@@ -24,9 +24,9 @@ SETTINGS = BuildSettings(preset="tiny", device="cpu")
 FEW_RAYS = WITHOUT_HOLLOWS.surface.surface.moves
 LONGER = replace(
     WITHOUT_HOLLOWS,
-    fit=replace(WITHOUT_HOLLOWS.fit, iterations=40),
+    fit=replace(WITHOUT_HOLLOWS.fit, iterations=20),
     surface=replace(WITHOUT_HOLLOWS.surface, passes=1, surface=SurfaceSettings(rounds=1, steps_a_round=20, moves=FEW_RAYS)),
-    materials=MeshMaterialSettings(iterations=20, moves=FEW_RAYS, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
+    materials=MeshMaterialSettings(iterations=4, moves=FEW_RAYS, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
 )
 
 

@@ -56,7 +56,7 @@ def test_photographs_become_a_capture_that_builds_read(
     real = posed_dataset.pose_photographs
 
     def quick(photos: Path, out: Path, settings: PoseSettings, *rest: object):  # type: ignore[no-untyped-def]
-        return real(photos, out, PoseSettings(seed=settings.seed, resume=settings.resume, most_features=1500), *rest)
+        return real(photos, out, PoseSettings(seed=settings.seed, resume=settings.resume, most_features=800), *rest)
 
     monkeypatch.setattr(posed_dataset, "pose_photographs", quick)
     said: list = []

@@ -9,7 +9,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
+from drgs.reconstruct.capture.find_hollows import CHOSEN_MESH, FIELD_MESH, HollowSettings, find_hollows
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
 from drgs.reconstruct.capture.visual_hull import VisualHull, visual_hull
@@ -22,7 +22,12 @@ from tests.reconstruct.tiny_capture import camera_positions, look_at
 
 SIDE = 72
 CPU = torch.device("cpu")
-SETTINGS = HollowSettings(RadianceGridSettings(levels=((24, 60), (40, 70)), rays_a_step=512))
+SETTINGS = HollowSettings(
+    RadianceGridSettings(levels=((24, 60), (40, 70)), rays_a_step=512),
+    pixels=3000,
+    field_mesh=replace(FIELD_MESH, resolution=64),
+    chosen_mesh=replace(CHOSEN_MESH, resolution=80),
+)
 RIM, FLOOR = 0.35, -0.05
 """Heights; the bowl's inner radius is 0.45."""
 BALL = (0.9, 0.0, 0.0)

@@ -24,6 +24,7 @@ from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS, asset_tensors
 from tests.reconstruct.tiny_capture import FEW_VIEWS, HEIGHT, WIDTH, TinyView, sphere_views, write_nerf_synthetic
 
 CPU = torch.device("cpu")
+VIEWS = 16
 
 
 def before_surroundings(view: TinyView) -> TinyView:
@@ -39,7 +40,7 @@ def before_surroundings(view: TinyView) -> TinyView:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    views = [before_surroundings(view) for view in sphere_views(square=True)]
+    views = [before_surroundings(view) for view in sphere_views(VIEWS, square=True)]
     return write_nerf_synthetic(tmp_path_factory.mktemp("unmasked"), views)
 
 
@@ -53,9 +54,9 @@ def test_the_object_is_found_before_its_surroundings(unmasked: Views, monkeypatc
     monkeypatch.setattr(find_masks_module, "ITERATIONS", 150)
     assert not unmasked.has_masks
     settings = FitSettings(densify=DensifySettings(every=40))
-    found = find_masks(unmasked, initial_points(unmasked, 1500, seed=0), settings, CPU)
+    found = find_masks(unmasked, initial_points(unmasked, 1000, seed=0), settings, CPU)
     assert found is not None and found.has_masks
-    truth = torch.from_numpy(np.stack([view.rgba[..., 3] for view in sphere_views(square=True)])) > 127
+    truth = torch.from_numpy(np.stack([view.rgba[..., 3] for view in sphere_views(VIEWS, square=True)])) > 127
     masks = torch.stack(found.coverage) > 127
     assert float((masks & truth).sum() / (masks | truth).sum()) > 0.8
 

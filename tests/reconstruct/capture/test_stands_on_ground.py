@@ -15,19 +15,23 @@ from drgs.reconstruct.capture.initial_points import initial_points, seen_by_all
 from drgs.reconstruct.capture.masks_by_strokes.vote_volume import Region, Volume
 from drgs.reconstruct.capture.on_ground.ground_picture import ground_likelihood, ground_picture
 from drgs.reconstruct.capture.on_ground.ground_plane import ground_plane
-from drgs.reconstruct.capture.on_ground.stands_on_ground import look_again, standing_parts, stands_on_ground
+from drgs.reconstruct.capture.on_ground.stands_on_ground import OnGroundSettings, look_again, standing_parts, stands_on_ground
 from drgs.reconstruct.fit.light.ground_layer import COVER, before_ground, ground_logits
 from drgs.reconstruct.presets import PRESETS
 from drgs.reconstruct.progress import BuildStopped
 from drgs.reconstruct.report_progress import BuildReporter
-from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.camera import Camera
 from drgs.scene.ground import Ground, places_on_ground
 from drgs.scene.views import Views
 from tests.one_torch_thread import one_torch_thread  # noqa: F401
 from tests.reconstruct.pose.textured_scene import FOCAL, RADII, SIZE, noise, orbit, picture
 
 GROUND_Z = -float(RADII[2])
-VIEWS = 40
+VIEWS, SIDE = 24, 200
+FOCAL_PIXELS = FOCAL * SIDE / SIZE
+"""Focal length."""
+SMALLER = OnGroundSettings(fine_texels=256, fine_views=16)
+"""A last picture of the ground as fine as so few and small photographs show it."""
 BLUE = np.array([0.5, 0.8, 1.2])
 CPU = torch.device("cpu")
 
@@ -57,17 +61,20 @@ def scene() -> tuple[Views, list[np.ndarray]]:
     poses = np.concatenate([orbit(VIEWS // 2, 2.2), orbit(VIEWS // 2, 4.5)])
     cameras, images, masks = [], [], []
     for number, pose in enumerate(poses):
-        color, egg = picture(pose)
-        color = np.where(egg[..., None], color * BLUE, color)
-        intrinsics = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
-        whole = Camera(torch.from_numpy(np.linalg.inv(pose)).float(), intrinsics, SIZE, SIZE, name=f"{number:02d}")
-        camera = scaled_camera(whole, 0.5)
-        cameras.append(camera)
-        images.append(torch.from_numpy(color.reshape(SIZE // 2, 2, SIZE // 2, 2, 3).mean((1, 3)).round().astype(np.uint8)))
-        masks.append(egg.reshape(SIZE // 2, 2, SIZE // 2, 2).mean((1, 3)) >= 0.5)
+        color, egg = picture(pose, FOCAL_PIXELS, size=SIDE)
+        intrinsics = torch.tensor([[FOCAL_PIXELS, 0, SIDE / 2], [0, FOCAL_PIXELS, SIDE / 2], [0, 0, 1]])
+        cameras.append(Camera(torch.from_numpy(np.linalg.inv(pose)).float(), intrinsics, SIDE, SIDE, name=f"{number:02d}"))
+        images.append(torch.from_numpy(np.where(egg[..., None], color * BLUE, color).round().astype(np.uint8)))
+        masks.append(egg)
     points = torch.from_numpy(sparse_points()).float()
-    all_of_it = tuple(torch.full((SIZE // 2, SIZE // 2), 255, dtype=torch.uint8) for _ in poses)
+    all_of_it = tuple(torch.full((SIDE, SIDE), 255, dtype=torch.uint8) for _ in poses)
     return Views(tuple(cameras), tuple(images), all_of_it, points, torch.full_like(points, 0.5), False, "nerfstudio"), masks
+
+
+@pytest.fixture(scope="module")
+def standing(scene: tuple[Views, list[np.ndarray]]) -> Views | None:
+    """What is found of it."""
+    return stands_on_ground(scene[0], seed=0, settings=SMALLER)
 
 
 def centers_of(views: Views) -> np.ndarray:
@@ -127,9 +134,9 @@ def test_what_the_ground_looks_like_and_who_sees_it(scene: tuple[Views, list[np.
     assert float((likely[known & egg] > 0).float().mean()) < 0.4, "what stands before it is mostly not"
 
 
-def test_the_egg_is_where_the_ground_is_hidden(scene: tuple[Views, list[np.ndarray]]) -> None:
-    views, masks = scene
-    found = stands_on_ground(views, seed=0)
+@pytest.mark.slow
+def test_the_egg_is_where_the_ground_is_hidden(scene: tuple[Views, list[np.ndarray]], standing: Views | None) -> None:
+    (views, masks), found = scene, standing
     assert found is not None and found.ground is not None and not found.has_masks
     for coverage, mask in zip(found.coverage, masks, strict=True):
         may = coverage.numpy() > 127
@@ -151,7 +158,7 @@ def test_masks_that_are_too_wide_are_cut_where_the_ground_is_seen_beside_the_egg
     views, masks = scene
     wide = [ndimage.binary_dilation(mask, iterations=4) for mask in masks]
     given = [torch.from_numpy(255 * mask.astype(np.uint8)) for mask in wide]
-    again = look_again(views, given, seed=0)
+    again = look_again(views, given, seed=0, settings=SMALLER)
     assert again is not None
     found, cut = again
     assert found.ground is not None and not found.has_masks
@@ -229,13 +236,14 @@ def test_what_floats_is_none_of_it() -> None:
 
 
 @pytest.mark.slow
-def test_a_fit_before_the_ground_finds_the_egg(scene: tuple[Views, list[np.ndarray]], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(find_masks_module, "ITERATIONS", 300)
-    monkeypatch.setattr(find_masks_module, "SIDE", 100)
-    views, masks = scene
-    found = stands_on_ground(views, seed=0)
+def test_a_fit_before_the_ground_finds_the_egg(
+    scene: tuple[Views, list[np.ndarray]], standing: Views | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(find_masks_module, "ITERATIONS", 250)
+    monkeypatch.setattr(find_masks_module, "SIDE", 80)
+    (_, masks), found = scene, standing
     assert found is not None
-    points = initial_points(dataclasses.replace(found, has_masks=True), 1500, seed=0)
+    points = initial_points(dataclasses.replace(found, has_masks=True), 1000, seed=0)
     masked = find_masks(found, points, dataclasses.replace(PRESETS["draft"].fit, seed=0), CPU)
     assert masked is not None and masked.has_masks and masked.ground is None
     shares = [((m.numpy() > 127) & mask).sum() / ((m.numpy() > 127) | mask).sum() for m, mask in zip(masked.coverage, masks, strict=True)]

@@ -21,7 +21,7 @@ from tests.reconstruct.pose.textured_scene import DISTORTION, FOCAL, orbit, pict
 
 pytest.importorskip("pycolmap")
 
-QUICK = PoseSettings(most_features=1500)
+QUICK = PoseSettings(most_features=800)
 VIEWS = 14
 
 
@@ -84,8 +84,8 @@ def test_the_capture_is_read_with_undistorted_pictures_and_masks(posed: PosedCap
     shown = views.images_srgb[3].numpy().astype(int)
     size, focal = shown.shape[0], float(views.cameras[3].intrinsics[0, 0])
     drawn = picture(true[3] @ np.diag([1.0, -1.0, -1.0, 1.0]), focal, 0.0, size)[0].astype(int)
-    beside = np.abs(shown - np.roll(drawn, 3, axis=1)).mean()
-    assert np.abs(shown - drawn).mean() < 0.3 * beside, "it is the pinhole picture from there, and not three pixels off"
+    beside = np.abs(shown - np.roll(drawn, 2, axis=1)).mean()
+    assert np.abs(shown - drawn).mean() < 0.3 * beside, "it is the pinhole picture from there, and not two pixels off"
     with_masks = load_views(Path(masked.folder))
     assert with_masks.has_masks
     inside = with_masks.coverage[0] > 250
@@ -123,7 +123,7 @@ def test_what_only_looks_like_a_backdrop_is_asked_too(photographs: Path, tmp_pat
         calls.append(len(prepared))
         for photo in prepared:
             mask = np.zeros((photo.height, photo.width), np.uint8)
-            mask[200:230, 200:230] = 255
+            mask[150:173, 150:173] = 255
             Image.fromarray(mask).save(work / "masks" / f"{photo.file}.png")
         return [replace(photo, has_mask=True) for photo in prepared], {}
 

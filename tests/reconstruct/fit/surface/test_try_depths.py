@@ -19,7 +19,7 @@ PIXEL = 1 / 16
 SETTINGS = TrialSettings(
     screen=(-0.06, 0.06),
     depths=(-0.12, -0.08, -0.04, 0.04, 0.08, 0.12, 0.16),
-    steps=24,
+    steps=20,
     rates=SurfaceRates(normals=0.005, albedo_logits=0.2, environment=0.0),  # the paint is not known at the start
     share_rays=4,
     spread=0.06,
@@ -28,7 +28,7 @@ SETTINGS = TrialSettings(
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
-    return painted_views(tmp_path_factory.mktemp("painted"), 12)
+    return painted_views(tmp_path_factory.mktemp("painted"), 8)
 
 
 def with_bump(height: float) -> tuple[TriangleMesh, Tensor]:
