@@ -7,7 +7,7 @@ from pathlib import Path
 from drgs.openmp import spin_briefly
 
 HERE = Path(__file__).parent
-FOLDERS = ("reconstruct", "deform", "render", "convert", "serve")
+FOLDERS = ("reconstruct", "deform", "render", "convert", "serve", "commits")
 """Each file in them is a benchmark with a `main(arguments)`, but for those whose names begin with _."""
 MODULES = {path.stem: f"{folder}.{path.stem}" for folder in FOLDERS for path in (HERE / folder).glob("[!_]*.py")}
 MODULES |= {path.parent.name: f"{path.parent.name}.command" for path in HERE.glob("*/command.py")}

@@ -5,7 +5,6 @@ In: a name, what was asked, and what makes it. Out: the document. A process that
 
 import json
 import os
-import platform
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from pathlib import Path
 import safetensors.torch
 from torch import Tensor
 
+from benchmarks.measures.machine import machine
 from benchmarks.reconstruct.ablate import commit
 
 
@@ -76,14 +76,3 @@ def write_whole(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
-
-
-def machine() -> str:
-    """Processor, cores that this process may use, and how busy the machine is."""
-    model = platform.processor() or platform.machine()
-    facts = Path("/proc/cpuinfo")
-    if facts.is_file():
-        named = [line.partition(":")[2].strip() for line in facts.read_text().splitlines() if line.startswith("model name")]
-        model = named[0] if named else model
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{model}, {cores} of {os.cpu_count()} cores, load {os.getloadavg()[0]:.0f}"
