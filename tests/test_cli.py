@@ -83,6 +83,14 @@ def test_help_imports_nothing_heavy():
     assert result.returncode == 0, f"imported {result.stderr}"
 
 
+@pytest.mark.slow
+def test_reading_cameras_imports_nothing_that_finds_points():
+    # `drgs render` reads them, and finds none.
+    program = "import sys, drgs.reconstruct.capture.load_views; sys.exit(sorted({'scipy', 'skimage'} & set(sys.modules)) or None)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
+    assert result.returncode == 0, f"imported {result.stderr}"
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="counts processor time as POSIX does")
 def test_help_takes_less_than_half_a_second_of_processor_time():
     import resource

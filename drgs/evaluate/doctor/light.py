@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from drgs.evaluate.doctor.findings import Finding, Section
-from drgs.reconstruct.capture.exposures import VARIED_STOPS, brightness_stops, jumps, spread
+from drgs.reconstruct.capture.exposure_gains import spread
+from drgs.reconstruct.capture.exposures import VARIED_STOPS, brightness_stops, jumps
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.turning_light import light_found

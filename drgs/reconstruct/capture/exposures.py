@@ -1,7 +1,7 @@
 """By how much each photograph was exposed more than the others: a camera that measures light anew for each picture makes one surface bright here
 and dark there, which a fit would explain by light or paint.
 
-Three sources, the first that knows wins: what the camera wrote into the files (read_pictures); points of the object that several photographs show,
+Three sources, the first that knows wins: what the camera wrote into the files (exposure_gains.py); points of the object that several photographs show,
 before anything is fitted; the surfels of stage 1, which know what depends on the view, afterwards. Gains are relative: their logarithms have
 the mean 0. Where they differ by less than chance would make them, there are none, and nothing changes.
 
@@ -18,6 +18,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from drgs.maths.color import linear_from_srgb, luminance
+from drgs.reconstruct.capture.exposure_gains import gains_of_stops
 from drgs.reconstruct.capture.initial_points import InitialPoints, project_points
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.scene.views import Views
@@ -27,8 +28,6 @@ VARIED_STOPS = 0.2
 LEFT_STOPS = 0.1
 """The same after stage 1, which explains what depends on the view."""
 NEIGHBOURS = 4
-WRITTEN_STOPS = 0.05
-"""Spread of what cameras wrote into their files; less is rounding."""
 SOLID = 0.9
 """Least coverage and mask of a pixel that is compared."""
 DARKEST, BRIGHTEST = 0.02, 0.98
@@ -41,8 +40,6 @@ COMPARED_POINTS = 3000
 FACING = 0.3
 """Least cosine between a point's normal and the direction to the camera."""
 POLISHINGS = 8
-MOST_STOPS = 4.0
-"""Of a gain, either way: more is a picture of something else."""
 
 
 def brightness_stops(views: Views, points: InitialPoints) -> Float[ndarray, "view"]:
@@ -118,31 +115,6 @@ def jumps(stops: Sequence[float] | Float[ndarray, "view"], views: Views) -> floa
     return float((values - values[nearest].mean(1)).std())
 
 
-def spread(stops: Sequence[float] | Float[ndarray, "view"]) -> float:
-    """Standard deviation of what is known; 0 where nothing is."""
-    known = np.array(stops)[np.isfinite(stops)]
-    return float(known.std()) if len(known) else 0.0
-
-
-def gains_of_files(exposures: Sequence[float | None]) -> tuple[float, ...] | None:
-    """What cameras wrote into their files; None where one did not, or all are alike.
-
-    Args:
-        exposures: time times sensitivity over the f-number's square.
-    """
-    if not exposures or any(exposure is None for exposure in exposures):
-        return None
-    stops = np.log2(np.array(exposures, np.float64))
-    return _centred(stops) if spread(stops) > WRITTEN_STOPS else None
-
-
 def with_gains(views: Views, stops: Sequence[float] | Float[ndarray, "view"]) -> Views:
     """The same with these exposures [stops, any common offset]; what is not known (nan) is taken for the mean."""
-    return replace(views, gains=_centred(np.array(stops, np.float64)))
-
-
-def _centred(stops: Float[ndarray, "view"]) -> tuple[float, ...]:
-    known = np.isfinite(stops)
-    mean = float(stops[known].mean()) if known.any() else 0.0
-    centred = np.where(known, stops - mean, 0.0)
-    return tuple((2.0 ** np.clip(centred, -MOST_STOPS, MOST_STOPS)).tolist())
+    return replace(views, gains=gains_of_stops(np.array(stops, np.float64)))

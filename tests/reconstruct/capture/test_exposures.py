@@ -10,7 +10,8 @@ from PIL import Image
 from torch import Tensor
 
 from drgs.maths.color import linear_from_srgb, srgb_from_linear
-from drgs.reconstruct.capture.exposures import gains_of_files, spread, with_gains, with_gains_of_fit, with_gains_of_points
+from drgs.reconstruct.capture.exposure_gains import gains_of_files, spread
+from drgs.reconstruct.capture.exposures import with_gains, with_gains_of_fit, with_gains_of_points
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.fit.losses import display_image

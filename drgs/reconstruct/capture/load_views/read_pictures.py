@@ -16,7 +16,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from drgs.exchange.pictures import as_eight_bits, exif_number, read_exif
-from drgs.reconstruct.capture.exposures import gains_of_files
+from drgs.reconstruct.capture.exposure_gains import gains_of_files
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, camera_of, resize_pinhole
 from drgs.reconstruct.capture.load_views.checks import damaged
 from drgs.reconstruct.capture.load_views.linear_light import premultiplied, straight
