@@ -28,6 +28,7 @@ TOP_FILES = {
     "drgs/cli_endings.py",
     "drgs/cli_options.py",
     "drgs/cli_progress.py",
+    "drgs/compiled_kernels.py",
     "drgs/installation.py",
     "drgs/openmp.py",
     "drgs/warp_torch.py",

@@ -23,6 +23,7 @@ from drgs_server.api.door.connections import guarded_connections
 from drgs_server.api.door.rate_limit import KeepPeer
 from drgs_server.api.door.text_streams import TextStream
 from drgs_server.app import create_app
+from drgs_server.first_start import KernelCompiler
 from drgs_worker.logs import set_up_logging
 from drgs_worker.store.backups import restore_backups
 from drgs_worker.store.data_directory import open_data_directory, read_token
@@ -77,15 +78,17 @@ def serve(
     config = uvicorn_config(app, settings)
     token = settings.token.get_secret_value() if settings.token else read_token(directory)
     server = _Server(config, lambda bound: _announce(bound, host, token, open_browser, ready))
-    worker = WorkerProcess(directory.root, settings.device) if settings.worker else None
+    worker, compiler = WorkerProcess(directory.root, settings.device) if settings.worker else None, KernelCompiler(settings.device)
     if worker:
         worker.start()
+    compiler.start()
     try:
         with _quiet_signals():
             server.run()
     except SystemExit as error:
         raise ValueError(f"port {port} of {host} cannot be used; is a server running there already? Pick another with --port") from error
     finally:
+        compiler.stop()
         if worker:
             worker.stop()
     return 0
