@@ -1,0 +1,108 @@
+"""Curves of costs have the exponents of what they are made of, and each is measured once at tiny sizes."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.scale.command import CURVES, main, measure
+from benchmarks.scale.cost_curve import CostCurve, Point, log_log_slope, table_lines, write_plot
+from benchmarks.scale.made_objects import bumpy_ball
+from benchmarks.scale.scale_run import ScaleRun, ScaleSizes
+
+TINY = ScaleSizes(
+    pixels=(8, 12, 16),
+    faces=(12, 48, 108),
+    surfels=(20, 40, 80),
+    samples=(4, 8, 16),
+    object_faces=108,
+    faces_side=16,
+    samples_side=8,
+    moving_frames=1,
+)
+
+
+def curve_of(costs: list[float | None]) -> CostCurve:
+    points: list[Point] = [{"x": 10.0**k, "seconds": cost} for k, cost in enumerate(costs)]
+    return CostCurve("made", "made-up size", points)
+
+
+def test_exponents_of_a_power_are_that_power():
+    document = curve_of([3 * 10 ** (1.5 * k) for k in range(4)]).document()
+    assert (document["exponent"], document["last_exponent"]) == (1.5, 1.5)
+    assert set(document) == {"x", "points", "exponent", "last_exponent", "exponents"} and len(document["points"]) == 4
+
+
+def test_a_constant_share_flattens_the_whole_more_than_its_end():
+    over_all, last = curve_of([1 + 0.1 * 10**k for k in range(4)]).exponents("seconds")
+    assert over_all is not None and last is not None and 0 < over_all < last < 1
+
+
+def test_least_squares_of_three_points_is_the_textbook_slope():
+    assert log_log_slope([(1, 1), (math.e, math.e), (math.e**2, 1)]) == 0
+    assert log_log_slope([(1, 1), (math.e, 1), (math.e**2, math.exp(3))]) == 1.5
+
+
+@pytest.mark.parametrize("points", [[], [(1, 1)], [(2, 1), (2, 3)], [(1, 1), (2, None)], [(1, 1), (2, -1)]])
+def test_what_has_no_slope_has_none(points: list[tuple[float, float | None]]):
+    assert log_log_slope(points) is None
+
+
+def test_a_table_says_whether_costs_grow_faster_than_their_size():
+    assert table_lines(curve_of([1, 10, 100]))[-1].endswith("(no faster than linearly)")
+    assert table_lines(curve_of([1, 10, 200]))[-1].endswith("(faster than linearly)")
+    assert "–" in table_lines(curve_of([1, None, 100]))[-1]
+
+
+def test_a_plot_leaves_out_what_a_logarithm_cannot_show(tmp_path: Path):
+    write_plot(curve_of([1, None, 100]), tmp_path / "plots")
+    assert (tmp_path / "plots" / "scale_made.svg").read_text().count("<circle") == 2
+    write_plot(CostCurve("none", "size", [{"x": 1, "seconds": 0.0}]), tmp_path)
+    assert not (tmp_path / "scale_none.svg").exists()
+
+
+@pytest.mark.parametrize("asked", [12, 100, 1000])
+def test_the_made_object_is_closed_and_faces_outwards(asked: int):
+    mesh = bumpy_ball(asked, torch.device("cpu")).mesh
+    assert abs(math.sqrt(len(mesh.faces) / 12) - math.sqrt(asked / 12)) <= 0.5 and len(mesh.vertices) == len(mesh.faces) // 2 + 2
+    corners = mesh.vertices[mesh.faces.long()].double()
+    volume = torch.linalg.det(corners).sum() / 6
+    assert 0.2 * volume.sign() < volume < 1.8 * 4 / 3 * math.pi
+    edges = {tuple(edge) for face in mesh.faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True)}
+    assert all((b, a) in edges for a, b in edges)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pixels", "faces", "surfels", "samples"])
+def test_pictures_are_measured_at_each_size(name: str, tmp_path: Path):
+    (curve,) = measure(ScaleRun(tmp_path, TINY, repeats=1), [name])
+    assert curve.name == name and [point["x"] for point in curve.points] == sorted({point["x"] for point in curve.points})
+    assert len(curve.points) == 3 and all(point[cost] > 0 for point in curve.points for cost in curve.costs)
+    assert curve.document()["exponent"] is not None and all(point["cpu_seconds"] is not None for point in curve.points)
+
+
+@pytest.mark.slow
+def test_one_document_is_printed_and_one_plot_a_curve_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    main(["--only", "surfels", "--sizes", "10", "20", "--repeats", "1", "--device", "cpu", "--plots", str(tmp_path), "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert [point["x"] for point in document["curves"]["surfels"]["points"]] == [10, 20]
+    assert [path.name for path in tmp_path.iterdir()] == ["scale_surfels.svg"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--sizes", "1", "2"], "one curve"),
+        (["--only", "samples", "--sizes", "8", "4"], "each larger"),
+        (["--repeats", "0"], "at least 1"),
+    ],
+)
+def test_wrong_arguments_are_refused_with_what_was_expected(arguments: list[str], words: str):
+    with pytest.raises(ValueError, match=words):
+        main(arguments)
+
+
+def test_each_curve_has_sizes_of_its_name():
+    assert set(CURVES) <= set(vars(ScaleSizes()))
