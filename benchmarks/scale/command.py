@@ -4,7 +4,8 @@
 
 pixels: a moving picture (32 rays a pixel, denoised, with kept light) and a first still pass of 32 rays, of ASSET or a made object.
 faces: the same of a ball with bumps of 10 k to 1 M faces, its tree, and this process's memory. surfels: a G-buffer of a torus of Gaussians.
-samples: a still of 8 to 512 rays a pixel. Exponents: `exponent` over all points by least squares, `last_exponent` between the last two; up to
+samples: a still of 8 to 512 rays a pixel. edits: one more edit on a server with 10 to 10 000 in force, until it is acknowledged and until a picture
+shows it, and bytes of messages. assets: a server's memory beyond its own with 1 to 8 open assets, and MiB a MiB of their files. Exponents: `exponent` over all points by least squares, `last_exponent` between the last two; up to
 {linear} is called no faster than linear. Costs of what is made once (kernels, trees, tables) are in none but what names them.
 """
 
@@ -16,7 +17,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.scale.assets import assets
 from benchmarks.scale.cost_curve import LINEAR, CostCurve, table_lines, write_plot
+from benchmarks.scale.edits import edits
 from benchmarks.scale.faces import faces
 from benchmarks.scale.pixels import pixels
 from benchmarks.scale.samples import samples
@@ -24,7 +27,14 @@ from benchmarks.scale.scale_run import ScaleRun, ScaleSizes
 from benchmarks.scale.surfels import surfels
 from drgs.warp_torch import device_from_name
 
-CURVES: dict[str, Callable[[ScaleRun], CostCurve]] = {"pixels": pixels, "faces": faces, "surfels": surfels, "samples": samples}
+CURVES: dict[str, Callable[[ScaleRun], CostCurve]] = {
+    "pixels": pixels,
+    "faces": faces,
+    "surfels": surfels,
+    "samples": samples,
+    "edits": edits,
+    "assets": assets,
+}
 """Each name is also that of its sizes."""
 LONG: tuple[str, ...] = ()
 """Made only when they are named."""

@@ -7,9 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.scale.assets import assets_on_server
 from benchmarks.scale.command import CURVES, main, measure
 from benchmarks.scale.cost_curve import CostCurve, Point, log_log_slope, table_lines, write_plot
+from benchmarks.scale.edits import edits_on_server
 from benchmarks.scale.made_objects import bumpy_ball
+from benchmarks.scale.own_server import own_server
 from benchmarks.scale.scale_run import ScaleRun, ScaleSizes
 
 TINY = ScaleSizes(
@@ -17,10 +20,14 @@ TINY = ScaleSizes(
     faces=(12, 48, 108),
     surfels=(20, 40, 80),
     samples=(4, 8, 16),
+    edits=(1, 2, 4),
+    assets=(1, 2, 3),
     object_faces=108,
     faces_side=16,
     samples_side=8,
+    asset_faces=108,
     moving_frames=1,
+    edits_measured=1,
 )
 
 
@@ -81,6 +88,18 @@ def test_pictures_are_measured_at_each_size(name: str, tmp_path: Path):
     assert curve.name == name and [point["x"] for point in curve.points] == sorted({point["x"] for point in curve.points})
     assert len(curve.points) == 3 and all(point[cost] > 0 for point in curve.points for cost in curve.costs)
     assert curve.document()["exponent"] is not None and all(point["cpu_seconds"] is not None for point in curve.points)
+
+
+@pytest.mark.slow
+def test_a_server_is_measured_with_more_and_more_edits_and_assets(tmp_path: Path):
+    run = ScaleRun(tmp_path, TINY, repeats=1)
+    with own_server(tmp_path / "served") as served:  # one for both: to start one takes longer than to ask it
+        changes, memory = edits_on_server(run, *served), assets_on_server(run, *served)
+    assert [point["x"] for point in changes.points] == [1, 2, 4] and [point["x"] for point in memory.points] == [1, 2, 3]
+    assert all(0 < point["accepted_seconds"] <= point["seconds"] and point["message_bytes"] > 0 for point in changes.points)
+    assert all({"asset_mib", "memory_mib", "grown_mib", "mib_per_mib"} <= set(point) for point in memory.points)
+    assert memory.points[0]["asset_mib"] < memory.points[2]["asset_mib"] < memory.points[0]["memory_mib"]
+    assert not served[0].is_running()
 
 
 @pytest.mark.slow
