@@ -2,12 +2,18 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+import benchmarks.scale.builds as builds_module
+from benchmarks.builds.build_process import BuildRun
 from benchmarks.scale.assets import assets_on_server
+from benchmarks.scale.builds import write_shrunk, write_views
 from benchmarks.scale.command import CURVES, main, measure
 from benchmarks.scale.cost_curve import CostCurve, Point, log_log_slope, table_lines, write_plot
 from benchmarks.scale.edits import edits_on_server
@@ -110,12 +116,53 @@ def test_one_document_is_printed_and_one_plot_a_curve_written(tmp_path: Path, ca
     assert [path.name for path in tmp_path.iterdir()] == ["scale_surfels.svg"]
 
 
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Four photographs of 8 x 4 pixels, half covered."""
+    folder = tmp_path / "scene"
+    (folder / "train").mkdir(parents=True)
+    for number in range(4):
+        pixels = np.zeros((4, 8, 4), np.uint8)
+        pixels[:, :4] = (50 * number, 100, 200, 255)
+        Image.fromarray(pixels).save(folder / "train" / f"r_{number}.png")
+    frames = [{"file_path": f"./train/r_{number}", "transform_matrix": np.eye(4).tolist()} for number in range(4)]
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.6, "w": 8, "h": 4, "frames": frames}))
+    return folder
+
+
+def test_builds_are_measured_against_photographs_and_their_pixels(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    built: list[tuple[int, tuple[int, int]]] = []
+
+    def look_at_capture(command: list[str]) -> BuildRun:
+        capture = Path(command[3])
+        frames = json.loads((capture / "transforms_train.json").read_text())["frames"]
+        sizes = {Image.open(capture / f"{frame['file_path']}.png").size for frame in frames}
+        built.append((len(frames), *sizes))
+        return BuildRun(2.0 * len(frames), 3.0, {}, 100)
+
+    monkeypatch.setattr(builds_module, "run_build", look_at_capture)
+    run = ScaleRun(tmp_path, replace(TINY, builds=(1, 2, 4), builds_pixels=(2, 4, 8)), scene=scene)
+    views, pixels = measure(run, ["builds", "builds_pixels"])
+    assert built == [(1, (8, 4)), (2, (8, 4)), (4, (8, 4)), (4, (2, 1)), (4, (4, 2)), (4, (8, 4))]
+    assert views.document()["exponent"] == 1 and pixels.document()["exponent"] == 0
+    assert [point["x"] for point in pixels.points] == [4, 16, 64] and views.points[0]["memory_mib"] == 100
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene"]
+
+
+def test_a_scene_with_too_few_or_too_small_photographs_is_refused(scene: Path, tmp_path: Path):
+    with pytest.raises(ValueError, match="has 4 photographs"):
+        write_views(scene, tmp_path / "more", 5)
+    with pytest.raises(ValueError, match="photograph of 8 pixels"):
+        write_shrunk(scene, tmp_path / "larger", 16)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--sizes", "1", "2"], "one curve"),
         (["--only", "samples", "--sizes", "8", "4"], "each larger"),
         (["--repeats", "0"], "at least 1"),
+        (["--only", "builds"], "need --scene"),
     ],
 )
 def test_wrong_arguments_are_refused_with_what_was_expected(arguments: list[str], words: str):
