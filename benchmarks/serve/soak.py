@@ -54,7 +54,7 @@ def measure(changes: int, folder: Path, mixed: bool = True) -> dict:
     import trimesh
 
     trimesh.creation.icosphere(subdivisions=3).export(folder / "ball.ply")
-    server, client = _serve(folder)
+    server, client = serve_folder(folder)
     try:
         asset = client.upload_asset(folder / "ball.ply", "ball").id
         session = client.open_session(asset)
@@ -69,7 +69,7 @@ def measure(changes: int, folder: Path, mixed: bool = True) -> dict:
         server.kill()
         server.wait()
         client.close()
-        server, client = _serve(folder)
+        server, client = serve_folder(folder)
         start = time.monotonic()
         again = client.session(session.id)
         info_again = again.info()
@@ -103,7 +103,8 @@ def measure(changes: int, folder: Path, mixed: bool = True) -> dict:
     }
 
 
-def _serve(folder: Path) -> tuple[subprocess.Popen, Client]:
+def serve_folder(folder: Path) -> tuple[subprocess.Popen, Client]:
+    """A server of its own on folder/data, with the real renderer, and a client of it; whoever asks ends both."""
     server = subprocess.Popen([sys.executable, "-c", SERVE, str(folder / "data")], stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
     return server, Client(server.stdout.readline().strip(), timeout_seconds=300)
@@ -124,11 +125,12 @@ def _messages(changes: int, mixed: bool) -> list[dict]:
             kind = "edit"
         done += -1 if kind == "undo" else 1
         undone = 0 if kind == "edit" else undone + (1 if kind == "undo" else -1)
-        made.append({"type": kind} | ({"edit": _edit(chooser)} if kind == "edit" else {}))
+        made.append({"type": kind} | ({"edit": random_edit(chooser)} if kind == "edit" else {}))
     return made
 
 
-def _edit(chooser: random.Random) -> dict:
+def random_edit(chooser: random.Random) -> dict:
+    """Of a material mostly, of the light or of the shape."""
     kind = chooser.choices(["all", "sphere", "environment", "twist"], [10, 8, 3, 1])[0]
     if kind == "environment":
         return {"op": "environment", "rotation": chooser.uniform(-180, 180)}
