@@ -149,7 +149,8 @@ def served(data: Path, kernels: Path | None = None) -> Iterator[tuple[str, float
     Raises:
         ValueError: it ended before it said an address.
     """
-    environment = {**os.environ} if kernels is None else {**os.environ, "WARP_CACHE_PATH": str(kernels)}
+    fresh = {} if kernels is None else {"WARP_CACHE_PATH": str(kernels), "XDG_CACHE_HOME": str(kernels)}
+    environment = {**os.environ, **fresh}
     started = time.perf_counter()
     command = [sys.executable, *DRGS, "serve", "--no-worker", "--data", str(data), "--port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
