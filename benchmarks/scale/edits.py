@@ -17,7 +17,7 @@ from benchmarks.scale.own_server import own_server
 from benchmarks.scale.scale_run import ScaleRun
 from benchmarks.serve.soak import SEED, random_edit
 from drgs.scene.asset import save_asset
-from drgs_server.client import Client
+from drgs_server.client import Client, RemoteSession, ServerError
 from drgs_server.live.frame_header import FLAG_CONVERGED, FrameHeader, unpack_frame
 
 FACES = 1280
@@ -62,7 +62,7 @@ def _point(client: Client, server: psutil.Process, asset: str, in_force: int, ru
         cpu_before = sum(server.cpu_times()[:2])
         changed = [_change(socket, number) for number in range(run.sizes.edits_measured * run.repeats)]
         cpu_seconds = (sum(server.cpu_times()[:2]) - cpu_before) / len(changed)
-    session.delete()
+    _delete(session)
     return {
         "x": in_force,
         "seconds": round(statistics.median(change.picture_seconds for change in changed), 6),
@@ -70,6 +70,18 @@ def _point(client: Client, server: psutil.Process, asset: str, in_force: int, ru
         "cpu_seconds": round(cpu_seconds, 6),
         "message_bytes": statistics.median(change.message_bytes for change in changed),
     }
+
+
+def _delete(session: RemoteSession) -> None:
+    """Once the server has noticed that its viewer is gone."""
+    deadline = time.monotonic() + SECONDS_TO_WAIT
+    while True:
+        try:
+            return session.delete()
+        except ServerError as error:
+            if error.status != 409 or time.monotonic() > deadline:
+                raise
+        time.sleep(0.02)
 
 
 @contextmanager
