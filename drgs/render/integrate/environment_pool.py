@@ -31,7 +31,7 @@ from drgs.render.integrate.environment_table import (
     uv_from_world_direction,
 )
 from drgs.render.integrate.random_warp import hash_combine, sobol_2d
-from drgs.warp_torch import load_kernel, warp_array, warp_device
+from drgs.warp_torch import load_kernel, share_out, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
 
@@ -191,15 +191,28 @@ def candidate_pools(light: Any, candidates: int, seed: int, first_round: int, la
     return pools
 
 
+def draw_ahead(light: Any, seed: int, first_round: int, end_round: int, device: torch.device) -> None:
+    """Draw the pools of a range of rounds side by side, so that slices which need all of them need not draw one after the other."""
+    seed = seed & 0xFFFFFFFF
+    with _lock:
+        kept = _kept.setdefault(light, OrderedDict())
+        missing = [round_ for round_ in range(first_round, end_round) if (seed, round_) not in kept][:ROUNDS_KEPT]
+    numbers = share_out(lambda k, _: _draw(light, seed, missing[k], device), range(len(missing) + 1))
+    with _lock:
+        kept.update({(seed, round_): drawn for round_, drawn in zip(missing, numbers, strict=True)})
+
+
+def _draw(light: Any, seed: int, round_: int, device: torch.device) -> Tensor:
+    """(2 * POOL * NUMBERS,), drawn by the calling thread."""
+    numbers = torch.empty(2 * POOL * NUMBERS, device=device)
+    load_kernel(draw_pools, warp_device(numbers))
+    wp.launch(draw_pools, dim=2 * POOL, inputs=[light, seed, round_], outputs=[warp_array(numbers)], device=warp_device(numbers))
+    return numbers
+
+
 def _pools_of_round(kept: OrderedDict[tuple[int, int], Tensor], light: Any, seed: int, round_: int, device: torch.device) -> Tensor:
     """(2 * POOL * NUMBERS,)."""
-    numbers = kept.get((seed, round_))
-    if numbers is None:
-        numbers = torch.empty(2 * POOL * NUMBERS, device=device)
-        load_kernel(draw_pools, warp_device(numbers))
-        # On this thread: threads of the pool may be waiting for the lock.
-        inputs, outputs = [light, seed, round_], [warp_array(numbers)]
-        wp.launch(draw_pools, dim=2 * POOL, inputs=inputs, outputs=outputs, device=warp_device(numbers))
-        kept[seed, round_] = numbers
+    if (seed, round_) not in kept:
+        kept[seed, round_] = _draw(light, seed, round_, device)  # not by the thread pool, whose threads may be waiting for the lock
     kept.move_to_end((seed, round_))
-    return numbers
+    return kept[seed, round_]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from drgs.render.integrate.choose_integrator import choose_integrator
-from drgs.render.integrate.environment_pool import ROUNDS_KEPT
+from drgs.render.integrate.environment_pool import ROUNDS_KEPT, draw_ahead
 from drgs.render.integrate.integrator import IntegratorSettings
 from drgs.render.integrate.plan import at_rest, moving_counts
 from drgs.render.intersect.horizon import usable_horizons
@@ -49,8 +49,10 @@ from drgs.warp_torch import thread_count
 SLICES_A_THREAD = (2, 8)
 """Slices of the image for each thread when passes run side by side, fewest and most: with few, some thread waits, for one slice's rays may
 cost twice another's; many are worth it where each still holds half of PIXELS_AT_ONCE."""
-PIXELS_AT_ONCE = 65536
+PIXELS_AT_ONCE = 131072
 """Camera rays that a thread takes together, of as many passes as that makes: Python's share of the time falls with it."""
+SHORTEST_RAYS = 32768
+"""Camera rays that the shortest slices still take together: slices shrink towards the end, lest a thread wait long for another's last one."""
 POOLS_AT_ONCE = 16
 """Passes that a thread takes together at most where samples choose: their pools (environment_pool.py) then take 2 MiB."""
 
@@ -182,9 +184,12 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
             points += len(primary.points.pixel)
         return points, tracing, primary.starts.face
 
+    if state.plan.candidates > 1:
+        draw_ahead(state.traced.environment_light, state.inputs.settings.seed, index, index + count, pixels.device)
     fewest, most = (slices * thread_count() for slices in SLICES_A_THREAD)
     slices = min(max(fewest, 2 * len(pixels) * count // PIXELS_AT_ONCE), most)
-    done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // slices)))
+    together = min(count, POOLS_AT_ONCE) if state.plan.candidates > 1 else count
+    done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // slices)), max(1, SHORTEST_RAYS // together))
     count_places(state.sums, here, None if rates is None else state.rates, index, index + count)
     traced = sum(seconds for _, seconds, _ in done) / max(1, min(thread_count(), len(done)))
     seconds = {"trace_primary": traced, "shade": max(0.0, time.perf_counter() - started - traced)}

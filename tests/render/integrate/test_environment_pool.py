@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+import warp as wp
 
 from drgs.reference import environment_pool as twin
 from drgs.reference import shade as reference
 from drgs.render.integrate import environment_pool
-from drgs.render.integrate.environment_pool import BLOCKS, CANDIDATES, NUMBERS, POOL, candidate_pools
+from drgs.render.integrate.environment_pool import BLOCKS, CANDIDATES, NUMBERS, POOL, candidate_pools, draw_ahead
 from drgs.render.integrate.environment_table import build_environment_table, environment_light
 from drgs.render.integrate.fused_embree import FusedEmbreeIntegrator
 from drgs.render.integrate.integrator import IntegratorSettings
@@ -99,6 +100,16 @@ def test_the_pool_is_its_twins_and_follows_the_tables_density(device: str) -> No
     polar = (torch.arange(finer.shape[1], dtype=torch.float64) + 0.5) * math.pi / finer.shape[1]
     integral = (finer * torch.sin(polar)[:, None]).mean((1, 2)) * 2 * math.pi**2
     torch.testing.assert_close((radiance / density[:, None]).double().mean((0, 2)), integral, rtol=0.02, atol=0)
+
+
+def test_pools_drawn_ahead_are_those_that_would_be_drawn_when_asked_for() -> None:
+    ahead, asked = (environment_light(build_environment_table(half_black_sky())) for _ in range(2))
+    draw_ahead(ahead, 7, 3, 9, torch.device("cpu"))
+    drawn = environment_pool._kept[ahead][7, 5]
+    found, truth = (wp.to_torch(candidate_pools(light, CANDIDATES, 7, 3, 8, torch.device("cpu")).numbers) for light in (ahead, asked))
+    assert torch.equal(found, truth)
+    draw_ahead(ahead, 7, 4, 12, torch.device("cpu"))
+    assert environment_pool._kept[ahead][7, 5] is drawn, "what is there is not drawn again"
 
 
 def test_pools_of_rounds_and_purposes_differ_and_are_kept_within_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
