@@ -2,7 +2,7 @@
 
     python -m benchmarks beside DATASET ASSET [--preset draft] [--size 400] [--seconds 20] [--json]
 
-The same build is run four times: alone; twice at once; and, as the service's worker runs it (giving way to others by ten steps of priority), while a
+The same build is run four times: alone; twice at once; and, as the service's worker runs it (giving way to others by some steps of priority), while a
 viewer of ASSET moves its camera with each picture that comes. A viewer that has the machine to itself is measured for `--seconds` before.
 beside_build_ratio, beside_viewer_ratio: seconds over those alone, of the two builds the longer one's; ..._cpu_ratio: the same of processor time, which says
 what threads that wait for each other burn. viewer_kept: pictures a second that the viewer gets while the build runs, over those without it.
@@ -24,8 +24,9 @@ from drgs.scene.asset import load_asset
 from drgs.scene.camera import opengl_from_camera
 from drgs_server.client import Stream
 from drgs_server.live.frame_header import CAMERA_NUMBER_SHIFT, FrameHeader
+from drgs_worker.run import MODESTY
 
-GIVING_WAY = "import os, sys; os.nice(10); sys.argv[0] = 'drgs'; from drgs.cli import main; main()"
+GIVING_WAY = f"import os, sys; os.nice({MODESTY}); sys.argv[0] = 'drgs'; from drgs.cli import main; main()"
 """`drgs` with the priority of the service's worker; its arguments follow."""
 FIELD_OF_VIEW_DEGREES = 31.5
 """Of the viewer's camera."""

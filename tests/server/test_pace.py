@@ -40,10 +40,29 @@ def test_the_size_recovers_when_the_machine_does() -> None:
     assert [measure(pace, 0.02) for _ in range(10)][-1] == 1.0
 
 
+def test_the_size_recovers_from_a_slow_start_though_small_pictures_cost_more_a_pixel() -> None:
+    pace = Pace()
+    measure(pace, 0.5)
+    scales = [measure(pace, 0.03, fixed_seconds=0.02) for _ in range(80)]
+    assert scales[0] == 0.5 and scales[-1] == 1.0, "50 ms at full size; what small ones cost says 80"
+    assert len([scale for scale, next_ in pairwise(scales) if next_ < scale]) <= 1
+
+
+def test_a_larger_size_is_tried_ever_more_seldom_where_it_is_too_slow() -> None:
+    pace = Pace()
+    scales = [measure(pace, 0.12) for _ in range(600)]
+    tried = [k for k, scale in enumerate(scales) if scale == 1.0][1:]
+    assert set(scales[1:]) == {0.75, 1.0} and 3 <= len(tried) <= 5
+    assert all(b >= a for a, b in pairwise([b - a for a, b in pairwise(tried)]))
+    slow = Pace()
+    assert {measure(slow, 0.5) for _ in range(200)} == {1.0, 0.5}, "twice as long as wanted at the least: not tried"
+    assert [measure(slow, 0.5) for _ in range(200)].count(1.0) == 0
+
+
 def test_the_size_does_not_flicker_at_a_limit() -> None:
     pace = Pace()
     scales = [measure(pace, 1 / 12 + (0.001 if k % 2 else -0.001)) for k in range(60)]
-    assert sum(a != b for a, b in pairwise(scales[5:])) <= 1
+    assert sum(a != b for a, b in pairwise(scales[5:])) <= 2, "but for the one picture that is tried larger"
 
 
 def test_small_pictures_are_not_reduced() -> None:

@@ -39,6 +39,9 @@ from drgs_worker.store.settings import read_settings
 SHUTDOWN_SECONDS = 30
 """For the checkpoint of a build that is told to stop."""
 MAX_SLOTS = 64
+MODESTY = 3
+"""Nice value, less than that of threads that render: beside a viewer that moves all the time a build gets more than half of the machine, and the viewer's
+pictures get smaller; the event loop and a browser, which need little, come before either. `python -m benchmarks beside` tells both."""
 
 
 def run_worker(data: Path | None = None, device: str | None = None, parent_pid: int | None = None) -> int:
@@ -55,7 +58,7 @@ def run_worker(data: Path | None = None, device: str | None = None, parent_pid: 
     directory = open_data_directory(settings.data, settings.database_url, settings.queue_url, settings.artifact_url)
     worker_id, slot_lock = _claim_slot(directory)
     spin_briefly()
-    os.nice(10)  # the viewer comes first where both run on one machine
+    os.nice(MODESTY)
     engine = open_database(directory)
     migrate_queue(directory)
     refuse_pickled_rows()

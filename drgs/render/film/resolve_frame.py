@@ -4,7 +4,9 @@ All but the last step happens in the window around the tiles that show something
 """
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 import warp as wp
@@ -17,9 +19,10 @@ from drgs.render.film.tonemap import tonemap
 from drgs.render.integrate.environment_table import EnvironmentLight, lookup_radiance, uv_from_world_direction
 from drgs.render.progressive.converge import frame_errors
 from drgs.render.progressive.frame_state import FrameState, GaussianView
+from drgs.render.progressive.invalidate import same_camera
 from drgs.render.progressive.mean_radiance import mean_gbuffer, mean_radiance, moving_radiance
 from drgs.render.records import Frame
-from drgs.scene.camera import world_from_pixel
+from drgs.scene.camera import Camera, world_from_pixel
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -93,10 +96,30 @@ def _background(state: FrameState) -> Tensor | None:
         return None
     if not isinstance(background, str):
         return torch.tensor(background, device=state.sums.weight.device)
-    scene, camera, light = state.inputs.scene, state.inputs.camera, state.traced.environment_light
+    scene, light = state.inputs.scene, state.traced.environment_light
     if background == "blurred":
         light = blurred_light(scene.environment, scene.environment_rotation_degrees, scene.environment_intensity)
-    rows = state.inputs.rows
+    known = _behind.get(light)
+    if known is None or known.rows != state.inputs.rows or not same_camera(known.camera, state.inputs.camera):
+        known = _behind[light] = _Behind(state.inputs.camera, state.inputs.rows, _environment_behind(state, light))
+    return known.radiance
+
+
+@dataclass(frozen=True, eq=False)
+class _Behind:
+    """What a camera sees of the environment where nothing is in its way."""
+
+    camera: Camera
+    rows: slice
+    radiance: Tensor
+
+
+_behind: WeakKeyDictionary[Any, _Behind] = WeakKeyDictionary()
+"""Of lights that are used, by the last camera: pictures that get better, and those after an edit, have the same behind them."""
+
+
+def _environment_behind(state: FrameState, light: Any) -> Tensor:
+    camera, rows = state.inputs.camera, state.inputs.rows
     radiance = state.sums.weight.new_empty(state.inputs.height, camera.width, 3)
     inputs = [camera.width, rows.start, wp.mat33(*world_from_pixel(camera).flatten().tolist()), light]
     launch(

@@ -71,7 +71,7 @@ NOTHING_BEFORE = Invalidation(frozenset(), frozenset(PARTS))
 def invalidate(before: FrameInputs, now: FrameInputs) -> Invalidation:
     """What of a frame made of `before` is old for one made of `now`."""
     changed = changed_in_scene(before.scene, now.scene)
-    if not _same_camera(before.camera, now.camera):
+    if not same_camera(before.camera, now.camera):
         changed |= {"camera"}
     if _rays_asked_for(before) != _rays_asked_for(now):
         changed |= {"rays"}
@@ -119,7 +119,8 @@ def _same_tensors(a: object, b: object, *names: str) -> bool:
     return all(getattr(a, name) is getattr(b, name) for name in names)
 
 
-def _same_camera(a: Camera, b: Camera) -> bool:
+def same_camera(a: Camera, b: Camera) -> bool:
+    """Whether both see the same picture."""
     if a is b:
         return True
     return (a.width, a.height) == (b.width, b.height) and all(

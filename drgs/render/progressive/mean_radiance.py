@@ -111,6 +111,49 @@ def moving_radiance(picture: MovingPicture, light: DemodulatedLight, samples: in
     return replace(radiance, variance=2 * (radiance.diffuse_variance + radiance.specular_variance))
 
 
+@wp.struct
+class MeanSurface:
+    """GBuffer as kernels see it."""
+
+    coverage: wp.array2d[float]
+    depth: wp.array2d[float]
+    position_world: wp.array2d[wp.vec3]
+    normal_world: wp.array2d[wp.vec3]
+    wo_world: wp.array2d[wp.vec3]
+    albedo: wp.array2d[wp.vec3]
+    roughness: wp.array2d[float]
+    metallic: wp.array2d[float]
+
+
+@wp.func
+def mean_vector(surface: wp.array2d[float], pixel: int, column: int, weight: float) -> wp.vec3:
+    return wp.vec3(surface[pixel, column], surface[pixel, column + 1], surface[pixel, column + 2]) / weight
+
+
+@wp.kernel
+def mean_surface(
+    first: int,
+    window: WindowPlace,
+    sums: SumArrays,
+    # outputs
+    mean: MeanSurface,
+):
+    """Over the places that found a surface; 0 where none did, infinitely far."""
+    i = first + wp.tid()
+    y = i / window.width
+    x = i - y * window.width
+    p = (window.row + y) * window.image_width + window.column + x
+    w = wp.max(sums.weight[p], 1.0)
+    mean.coverage[y, x] = sums.weight[p] / wp.max(sums.places[p], 1.0)
+    mean.depth[y, x] = wp.where(sums.weight[p] > 0.0, sums.surface[p, 14] / w, wp.inf)
+    mean.position_world[y, x] = mean_vector(sums.surface, p, 0, w)
+    mean.normal_world[y, x] = wp.normalize(mean_vector(sums.surface, p, 3, w))
+    mean.wo_world[y, x] = wp.normalize(mean_vector(sums.surface, p, 6, w))
+    mean.albedo[y, x] = mean_vector(sums.surface, p, 9, w)
+    mean.roughness[y, x] = sums.surface[p, 12] / w
+    mean.metallic[y, x] = sums.surface[p, 13] / w
+
+
 _gbuffers: WeakKeyDictionary[FrameSums, tuple[int, GBuffer]] = WeakKeyDictionary()
 """Of sums that live, after so many passes over all tiles: denoiser, history and whoever shows the picture ask for it."""
 
@@ -130,12 +173,16 @@ def mean_gbuffer(state: FrameState) -> GBuffer:
 
 def _mean_surface(state: FrameState) -> GBuffer:
     assert state.sums.surface is not None
-    weight = state.in_window(state.sums.weight)
-    coverage = weight / state.places_in_window.clamp(min=1)
-    mean = state.in_window(state.sums.surface) / weight.clamp(min=1)[..., None]
-    depth = torch.where(coverage > 0, mean[..., 14], torch.inf)
-    normal, wo = (torch.nn.functional.normalize(mean[..., a : a + 3].contiguous(), dim=-1) for a in (3, 6))
-    return GBuffer(coverage, depth, mean[..., :3], normal, wo, mean[..., 9:12], mean[..., 12], mean[..., 13])
+    device, size = state.sums.weight.device, state.window.shape
+    vectors = {name: torch.empty(*size, 3, device=device) for name in ("position_world", "normal_world", "wo_world", "albedo")}
+    numbers = {name: torch.empty(*size, device=device) for name in ("coverage", "depth", "roughness", "metallic")}
+    maps = MeanSurface()
+    for name, values in vectors.items():
+        setattr(maps, name, warp_array(values, wp.vec3))
+    for name, values in numbers.items():
+        setattr(maps, name, warp_array(values))
+    launch(mean_surface, size[0] * size[1], [_window_place(state.window), sum_arrays(state.sums)], [maps], warp_device(state.sums.weight))
+    return GBuffer(**numbers, **vectors)
 
 
 def frame_history(state: FrameState) -> History | None:

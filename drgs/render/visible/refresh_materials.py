@@ -3,13 +3,17 @@
 from dataclasses import replace
 
 import torch
+import warp as wp
 
+from drgs.render.intersect.mesh_surface import MeshArrays, mesh_arrays, surface_at
 from drgs.render.records import GBuffer, PrimaryPoints, ShadingPoints
 from drgs.render.visible.rasterize import rasterize_gbuffer
-from drgs.scene.albedo_detail import detailed_albedo
 from drgs.scene.camera import Camera
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedSurfels
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
 
 
 def refresh_gbuffer(gbuffer: GBuffer, surfels: PosedSurfels, camera: Camera) -> GBuffer:
@@ -33,13 +37,34 @@ def refresh_points(points: ShadingPoints, gbuffer: GBuffer) -> ShadingPoints:
     )
 
 
+@wp.kernel
+def materials_at(
+    first: int,
+    face: wp.array[int],
+    barycentric: wp.array[wp.vec2],
+    mesh: MeshArrays,
+    # outputs
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    metallic: wp.array[float],
+):
+    i = first + wp.tid()
+    surface = surface_at(mesh, face[i], barycentric[i])
+    albedo[i] = surface.albedo
+    roughness[i] = surface.roughness
+    metallic[i] = surface.metallic
+
+
 def refresh_primary(primary: PrimaryPoints, mesh: TriangleMesh) -> PrimaryPoints:
     """The same points of a mesh of the same shape with other materials."""
-    assert primary.starts.face is not None and primary.barycentric is not None
-    corner = mesh.faces[primary.starts.face.long()].long()
-    y, z = primary.barycentric.unbind(-1)
-    weights = torch.stack([1 - y - z, y, z], -1)
-    albedo = (weights[..., None] * mesh.albedo.detach()[corner]).sum(1)
-    albedo = detailed_albedo(albedo, mesh.detail, mesh.faces, primary.starts.face, primary.barycentric)
-    roughness, metallic = ((weights * values.detach()[corner]).sum(1) for values in (mesh.roughness, mesh.metallic))
+    face, barycentric = primary.starts.face, primary.barycentric
+    assert face is not None and barycentric is not None
+    albedo, roughness, metallic = (torch.empty_like(getattr(primary.points, name)) for name in ("albedo", "roughness", "metallic"))
+    launch(
+        materials_at,
+        len(face),
+        [warp_array(face), warp_array(barycentric, wp.vec2), mesh_arrays(mesh, 0.0)],
+        [warp_array(albedo, wp.vec3), warp_array(roughness), warp_array(metallic)],
+        warp_device(albedo),
+    )
     return replace(primary, points=replace(primary.points, albedo=albedo, roughness=roughness, metallic=metallic))

@@ -27,8 +27,13 @@ from drgs_server.render.interface import AbstractPicture, AbstractPose
 
 MOVING_SECONDS = 0.2
 """Without input, after which the picture counts as still."""
+ANSWER_SECONDS = 0.03
+"""Beyond the round trip, in which the next input of a row is waited for once its last one's picture is sent: a refinement begun meanwhile would be thrown
+away and keep that picture waiting."""
 STILL_FRAME_SECONDS = 0.25
 """Between two frames while samples add up; the first ones come as soon as their samples have doubled."""
+REDUCED_SECONDS = 1 / 13
+"""From one reduced moving picture's beginning to the next one's, at least: other work, for which they were reduced, gets the rest of the time."""
 STATUS_SECONDS = 0.2
 ROUND_TRIP_WEIGHT = 0.2
 """Of the newest measurement."""
@@ -67,6 +72,9 @@ class _Progress:
     inputs: _Inputs
     picture: AbstractPicture
     scale: float
+    begun_at: float
+    rests_until: float = 0.0
+    """Nothing is added before, unless something comes in."""
     samples_sent: int = 0
     sent_at: float = 0.0
     converged_sent: bool = False
@@ -93,6 +101,8 @@ class Viewer:
         self._settings = Settings()
         self._visible = True
         self._input_at = -MOVING_SECONDS
+        self._in_a_row = False
+        """The last input came soon after the one before."""
         self._last_frame_id = 0
         self._acked_frame_id = 0
         self._sent_at: dict[int, float] = {}
@@ -144,6 +154,7 @@ class Viewer:
 
     def _touch(self) -> None:
         self._generation += 1
+        self._in_a_row = self.moving
         self._input_at = self._clock()
 
     @property
@@ -184,10 +195,10 @@ class Viewer:
                 return None
         progress = self._progress
         if progress is None or progress.inputs.generation != inputs.generation:
-            return 0.0
+            return 0.0 if progress is None or progress.scale == 1 else progress.begun_at + REDUCED_SECONDS
         if progress.scale < 1:
             return self._input_at + MOVING_SECONDS
-        return None if progress.converged_sent else 0.0
+        return None if progress.converged_sent else progress.rests_until
 
     def _inputs(self) -> _Inputs | None:
         posed = self._posed()
@@ -226,16 +237,18 @@ class Viewer:
             return
         self._send(progress, moving and begun, converged and not overtaken)
         if begun:
+            if self._in_a_row:
+                progress.rests_until = self._clock() + min(ANSWER_SECONDS + (self._round_trip or 0.0), MOVING_SECONDS)
             self._pace.measured(picture.width, picture.height, progress.scale, self._clock() - start)
 
     def _begin(self, inputs: _Inputs, moving: bool) -> _Progress:
-        asked = inputs.camera
+        asked, begun_at = inputs.camera, self._clock()
         scale = self._pace.scale(asked.width, asked.height) if moving else 1.0
         width, height = max(round(asked.width * scale), 1), max(round(asked.height * scale), 1)
         previous = self._progress.picture if self._progress else None
         picture = inputs.posed.pose.begin(asked, inputs.settings, width, height, previous)
         picture.refine()
-        return _Progress(inputs, picture, scale)
+        return _Progress(inputs, picture, scale, begun_at)
 
     def _worth_a_frame(self, progress: _Progress) -> bool:
         waited = self._clock() - progress.sent_at
@@ -283,7 +296,9 @@ class Viewer:
         picture = progress.picture
         notes = list(picture.notes)
         if progress.scale < 1:
-            notes.append(f"moving: {progress.scale:.0%} of the width, because this machine needs longer for all of it")
+            notes.append(
+                f"moving: {progress.scale:.0%} of the width, because this machine needs longer for all of it; at most {1 / REDUCED_SECONDS:.0f} a second"
+            )
         self._deliver(
             StatusMessage(
                 phase=phase,

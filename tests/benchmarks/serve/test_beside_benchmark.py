@@ -8,6 +8,7 @@ from benchmarks.builds.build_process import BuildRun
 from benchmarks.render.frame import served
 from benchmarks.serve.beside import GIVING_WAY, camera_path, figures, pictures_a_second
 from drgs.scene.asset import Asset, save_asset
+from drgs_worker.run import MODESTY
 from tests.render.closed_form_scenes import sunny_sky, two_spheres
 
 
@@ -28,7 +29,7 @@ def test_a_build_that_gives_way_is_the_command_itself(tmp_path: Path):
     asked = f"import os; print(os.nice(0), end=' '); {GIVING_WAY.replace('main()', 'print(os.nice(0), sys.argv)')}"
     said = subprocess.run([sys.executable, "-c", asked, "build", "x"], capture_output=True, text=True, check=True).stdout
     before, after, *arguments = said.split(maxsplit=2)
-    assert int(after) == min(int(before) + 10, 19) and arguments == ["['drgs', 'build', 'x']\n"]
+    assert int(after) == min(int(before) + MODESTY, 19) and arguments == ["['drgs', 'build', 'x']\n"]
 
 
 @pytest.mark.slow
