@@ -21,7 +21,7 @@ from drgs_server.live.frame_header import (
     pack_frame,
 )
 from drgs_server.live.messages import MAX_FRAMES_IN_FLIGHT, CameraMessage, ErrorMessage, Phase, Settings, StatusMessage
-from drgs_server.live.pace import Pace
+from drgs_server.live.pace import TARGET_SECONDS, Pace
 from drgs_server.render.encode import encode_jpeg, encode_png, has_alpha
 from drgs_server.render.interface import AbstractPicture, AbstractPose
 
@@ -32,8 +32,6 @@ ANSWER_SECONDS = 0.03
 away and keep that picture waiting."""
 STILL_FRAME_SECONDS = 0.25
 """Between two frames while samples add up; the first ones come as soon as their samples have doubled."""
-REDUCED_SECONDS = 1 / 13
-"""From one reduced moving picture's beginning to the next one's, at least: other work, for which they were reduced, gets the rest of the time."""
 STATUS_SECONDS = 0.2
 ROUND_TRIP_WEIGHT = 0.2
 """Of the newest measurement."""
@@ -195,7 +193,9 @@ class Viewer:
                 return None
         progress = self._progress
         if progress is None or progress.inputs.generation != inputs.generation:
-            return 0.0 if progress is None or progress.scale == 1 else progress.begun_at + REDUCED_SECONDS
+            return (
+                0.0 if progress is None or progress.scale == 1 else progress.begun_at + TARGET_SECONDS
+            )  # other work gets the rest of the time
         if progress.scale < 1:
             return self._input_at + MOVING_SECONDS
         return None if progress.converged_sent else progress.rests_until
@@ -297,7 +297,7 @@ class Viewer:
         notes = list(picture.notes)
         if progress.scale < 1:
             notes.append(
-                f"moving: {progress.scale:.0%} of the width, because this machine needs longer for all of it; at most {1 / REDUCED_SECONDS:.0f} a second"
+                f"moving: {progress.scale:.0%} of the width, because this machine needs longer for all of it; at most {1 / TARGET_SECONDS:.0f} a second"
             )
         self._deliver(
             StatusMessage(
