@@ -215,6 +215,8 @@ def sum_pair_gradients(
     surfel_gradients: wp.array2d[float],
 ):
     i = first + wp.tid()
+    for k in range(columns):
+        surfel_gradients[i, k] = 0.0
     for pair in range(offsets[i], offsets[i + 1]):
         for k in range(columns):
             surfel_gradients[i, k] += pair_gradients[pair, k]

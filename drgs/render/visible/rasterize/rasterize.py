@@ -156,20 +156,24 @@ class _Rasterize(torch.autograd.Function):
         warp = warp_device(centers)
         tiles_x, tiles_y = _padded_size(camera)
         plane = tiles_x * tiles_y * TILE * TILE
-        gradients = torch.zeros(len(planes), plane, device=device)  # padding, and maps that nobody used, stay 0
+        # Padding, and maps that nobody used, stay 0; where all is written it need not be 0 before.
+        is_whole = plane == camera.height * camera.width and channels == ctx.feature_channels
+        gradients = (torch.empty if is_whole else torch.zeros)(len(planes), plane, device=device)
         images = gradients.view(-1, tiles_y * TILE, tiles_x * TILE)[:, : camera.height, : camera.width]
         images[: ctx.feature_channels] = 0.0 if image_gradients[0] is None else image_gradients[0]
-        for k, image_gradient in enumerate(image_gradients[1:]):
-            if image_gradient is not None:
-                images[channels + k] = image_gradient
+        for k, image_gradient in enumerate(image_gradients[1 : 1 + len(planes) - channels]):
+            images[channels + k] = 0.0 if image_gradient is None else image_gradient
         # S = sum_i w_i (g . f_i): everything blended with weight w, that is all planes but the median.
         blended = channels + 1 + 2 * settings.depth
-        total = (gradients[:blended] * planes[:blended]).sum(0)
-        surfel_gradients = torch.zeros(count, 16 + channels, device=device)
+        total = gradients[0] * planes[0]
+        for k in range(1, blended):  # one product of all planes would be written whole, and read again
+            total.addcmul_(gradients[k], planes[k])
+        surfel_gradients = torch.empty(count, 16 + channels, device=device)
         table = _tile_table((tiles_x, tiles_y), 0, ctx.depth_origin, lists, parameters, features)
         inputs = [table, warp_array(gradients), warp_array(total), warp_array(median_entry)]
         if ctx.per_pixel:
             # Atomic sums: one thread on the CPU (tests only).
+            surfel_gradients.zero_()
             kernel = pixel_backward_kernel(channels, settings.depth)
             wp.launch(kernel, dim=plane, inputs=[0, *inputs], outputs=[warp_array(surfel_gradients)], device=warp)
         else:
