@@ -1,6 +1,6 @@
 """What a user of the viewer waits for, measured in Chromium with software GL on a server of this machine.
 
-    python -m benchmarks viewer [--mesh FILE] [--repeats 7] [--turn-seconds 3] [--json]
+    python -m benchmarks viewer [--asset ASSET | --mesh FILE] [--repeats 7] [--turn-seconds 3] [--json]
 
 edit_to_pixel_ms: from a slider's event to the first changed picture on the screen, which the browser draws itself; edit_to_traced_ms: to the
 first traced picture of that edit. local_fps: pictures a second that the browser draws while the camera turns, 800x600, once it has found how
@@ -17,6 +17,7 @@ import argparse
 import gzip
 import itertools
 import json
+import shutil
 import statistics
 import tempfile
 import time
@@ -73,12 +74,26 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks viewer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--mesh", type=Path, help="GLB, PLY, OBJ or a zipped asset; a ball of 1280 faces without it")
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument("--asset", type=Path, help="a built asset, a folder or zipped")
+    shown.add_argument("--mesh", type=Path, help="GLB, PLY, OBJ or a zipped asset; a ball of 1280 faces without it")
     parser.add_argument("--repeats", type=int, default=7, help="edits that are timed")
     parser.add_argument("--turn-seconds", type=float, default=3.0, help="how long the camera is turned for each rate")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
-    print(json.dumps(measure(given.mesh, given.repeats, given.turn_seconds), indent=None if given.json else 1))
+    with tempfile.TemporaryDirectory(prefix="drgs-viewer-") as folder:
+        mesh = given.mesh if given.asset is None else zipped(given.asset, Path(folder))
+        print(json.dumps(measure(mesh, given.repeats, given.turn_seconds), indent=None if given.json else 1))
+
+
+def zipped(asset: Path, folder: Path) -> Path:
+    """The asset as one file, which a page can be given.
+
+    Raises:
+        ValueError: it is no asset.
+    """
+    load_asset(asset)  # complain before a browser is started
+    return asset if asset.is_file() else Path(shutil.make_archive(str(folder / asset.name), "zip", asset))
 
 
 def measure(mesh: Path | None, repeats: int, turn_seconds: float) -> dict[str, float]:
