@@ -26,7 +26,7 @@ SETTLE_AFTER_SLICES = (1, 30)
 """The first pictures load kernels and all that they need."""
 
 
-MODESTY = 5
+MODESTY = 7
 """Nice value of threads that compute for long."""
 
 

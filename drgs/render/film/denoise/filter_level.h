@@ -14,6 +14,10 @@ const auto luminance = [&](const float* p) { return LUMINANCE_RED * load16(p) + 
 const v16 y_d = luminance(from + at), y_s = luminance(from + 3 * plane + at);
 const v16 local_d = load16(soft + at), local_s = load16(soft + plane + at);
 const v16 plane_scale = 1.0f / max16(sigma_plane * (float)step * load16(guide + plane + at), v16(1e-12f));
+const auto weight = [&](v16 most, v16 off) -> v16 {
+    const v16 found = most * exp_negative(min16(off, v16(28.0f)));
+    return select(found > 1e-12f, found, v16(0.0f));
+};
 v16 sum[8], weights_d(0.0f), weights_s(0.0f);
 for (int k = 0; k < 8; ++k) sum[k] = v16(0.0f);
 const float hat[3] = {0.375f, 0.25f, 0.0625f};
@@ -26,6 +30,8 @@ for (int dy = -2; dy <= 2; ++dy) {
         const v16 there = load16(guide + q);
         if (!any(there > 0.0f)) continue;
         v16 alike = max16(nx * load16(guide + 5 * plane + q) + ny * load16(guide + 6 * plane + q) + nz * load16(guide + 7 * plane + q), v16(0.0f));
+        // Weights below 1e-12 are none: numbers too small for a float's exponent take the processor a hundred times as long.
+        alike = select(alike > 0.65f, alike, v16(0.0f));
         for (int k = 1; k < NORMAL_POWER; k *= 2) alike *= alike;
         const v16 off = nx * (load16(guide + 2 * plane + q) - x) + ny * (load16(guide + 3 * plane + q) - y) + nz * (load16(guide + 4 * plane + q) - z);
         const v16 off_plane = abs16(off) * plane_scale;
@@ -35,7 +41,7 @@ for (int dy = -2; dy <= 2; ++dy) {
         const v16 s0 = load16(from + 3 * plane + q), s1 = load16(from + 4 * plane + q), s2 = load16(from + 5 * plane + q);
         const v16 off_d = abs16(LUMINANCE_RED * d0 + LUMINANCE_GREEN * d1 + LUMINANCE_BLUE * d2 - y_d) / (sigma_luminance * sqrt16(both_d) + 1e-6f);
         const v16 off_s = abs16(LUMINANCE_RED * s0 + LUMINANCE_GREEN * s1 + LUMINANCE_BLUE * s2 - y_s) / (sigma_luminance * sqrt16(both_s) + 1e-6f);
-        const v16 w_d = shared * exp_negative(off_plane + off_d), w_s = shared * exp_negative(off_plane + off_s);
+        const v16 w_d = weight(shared, off_plane + off_d), w_s = weight(shared, off_plane + off_s);
         sum[0] += w_d * d0;
         sum[1] += w_d * d1;
         sum[2] += w_d * d2;

@@ -64,7 +64,7 @@ for (int entry = first; entry < last; ++entry) {
         if (!any(live)) continue;
         touched = true;
         const v16 rho_plane = select(front, h2 / (hz2 + 1e-30f), v16(1e30f));
-        const v16 rho = min16(rho_plane, rho_screen);
+        const v16 rho = min16(min16(rho_plane, rho_screen), v16(FAR));  // tile_forward.h says why
         const v16 e = exp_negative(0.5f * rho);
         const v16 raw = q[13] * e;
         const v16 alpha = min16(v16(MAX_ALPHA), raw);

@@ -14,6 +14,8 @@ from drgs.maths.constants import MAX_ALPHA, MIN_TRANSMITTANCE
 from drgs.render.native_source import native_source
 from drgs.render.visible.rasterize.project import DEPTH_CUTOFF, PARAMETERS
 
+FAR = 100.0
+"""Squared distance from a surfel, in standard deviations, that counts for all farther ones. No pixel is live beyond 12: its opacity there is below MIN_ALPHA."""
 CHANNEL_STEPS = (4, 8, 12, 16, 20, 24, 32, 48)
 """Compiled widths; features are padded with zeros to the next one."""
 
@@ -31,7 +33,7 @@ def padded_channels(channels: int) -> int:
 
 
 def _source(name: str, channels: int, depth: bool) -> str:
-    limits = {"MAX_ALPHA": MAX_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE, "DEPTH_CUTOFF": DEPTH_CUTOFF}
+    limits = {"FAR": FAR, "MAX_ALPHA": MAX_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE, "DEPTH_CUTOFF": DEPTH_CUTOFF}
     sizes = {"CHANNELS": channels, "DEPTH": int(depth), "PARAMETERS": PARAMETERS}
     return native_source(Path(__file__).with_name(name), constants={**sizes, **limits})
 
