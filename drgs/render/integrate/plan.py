@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import torch
-from torch import Tensor
 
 from drgs.maths.constants import F0
 from drgs.render.integrate.environment_pool import CANDIDATES
@@ -102,15 +101,9 @@ _known_extremes: WeakKeyDictionary[TriangleMesh | Materials, tuple[float, float,
 def _extremes(m: TriangleMesh | Materials) -> tuple[float, float, float]:
     """Largest diffuse part, largest metallic, smallest roughness."""
     if m not in _known_extremes:
-        diffuse = float(((1 - m.metallic) * _largest(m.albedo)).max())
+        diffuse = float(((1 - m.metallic) * m.albedo.amax(-1)).max())
         _known_extremes[m] = diffuse, float(m.metallic.max()), float(m.roughness.min())
     return _known_extremes[m]
-
-
-def _largest(albedo: Tensor) -> Tensor:
-    """(...,) of the three channels; torch's amax over a last axis of three takes ten times as long."""
-    red, green, blue = albedo.unbind(-1)
-    return torch.maximum(torch.maximum(red, green), blue)
 
 
 _diffuse_shares: WeakKeyDictionary[TriangleMesh, float] = WeakKeyDictionary()
@@ -118,7 +111,7 @@ _diffuse_shares: WeakKeyDictionary[TriangleMesh, float] = WeakKeyDictionary()
 
 def _diffuse_share(mesh: TriangleMesh) -> float:
     if mesh not in _diffuse_shares:
-        base = _largest(mesh.albedo)
+        base = mesh.albedo.amax(-1)
         diffuse, specular = (1 - mesh.metallic) * base, F0 * (1 - mesh.metallic) + mesh.metallic * base
         _diffuse_shares[mesh] = float((diffuse >= LEAST_DIFFUSE * (diffuse + specular)).float().mean())
     return _diffuse_shares[mesh]

@@ -15,6 +15,7 @@ from drgs.render.progressive.moving_picture import MovingPicture
 from drgs.render.progressive.reproject import blend_history, remember
 from drgs.render.records import DemodulatedLight, GBuffer, History, Radiance
 from drgs.render.visible.image_tiles import Window
+from drgs.render.visible.rasterize.gbuffer import GBufferArrays, gbuffer_arrays
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -111,20 +112,6 @@ def moving_radiance(picture: MovingPicture, light: DemodulatedLight, samples: in
     return replace(radiance, variance=2 * (radiance.diffuse_variance + radiance.specular_variance))
 
 
-@wp.struct
-class MeanSurface:
-    """GBuffer as kernels see it."""
-
-    coverage: wp.array2d[float]
-    depth: wp.array2d[float]
-    position_world: wp.array2d[wp.vec3]
-    normal_world: wp.array2d[wp.vec3]
-    wo_world: wp.array2d[wp.vec3]
-    albedo: wp.array2d[wp.vec3]
-    roughness: wp.array2d[float]
-    metallic: wp.array2d[float]
-
-
 @wp.func
 def mean_vector(surface: wp.array2d[float], pixel: int, column: int, weight: float) -> wp.vec3:
     return wp.vec3(surface[pixel, column], surface[pixel, column + 1], surface[pixel, column + 2]) / weight
@@ -136,7 +123,7 @@ def mean_surface(
     window: WindowPlace,
     sums: SumArrays,
     # outputs
-    mean: MeanSurface,
+    mean: GBufferArrays,
 ):
     """Over the places that found a surface; 0 where none did, infinitely far."""
     i = first + wp.tid()
@@ -144,14 +131,14 @@ def mean_surface(
     x = i - y * window.width
     p = (window.row + y) * window.image_width + window.column + x
     w = wp.max(sums.weight[p], 1.0)
-    mean.coverage[y, x] = sums.weight[p] / wp.max(sums.places[p], 1.0)
-    mean.depth[y, x] = wp.where(sums.weight[p] > 0.0, sums.surface[p, 14] / w, wp.inf)
-    mean.position_world[y, x] = mean_vector(sums.surface, p, 0, w)
-    mean.normal_world[y, x] = wp.normalize(mean_vector(sums.surface, p, 3, w))
-    mean.wo_world[y, x] = wp.normalize(mean_vector(sums.surface, p, 6, w))
-    mean.albedo[y, x] = mean_vector(sums.surface, p, 9, w)
-    mean.roughness[y, x] = sums.surface[p, 12] / w
-    mean.metallic[y, x] = sums.surface[p, 13] / w
+    mean.coverage[i] = sums.weight[p] / wp.max(sums.places[p], 1.0)
+    mean.depth[i] = wp.where(sums.weight[p] > 0.0, sums.surface[p, 14] / w, wp.inf)
+    mean.position[i] = mean_vector(sums.surface, p, 0, w)
+    mean.normal[i] = wp.normalize(mean_vector(sums.surface, p, 3, w))
+    mean.wo[i] = wp.normalize(mean_vector(sums.surface, p, 6, w))
+    mean.albedo[i] = mean_vector(sums.surface, p, 9, w)
+    mean.roughness[i] = sums.surface[p, 12] / w
+    mean.metallic[i] = sums.surface[p, 13] / w
 
 
 _gbuffers: WeakKeyDictionary[FrameSums, tuple[int, GBuffer]] = WeakKeyDictionary()
@@ -173,16 +160,15 @@ def mean_gbuffer(state: FrameState) -> GBuffer:
 
 def _mean_surface(state: FrameState) -> GBuffer:
     assert state.sums.surface is not None
-    device, size = state.sums.weight.device, state.window.shape
-    vectors = {name: torch.empty(*size, 3, device=device) for name in ("position_world", "normal_world", "wo_world", "albedo")}
-    numbers = {name: torch.empty(*size, device=device) for name in ("coverage", "depth", "roughness", "metallic")}
-    maps = MeanSurface()
-    for name, values in vectors.items():
-        setattr(maps, name, warp_array(values, wp.vec3))
-    for name, values in numbers.items():
-        setattr(maps, name, warp_array(values))
-    launch(mean_surface, size[0] * size[1], [_window_place(state.window), sum_arrays(state.sums)], [maps], warp_device(state.sums.weight))
-    return GBuffer(**numbers, **vectors)
+    rows, columns = state.window.shape
+    numbers = torch.empty(4, rows, columns, device=state.sums.weight.device)
+    vectors = torch.empty(4, rows, columns, 3, device=numbers.device)
+    coverage, depth, roughness, metallic = numbers.unbind()
+    position, normal, wo, albedo = vectors.unbind()
+    gbuffer = GBuffer(coverage, depth, position, normal, wo, albedo, roughness, metallic)
+    inputs = [_window_place(state.window), sum_arrays(state.sums)]
+    launch(mean_surface, rows * columns, inputs, [gbuffer_arrays(gbuffer)], warp_device(numbers))
+    return gbuffer
 
 
 def frame_history(state: FrameState) -> History | None:

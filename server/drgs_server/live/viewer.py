@@ -192,10 +192,11 @@ class Viewer:
             if inputs is None or self._last_frame_id - self._acked_frame_id >= MAX_FRAMES_IN_FLIGHT:
                 return None
         progress = self._progress
-        if progress is None or progress.inputs.generation != inputs.generation:
-            return (
-                0.0 if progress is None or progress.scale == 1 else progress.begun_at + TARGET_SECONDS
-            )  # other work gets the rest of the time
+        if progress is None:
+            return 0.0
+        if progress.inputs.generation != inputs.generation:
+            # Other work, for which a picture was reduced, gets the rest of the time.
+            return 0.0 if progress.scale == 1 else progress.begun_at + TARGET_SECONDS
         if progress.scale < 1:
             return self._input_at + MOVING_SECONDS
         return None if progress.converged_sent else progress.rests_until

@@ -30,7 +30,7 @@ for (int dy = -2; dy <= 2; ++dy) {
         const v16 there = load16(guide + q);
         if (!any(there > 0.0f)) continue;
         v16 alike = max16(nx * load16(guide + 5 * plane + q) + ny * load16(guide + 6 * plane + q) + nz * load16(guide + 7 * plane + q), v16(0.0f));
-        // Weights below 1e-12 are none: numbers too small for a float's exponent take the processor a hundred times as long.
+        // Weights below 1e-12 are none: numbers too small for a float's exponent take the processor many times as long.
         alike = select(alike > 0.65f, alike, v16(0.0f));
         for (int k = 1; k < NORMAL_POWER; k *= 2) alike *= alike;
         const v16 off = nx * (load16(guide + 2 * plane + q) - x) + ny * (load16(guide + 3 * plane + q) - y) + nz * (load16(guide + 4 * plane + q) - z);

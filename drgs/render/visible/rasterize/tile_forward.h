@@ -52,7 +52,7 @@ for (int entry = first; entry < last; ++entry) {
         const i16 live = inside & (T >= MIN_TRANSMITTANCE);
         if (!any(live)) continue;
         const v16 rho_plane = select(front, h2 / (hz2 + 1e-30f), v16(1e30f));
-        // Farther off no pixel is live; numbers too small for a float's exponent would take the processor a hundred times as long.
+        // Farther off no pixel is live; numbers too small for a float's exponent would take the processor many times as long.
         const v16 rho = min16(min16(rho_plane, rho_screen), v16(FAR));
         const v16 alpha = min16(v16(MAX_ALPHA), q[13] * exp_negative(0.5f * rho));
         const v16 w = select(live, alpha * T, v16(0.0f));
