@@ -29,8 +29,8 @@ PLAIN_COMPOSITING = ("--disable-gpu-compositing", "--disable-gpu-rasterization")
 """Panels and pictures are put together without software GL, which takes as much of a core for it as for what it draws on canvases."""
 PLAIN_EDGES = () if os.environ.get("DRGS_SCREENSHOTS") else ("--webgl-antialiasing-mode=none",)
 """Canvases are drawn once a pixel instead of four times, but in pictures that are kept to be looked at."""
-FEW_SAMPLES = "64"
-"""A pixel, as the page offers them: a quarter of what it asks for by itself."""
+FEW_SAMPLES = 16
+"""A pixel, which the page remembers of earlier visits: so the server, whose cores are the browser's, does not refine what a test has seen enough of."""
 
 
 @dataclass
@@ -147,8 +147,9 @@ def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], seco
 
 
 def patient_page(browser: Browser, **options: Any) -> Page:
-    """A page of its own context."""
+    """A page of its own context, which once chose few samples."""
     page = browser.new_page(**options)
+    page.add_init_script(f"localStorage.getItem('drgs.samplesAPixel') ?? localStorage.setItem('drgs.samplesAPixel', '{FEW_SAMPLES}')")
     page.set_default_timeout(1000 * PATIENCE_SECONDS)
     return page
 
@@ -261,13 +262,6 @@ def shown_page(server: RunningServer, browser: Browser, asset: str = "") -> Iter
     page.close()
 
 
-def ask_for_few_samples(viewer: Viewer) -> None:
-    """So that the server, whose cores are the browser's, does not refine what a test has seen enough of. Until the page is loaded anew."""
-    viewer.open_tab("View")
-    viewer.page.get_by_role("radio", name=FEW_SAMPLES, exact=True).check()
-    viewer.open_tab("Material")
-
-
 def frame_alone(viewer: Viewer) -> None:
     """Frame the object in what is free without the left panel, which may have been there when it came."""
     viewer.close_library()
@@ -288,6 +282,5 @@ def ball(server: RunningServer, browser: Browser, ball_asset: str) -> Iterator[V
     """The page with the ball open, its left panel away."""
     with shown_page(server, browser, ball_asset) as viewer:
         expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
-        ask_for_few_samples(viewer)
         frame_alone(viewer)
         yield viewer

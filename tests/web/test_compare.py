@@ -25,7 +25,7 @@ from drgs.scene.asset import Asset, save_asset
 from drgs.scene.camera import Camera, camera_from_opengl
 from tests.patience import PATIENCE_SECONDS
 from tests.web.browser import RunningServer
-from tests.web.conftest import Viewer, ask_for_few_samples, frame_alone, shown_page, wait_until
+from tests.web.conftest import Viewer, frame_alone, shown_page, wait_until
 
 WIDTH, HEIGHT = 120, 90
 INTRINSICS = torch.tensor([[150.0, 0, 42], [0, 150, 55], [0, 0, 1]])
@@ -74,7 +74,6 @@ def captured(
     assert answer.status_code == 201, answer.text
     with shown_page(server, browser, answer.json()["id"]) as viewer:
         expect(viewer.page.get_by_role("heading", name="captured", exact=True)).to_be_visible()
-        ask_for_few_samples(viewer)
         frame_alone(viewer)
         viewer.open_tab("View")
         yield viewer

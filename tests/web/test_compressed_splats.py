@@ -21,7 +21,7 @@ from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
 from drgs_server.client import Client
 from tests.web.browser import RunningServer
-from tests.web.conftest import Viewer, ask_for_few_samples, shown_page
+from tests.web.conftest import Viewer, shown_page
 
 SPLATS = 600
 """More than the 512 harmonics that the palette of so small a SOG has, so that it has to choose."""
@@ -62,7 +62,6 @@ def splats(server: RunningServer, browser: Browser, tmp_path_factory: pytest.Tem
         asset = client.upload_asset(folder / "splats.zip").id
     with shown_page(server, browser, asset) as viewer:
         expect(viewer.page.get_by_role("heading", name="splats", exact=True)).to_be_visible()
-        ask_for_few_samples(viewer)
         viewer.open_tab("Export")
         viewer.append_edit({"op": "deform", "map": {"type": "twist", "rate": 2.0}})
         expect(viewer.page.get_by_role("switch", name="With this session’s edits")).to_be_visible()

@@ -17,7 +17,7 @@ from playwright.sync_api import Browser, Route, expect
 
 from drgs_server.api.rest_records import JobFile, JobFileList, JobInfo, JobList
 from tests.web.browser import ROOT, RunningServer
-from tests.web.conftest import FEW_SAMPLES, Viewer, patient_page
+from tests.web.conftest import Viewer, patient_page
 
 TABS = ("Material", "Light", "Shape", "View", "Export")
 LAPTOP, TABLET, LARGE = (1280, 720), (1024, 768), (3840, 2160)
@@ -180,7 +180,6 @@ def shown(server: RunningServer, browser: Browser, ball_asset: str) -> Iterator[
     expect(page.get_by_role("list", name="Edits in force").get_by_role("button")).to_have_count(1 + len(EDITS))
     viewer.open_tab("View")
     page.get_by_role("radio", name="Low", exact=True).check()
-    page.get_by_role("radio", name=FEW_SAMPLES, exact=True).check()
     page.set_viewport_size(dict(zip(("width", "height"), LAPTOP, strict=True)))
     yield viewer
     page.close()

@@ -13,7 +13,7 @@ from PIL import Image
 from playwright.sync_api import expect
 
 from tests.web.browser import RunningServer
-from tests.web.conftest import FEW_SAMPLES, Viewer, ask_for_few_samples, wait_until
+from tests.web.conftest import FEW_SAMPLES, Viewer, wait_until
 
 TOO_SMALL_TO_SEE = 6.0
 """Euclidean difference of mean sRGB colours that noise between two pictures of the same thing stays below."""
@@ -60,7 +60,6 @@ def test_the_token_leaves_the_address_bar_and_a_chosen_mesh_opens(viewer: Viewer
     assert "token" not in viewer.page.url
     viewer.page.get_by_label("Capture or mesh").set_input_files(ball_file)
     expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
-    ask_for_few_samples(viewer)
     color = viewer.settled_color()
     assert color[0] > 1.5 * color[2], "the ball's red side faces the first camera"
     assert "asset=" in viewer.page.url
@@ -115,7 +114,7 @@ def test_orbiting_changes_the_picture_and_reset_brings_it_back(viewer: Viewer) -
     before = viewer.settled_color()
     viewer.page.mouse.move(380, 150)
     viewer.page.mouse.down()
-    viewer.page.evaluate(COUNT_DRAWN, int(FEW_SAMPLES))
+    viewer.page.evaluate(COUNT_DRAWN, FEW_SAMPLES)
     viewer.page.mouse.move(290, 150, steps=4)
     viewer.page.mouse.up()
     assert difference(viewer.settled_color(), before) > 5 * TOO_SMALL_TO_SEE
@@ -200,13 +199,17 @@ def test_help_lists_the_shortcut_table(viewer: Viewer) -> None:
     expect(viewer.page.locator("dialog.help")).to_be_hidden()
 
 
-def test_edits_survive_a_reload_and_the_page_logged_no_errors(viewer: Viewer) -> None:
+def test_edits_and_the_number_of_samples_survive_a_reload_and_the_page_logged_no_errors(viewer: Viewer) -> None:
     number = viewer.page.get_by_label("Metallic, exact value")
     number.fill("1")
     number.press("Enter")
     wait_until(lambda: viewer.edits() and viewer.edits()[-1]["set"]["metallic"] == 1.0, "the edit in the server's log")
+    viewer.open_tab("View")
+    viewer.page.get_by_role("radio", name="64", exact=True).check()
+    viewer.open_tab("Material")
     viewer.page.reload()
     expect(viewer.page.get_by_label("Metallic, exact value")).to_have_value("1.00")
+    wait_until(lambda: viewer.stage().get("samples") == "64", "as many samples as were chosen")
     viewer.settled_color()
     assert viewer.complaints == []
 

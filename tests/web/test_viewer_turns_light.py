@@ -15,7 +15,7 @@ from drgs.scene.environment import Environment
 from drgs_server.client import Client
 from tests.render.closed_form_scenes import sphere_mesh
 from tests.web.browser import RunningServer
-from tests.web.conftest import Viewer, ask_for_few_samples, frame_alone, shown_page
+from tests.web.conftest import Viewer, frame_alone, shown_page
 
 SWITCH = "Turns with the camera"
 
@@ -32,7 +32,6 @@ def turntable_ball(server: RunningServer, browser: Browser, tmp_path_factory: py
         asset = client.upload_asset(path).id
     with shown_page(server, browser, asset) as viewer:
         expect(viewer.page.get_by_role("heading", name="ball", exact=True)).to_be_visible()
-        ask_for_few_samples(viewer)
         frame_alone(viewer)
         yield viewer
 

@@ -25,7 +25,7 @@ from scipy import ndimage
 from tests.patience import PATIENCE_SECONDS
 from tests.reconstruct.pose.textured_scene import orbit, write_photographs
 from tests.web.browser import ROOT, RunningServer
-from tests.web.conftest import Viewer, patient_page, wait_until
+from tests.web.conftest import FEW_SAMPLES, Viewer, patient_page, wait_until
 from tests.web.test_dropped_photos import drop_folder, numbers
 
 CAPTURE = ROOT / "examples" / "sample_capture"
@@ -34,7 +34,6 @@ VIEW_STEP, SIDE = 2, 96
 BUILD_SECONDS = 900
 """Some twenty on two idle cores; others may use them, too."""
 EGG_VIEWS = 14
-SAMPLES = 64
 NOISE = 3.0
 """Mean over the object of the difference between two pictures of the same thing, sRGB 0..255, stays below this."""
 DROP = """(base64) => {
@@ -106,7 +105,7 @@ def refined_picture(viewer: Viewer) -> np.ndarray:
 
     def is_refined() -> bool:
         viewer.settle()
-        return int(viewer.stage()["samples"]) >= SAMPLES
+        return int(viewer.stage()["samples"]) >= FEW_SAMPLES
 
     wait_until(is_refined, lambda: f"all samples; the page says {viewer.stage()}", PATIENCE_SECONDS)
     data = viewer.page.evaluate(READ_CANVAS)
@@ -172,10 +171,8 @@ def test_the_finished_asset_opens_by_itself(path: Viewer) -> None:
     assert asset["source"] == "build" and asset["surfel_count"] > 1000 and asset["face_count"] > 1000
     log = path.session()
     assert (log["edits"], log["can_undo"]) == ([], False)
-    # From here on every picture is of the object alone, and has few samples: they are waited for often.
+    # From here on every picture is of the object alone.
     path.page.get_by_role("button", name="Library").click()
-    path.open_tab("View")
-    path.page.get_by_role("radio", name=str(SAMPLES), exact=True).check()
     path.open_tab("Light")
     path.page.get_by_role("radio", name="None", exact=True).check()
     path.page.keyboard.press("Escape")

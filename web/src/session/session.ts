@@ -5,6 +5,7 @@ import * as api from './api';
 import { attachStream, editsToRestore, forgetUnsent, receiveAccepted, receiveChange, receiveLog, receiveRejected, resetLog, sendSplice } from './edit_log';
 import { noteWaiting } from './long_change';
 import { attempt, notify } from './notices';
+import { preference } from './preferences';
 import type { EditLog, FrameHeader, PickedMessage, ServerHello, SessionInfo, Settings, StatusMessage } from './protocol.gen';
 import { Stream, type Connection, type StreamEvents } from './stream';
 
@@ -19,7 +20,9 @@ export const openedAsset = computed(() => session.value?.asset ?? null);
 export const connection = signal<Connection>('closed');
 /** What the server says of its newest picture. */
 export const status = signal<StatusMessage | null>(null);
-export const settings = signal<Required<Settings>>({ exposure_stops: 0, tone_curve: 'standard', background: 'environment', spp_target: 256, bounces: 1, channel: 'final', denoise: true, turn_light: false });
+/** What machines of different speed choose once. */
+const samplesAPixel = preference('samplesAPixel', 256);
+export const settings = signal<Required<Settings>>({ exposure_stops: 0, tone_curve: 'standard', background: 'environment', spp_target: samplesAPixel.value, bounces: 1, channel: 'final', denoise: true, turn_light: false });
 /** Rows of the first photograph's rotation, world from camera, where the opened asset's own light stood still with the camera; null: with the object. */
 export const lightCamera = signal<NonNullable<ServerHello['light_camera']> | null>(null);
 
@@ -146,6 +149,7 @@ async function recoverSession(asset: string): Promise<string | null> {
 
 export function changeSettings(change: Partial<Settings>): void {
   settings.value = { ...settings.value, ...change };
+  samplesAPixel.value = settings.value.spp_target;
   stream?.sendSettings(settings.value);
 }
 

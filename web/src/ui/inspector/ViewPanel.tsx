@@ -69,7 +69,7 @@ export function ViewPanel() {
         <Choice
           label="Samples a pixel"
           value={String(spp_target)}
-          options={['64', '256', '1024'].map((value) => ({ value, text: value }))}
+          options={['16', '64', '256', '1024'].map((value) => ({ value, text: value }))}
           onChange={(value) => changeSettings({ spp_target: Number(value) })}
         />
         <Choice label="Indirect bounces" value={String(bounces)} options={['0', '1', '2', '4'].map((value) => ({ value, text: value, title: value === '1' ? `Of moving pictures; saved ones and films then have ${STILL_BOUNCES}` : undefined }))} onChange={(value) => changeSettings({ bounces: Number(value) })} />
