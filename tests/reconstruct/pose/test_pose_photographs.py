@@ -22,7 +22,7 @@ from tests.reconstruct.pose.textured_scene import DISTORTION, FOCAL, orbit, pict
 pytest.importorskip("pycolmap")
 
 QUICK = PoseSettings(most_features=800)
-VIEWS, MASKED_VIEWS = 10, 14
+VIEWS, MASKED_VIEWS = 12, 14
 """All around; without the ground, steps must be smaller."""
 
 
