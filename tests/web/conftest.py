@@ -110,6 +110,8 @@ class Viewer:
             shown = self.stage()
             return shown.get("moving") == "false" and shown.get("fresh") == "true" and int(shown.get("revision", -1)) >= revision
 
+        # What was pressed a moment ago is the page's state, but not yet its data attributes.
+        self.page.evaluate("new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)))")
         wait_until(
             is_settled,
             lambda: (
