@@ -11,6 +11,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,7 +26,7 @@ from scipy import ndimage
 from tests.patience import PATIENCE_SECONDS
 from tests.reconstruct.pose.textured_scene import orbit, write_photographs
 from tests.web.browser import ROOT, RunningServer
-from tests.web.conftest import FEW_SAMPLES, Viewer, patient_page, wait_until
+from tests.web.conftest import Viewer, patient_page, wait_until
 from tests.web.test_dropped_photos import drop_folder, numbers
 
 CAPTURE = ROOT / "examples" / "sample_capture"
@@ -34,6 +35,7 @@ VIEW_STEP, SIDE = 2, 96
 BUILD_SECONDS = 900
 """Some twenty on two idle cores; others may use them, too."""
 EGG_VIEWS = 14
+SAMPLES = 64
 NOISE = 3.0
 """Mean over the object of the difference between two pictures of the same thing, sRGB 0..255, stays below this."""
 DROP = """(base64) => {
@@ -105,7 +107,7 @@ def refined_picture(viewer: Viewer) -> np.ndarray:
 
     def is_refined() -> bool:
         viewer.settle()
-        return int(viewer.stage()["samples"]) >= FEW_SAMPLES
+        return int(viewer.stage()["samples"]) >= SAMPLES
 
     wait_until(is_refined, lambda: f"all samples; the page says {viewer.stage()}", PATIENCE_SECONDS)
     data = viewer.page.evaluate(READ_CANVAS)
@@ -115,11 +117,18 @@ def refined_picture(viewer: Viewer) -> np.ndarray:
 def wait_for_picture(viewer: Viewer, holds: Callable[[np.ndarray], bool], what: str) -> np.ndarray:
     """The first refined picture of which `holds` is true. The log is written before the picture is drawn."""
 
-    def picture() -> list[np.ndarray]:
-        now = refined_picture(viewer)
-        return [now] if holds(now) else []
+    last: list[np.ndarray] = []
 
-    return wait_until(picture, what, PATIENCE_SECONDS)[0]
+    def picture() -> list[np.ndarray]:
+        last[:] = [refined_picture(viewer)]
+        return last if holds(last[0]) else []
+
+    def said() -> str:
+        shown = tempfile.mkstemp(suffix=".png")[1]
+        Image.fromarray(last[0].astype(np.uint8)).save(shown)
+        return f"{what}; the page shows {shown} and says {viewer.stage()}, the log is {viewer.edits()}"
+
+    return wait_until(picture, said, PATIENCE_SECONDS)[0]
 
 
 def silhouette(picture: np.ndarray) -> np.ndarray:
@@ -138,6 +147,17 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 def brightness(picture: np.ndarray) -> np.ndarray:
     return picture[..., :3].mean(-1)
+
+
+def waits(viewer: Viewer, kind: str) -> bool:
+    """Whether the newest job of this kind is not at its end.
+
+    Raises:
+        AssertionError: it failed; why.
+    """
+    newest = next(job for job in viewer.server.ask("/api/jobs")["jobs"] if job["kind"] == kind)
+    assert newest["state"] != "failed", newest["error"]
+    return newest["state"] in ("queued", "running")
 
 
 def jobs_of(viewer: Viewer) -> list[dict]:
@@ -173,6 +193,8 @@ def test_the_finished_asset_opens_by_itself(path: Viewer) -> None:
     assert (log["edits"], log["can_undo"]) == ([], False)
     # From here on every picture is of the object alone.
     path.page.get_by_role("button", name="Library").click()
+    path.open_tab("View")
+    path.page.get_by_role("radio", name=str(SAMPLES), exact=True).check()
     path.open_tab("Light")
     path.page.get_by_role("radio", name="None", exact=True).check()
     path.page.keyboard.press("Escape")
@@ -201,7 +223,8 @@ def test_a_part_picked_by_a_click_alone_turns_to_gold(path: Viewer, first: np.nd
     rest = silhouette(first) & ~ndimage.binary_dilation(part, iterations=10)
     assert part[y, x] and part.sum() > 100, "the clicked part is of metal now"
     assert rest.sum() > 500, "and not the whole object"
-    gold = wait_for_picture(path, lambda now: change(first, now, part) > 20, "another colour on the part")
+    asked = f"another colour than {first[part].mean(0)} on {part.sum()} pixels around {x}, {y}"
+    gold = wait_for_picture(path, lambda now: change(first, now, part) > 20, asked)
     red, green, blue = gold[part][:, :3].mean(0)
     assert red > green > 1.2 * blue, f"gold is yellow, not {red:.0f}, {green:.0f}, {blue:.0f}"
     assert change(first, gold, rest) < 0.25 * change(first, gold, part), "but for light from the gold, the rest stays"
@@ -296,7 +319,8 @@ def test_a_folder_of_plain_photographs_is_posed_seen_stroked_cut_and_built(path:
     find.click()
     expect(bar).to_be_visible()
     posed = path.page.get_by_role("dialog", name="Egg, posed")
-    expect(posed).to_be_visible(timeout=BUILD_SECONDS * 1000)
+    wait_until(lambda: posed.is_visible() or not waits(path, "pose"), "the poses", BUILD_SECONDS)
+    expect(posed).to_be_visible()
     expect(posed.get_by_role("img", name=f"{EGG_VIEWS} cameras around the object")).to_have_attribute("data-cameras", str(EGG_VIEWS))
     expect(posed.get_by_text(f"{EGG_VIEWS} of {EGG_VIEWS} pictures found their place")).to_be_visible()
     searches = [job["state"] for job in path.server.ask("/api/jobs")["jobs"] if job["kind"] == "pose"]
