@@ -24,8 +24,8 @@ SETTINGS = BuildSettings(preset="tiny", device="cpu")
 FEW_RAYS = WITHOUT_HOLLOWS.surface.surface.moves
 LONGER = replace(
     WITHOUT_HOLLOWS,
-    fit=replace(WITHOUT_HOLLOWS.fit, iterations=20),
-    surface=replace(WITHOUT_HOLLOWS.surface, passes=1, surface=SurfaceSettings(rounds=1, steps_a_round=20, moves=FEW_RAYS)),
+    fit=replace(WITHOUT_HOLLOWS.fit, iterations=14),
+    surface=replace(WITHOUT_HOLLOWS.surface, passes=1, surface=SurfaceSettings(rounds=1, steps_a_round=14, moves=FEW_RAYS)),
     materials=MeshMaterialSettings(iterations=4, moves=FEW_RAYS, points_a_step=256, samples=WITHOUT_HOLLOWS.materials.samples),
 )
 
