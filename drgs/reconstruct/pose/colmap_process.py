@@ -5,6 +5,7 @@ It is stopped by ending the process: its database survives that, and what it had
 
 import json
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -18,11 +19,13 @@ PATIENCE_SECONDS = 5.0
 """Between asking the process to end and ending it."""
 LOG_TAIL = 300
 """Characters of the log in a sentence."""
+CRASHES = {getattr(signal, name) for name in ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGFPE") if hasattr(signal, name)}
+"""Now and then COLMAP's threads end by one of these, and not when asked the same again (a SIGBUS among its features, in some hundred searches)."""
 PROGRAM = Path(__file__).with_name("run_colmap.py")
 
 
 def colmap_process(job: Path, told: Callable[[str, int, int], None], should_stop: Callable[[], bool]) -> None:
-    """Run the steps of a job file that are not done yet.
+    """Run the steps of a job file that are not done yet; where the library crashes, once more.
 
     Args:
         told: called with step, done, total.
@@ -32,7 +35,21 @@ def colmap_process(job: Path, told: Callable[[str, int, int], None], should_stop
         ValueError: it ended by itself before its work was done.
     """
     log = job.parent / "colmap.log"
-    with log.open("w") as output:
+    log.write_text("")
+    code = _ended(job, log, told, should_stop)
+    if -code in CRASHES:
+        code = _ended(job, log, told, should_stop)
+    if code != 0:
+        said = " ".join(log.read_text(errors="replace").split())[-LOG_TAIL:]
+        how = f"was ended by signal {-code}{' (too little memory?)' if -code == signal.SIGKILL else ''}" if code < 0 else "failed"
+        raise ValueError(
+            f"{log}: pycolmap {how} before the poses were found; go on with --resume, or read the file: {said or 'it is empty'}"
+        )
+
+
+def _ended(job: Path, log: Path, told: Callable[[str, int, int], None], should_stop: Callable[[], bool]) -> int:
+    """Exit code of a process that went as far as it came; what it says beside its reports is added to `log`."""
+    with log.open("a") as output:
         process = subprocess.Popen(
             [sys.executable, "-P", str(PROGRAM), str(job)],
             stdin=subprocess.PIPE,
@@ -52,12 +69,7 @@ def colmap_process(job: Path, told: Callable[[str, int, int], None], should_stop
         _end(process)
         reader.join()
         process.stdout.close()
-    if process.returncode != 0:
-        said = " ".join(log.read_text(errors="replace").split())[-LOG_TAIL:]
-        how = f"was ended by signal {-process.returncode} (too little memory?)" if process.returncode < 0 else "failed"
-        raise ValueError(
-            f"{log}: pycolmap {how} before the poses were found; go on with --resume, or read the file: {said or 'it is empty'}"
-        )
+    return process.returncode
 
 
 def _follow(lines: "queue.Queue[str | None]", told: Callable[[str, int, int], None], should_stop: Callable[[], bool]) -> None:

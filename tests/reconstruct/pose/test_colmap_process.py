@@ -51,6 +51,25 @@ def test_one_that_ends_by_itself_is_told_with_its_log(program: Path, tmp_path: P
         colmap_process(tmp_path / "job.json", lambda *report: None, lambda: False)
 
 
+@pytest.mark.parametrize("crashes", [1, 2])
+def test_one_that_crashes_is_tried_once_more(program: Path, tmp_path: Path, crashes: int):
+    tries = tmp_path / "tries"
+    program.write_text(f"""
+import os, pathlib, sys
+tries = pathlib.Path({str(tries)!r})
+tries.write_text(tries.read_text() + "x" if tries.exists() else "x")
+print("try", len(tries.read_text()), file=sys.stderr, flush=True)
+if len(tries.read_text()) <= {crashes}:
+    os.abort()
+""")
+    if crashes == 2:
+        with pytest.raises(ValueError, match=r"pycolmap was ended by signal 6 before .* try 1 .*try 2"):
+            colmap_process(tmp_path / "job.json", lambda *report: None, lambda: False)
+    else:
+        colmap_process(tmp_path / "job.json", lambda *report: None, lambda: False)
+    assert tries.read_text() == "xx"
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="makes a named pipe")
 def test_it_ends_when_who_started_it_is_gone(tmp_path: Path):
