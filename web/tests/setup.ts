@@ -1,5 +1,3 @@
-/** What every test's file finds of a browser: a local storage in which nothing is kept. */
+/** What every test's file finds of a browser: a local storage in which nothing is kept. No stub, which would be gone after the first test. */
 
-import { vi } from 'vitest';
-
-vi.stubGlobal('localStorage', { getItem: () => null, setItem: () => {} });
+Object.assign(globalThis, { localStorage: { getItem: () => null, setItem: () => {} } });

@@ -20,7 +20,7 @@ PATIENCE_SECONDS = 5.0
 LOG_TAIL = 300
 """Characters of the log in a sentence."""
 CRASHES = {getattr(signal, name) for name in ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGFPE") if hasattr(signal, name)}
-"""Now and then COLMAP's threads end by one of these, and not when asked the same again (a SIGBUS among its features, in some hundred searches)."""
+"""By which a library ends for reasons of its own. Seen once: a SIGBUS while it looked for features, with memory and disk free."""
 PROGRAM = Path(__file__).with_name("run_colmap.py")
 
 
@@ -41,7 +41,7 @@ def colmap_process(job: Path, told: Callable[[str, int, int], None], should_stop
         code = _ended(job, log, told, should_stop)
     if code != 0:
         said = " ".join(log.read_text(errors="replace").split())[-LOG_TAIL:]
-        how = f"was ended by signal {-code}{' (too little memory?)' if -code == signal.SIGKILL else ''}" if code < 0 else "failed"
+        how = f"was ended by signal {-code} (too little memory, or a full disk?)" if code < 0 else "failed"
         raise ValueError(
             f"{log}: pycolmap {how} before the poses were found; go on with --resume, or read the file: {said or 'it is empty'}"
         )

@@ -51,7 +51,7 @@ def unmasked(folder: Path) -> Views:
 
 @pytest.mark.slow
 def test_the_object_is_found_before_its_surroundings(unmasked: Views, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(find_masks_module, "ITERATIONS", 120)
+    monkeypatch.setattr(find_masks_module, "ITERATIONS", 150)
     assert not unmasked.has_masks
     settings = FitSettings(densify=DensifySettings(every=40))
     found = find_masks(unmasked, initial_points(unmasked, 1000, seed=0), settings, CPU)

@@ -239,7 +239,7 @@ def test_what_floats_is_none_of_it() -> None:
 def test_a_fit_before_the_ground_finds_the_egg(
     scene: tuple[Views, list[np.ndarray]], standing: Views | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(find_masks_module, "ITERATIONS", 190)
+    monkeypatch.setattr(find_masks_module, "ITERATIONS", 250)
     monkeypatch.setattr(find_masks_module, "SIDE", 80)
     (_, masks), found = scene, standing
     assert found is not None

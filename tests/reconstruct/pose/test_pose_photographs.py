@@ -86,7 +86,7 @@ def test_the_capture_is_read_with_undistorted_pictures_and_masks(posed: PosedCap
     assert calibration["f"] == pytest.approx(FOCAL, rel=0.02) and calibration["k"] == pytest.approx(DISTORTION, abs=0.02)
     true, _, _, _ = true_from_found(posed)
     views = load_views(Path(posed.folder))
-    assert not views.has_masks and views.points_world is not None and len(views.points_world) == posed.points > 200
+    assert not views.has_masks and views.points_world is not None and len(views.points_world) == posed.points > 500
     shown = views.images_srgb[3].numpy().astype(int)
     size, focal = shown.shape[0], float(views.cameras[3].intrinsics[0, 0])
     drawn = picture(true[3] @ np.diag([1.0, -1.0, -1.0, 1.0]), focal, 0.0, size)[0].astype(int)

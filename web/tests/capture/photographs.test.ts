@@ -1,6 +1,5 @@
 import { describe, expect, it, vi } from 'vitest';
 
-vi.stubGlobal('localStorage', { getItem: () => null, setItem: () => {} });
 vi.stubGlobal('matchMedia', () => ({ matches: false }));
 const { nearestView, placeView } = await import('../../src/capture/photographs');
 
