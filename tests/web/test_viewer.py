@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import expect
 
+from tests.patience import PATIENCE_SECONDS
 from tests.web.browser import RunningServer
 from tests.web.conftest import FEW_SAMPLES, Viewer, wait_until
 
@@ -30,10 +31,11 @@ DRAG = """async (slider, values) => {
 """What a pointer does to a range input."""
 
 
-COUNT_DRAWN = """(samples) => {
+COUNT_DRAWN = """([samples, patience]) => {
   const stage = document.querySelector('.stage');
   const count = () => ({ traced: Number(stage.dataset.tracedFrames), local: Number(stage.dataset.localFrames) });
-  window.drawnWhileRefined = new Promise((resolve) => {
+  window.drawnWhileRefined = new Promise((resolve, reject) => {
+    setTimeout(() => reject(new Error(`not seen to get ${samples} samples: ${JSON.stringify(stage.dataset)}`)), patience);
     let moved = false, from = null;
     const look = new MutationObserver(() => {
       const { moving, fresh, samples: summed } = stage.dataset;
@@ -112,14 +114,16 @@ def test_the_local_picture_agrees_under_another_tone_curve_and_before_a_blurred_
 
 def test_orbiting_changes_the_picture_and_reset_brings_it_back(viewer: Viewer) -> None:
     before = viewer.settled_color()
+    choose_samples(viewer, 64)
     viewer.page.mouse.move(380, 150)
     viewer.page.mouse.down()
-    viewer.page.evaluate(COUNT_DRAWN, FEW_SAMPLES)
+    viewer.page.evaluate(COUNT_DRAWN, [64, 1000 * PATIENCE_SECONDS])
     viewer.page.mouse.move(290, 150, steps=4)
     viewer.page.mouse.up()
     assert difference(viewer.settled_color(), before) > 5 * TOO_SMALL_TO_SEE
     drawn = viewer.page.evaluate("window.drawnWhileRefined")
-    assert drawn["traced"] > 0 and drawn["local"] == 0, "the local picture, which nobody sees, is not drawn with each traced one"
+    assert drawn["traced"] > 1 and drawn["local"] == 0, "the local picture, which nobody sees, is not drawn with each traced one"
+    choose_samples(viewer, FEW_SAMPLES)
     viewer.page.keyboard.press("Shift+F")
     wait_until(lambda: difference(viewer.settled_color(), before) < TOO_SMALL_TO_SEE, "the first view")
 
@@ -204,9 +208,7 @@ def test_edits_and_the_number_of_samples_survive_a_reload_and_the_page_logged_no
     number.fill("1")
     number.press("Enter")
     wait_until(lambda: viewer.edits() and viewer.edits()[-1]["set"]["metallic"] == 1.0, "the edit in the server's log")
-    viewer.open_tab("View")
-    viewer.page.get_by_role("radio", name="64", exact=True).check()
-    viewer.open_tab("Material")
+    choose_samples(viewer, 64)
     viewer.page.reload()
     expect(viewer.page.get_by_label("Metallic, exact value")).to_have_value("1.00")
     wait_until(lambda: viewer.stage().get("samples") == "64", "as many samples as were chosen")
@@ -225,6 +227,13 @@ def test_the_page_comes_back_after_a_server_restart_with_its_edits(viewer: Viewe
     viewer.settled_color()
     viewer.undo()
     viewer.wait_for_edits(len(before) - 1)
+
+
+def choose_samples(viewer: Viewer, count: int) -> None:
+    """A pixel."""
+    viewer.open_tab("View")
+    viewer.page.get_by_role("radio", name=str(count), exact=True).check()
+    viewer.open_tab("Material")
 
 
 def local_picture(viewer: Viewer, clip: dict) -> np.ndarray:

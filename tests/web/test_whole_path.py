@@ -124,9 +124,9 @@ def wait_for_picture(viewer: Viewer, holds: Callable[[np.ndarray], bool], what: 
         return last if holds(last[0]) else []
 
     def said() -> str:
-        shown = tempfile.mkstemp(suffix=".png")[1]
-        Image.fromarray(last[0].astype(np.uint8)).save(shown)
-        return f"{what}; the page shows {shown} and says {viewer.stage()}, the log is {viewer.edits()}"
+        with tempfile.NamedTemporaryFile(suffix=".png", delete=False) as shown:
+            Image.fromarray(last[0].astype(np.uint8)).save(shown, "PNG")
+        return f"{what}; the page shows {shown.name} and says {viewer.stage()}, the log is {viewer.edits()}"
 
     return wait_until(picture, said, PATIENCE_SECONDS)[0]
 
@@ -149,7 +149,7 @@ def brightness(picture: np.ndarray) -> np.ndarray:
     return picture[..., :3].mean(-1)
 
 
-def waits(viewer: Viewer, kind: str) -> bool:
+def is_under_way(viewer: Viewer, kind: str) -> bool:
     """Whether the newest job of this kind is not at its end.
 
     Raises:
@@ -319,7 +319,7 @@ def test_a_folder_of_plain_photographs_is_posed_seen_stroked_cut_and_built(path:
     find.click()
     expect(bar).to_be_visible()
     posed = path.page.get_by_role("dialog", name="Egg, posed")
-    wait_until(lambda: posed.is_visible() or not waits(path, "pose"), "the poses", BUILD_SECONDS)
+    wait_until(lambda: posed.is_visible() or not is_under_way(path, "pose"), "the poses", BUILD_SECONDS)
     expect(posed).to_be_visible()
     expect(posed.get_by_role("img", name=f"{EGG_VIEWS} cameras around the object")).to_have_attribute("data-cameras", str(EGG_VIEWS))
     expect(posed.get_by_text(f"{EGG_VIEWS} of {EGG_VIEWS} pictures found their place")).to_be_visible()
