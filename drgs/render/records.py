@@ -134,6 +134,8 @@ class RenderPlan:
     """Light rays behind a first pass take the tree that tests no edges (plan.SWIFT_RAYS)."""
     spread_places: bool = False
     """Passes look through more places of some pixels of a tile and fewer of others (spread_places.py)."""
+    every_other: bool = False
+    """A first pass by itself is shown after an edit, and has rays in every other pixel (plan.EVERY_OTHER)."""
 
 
 # ---- what the camera sees ------------------------------------------------------------------------------------------------

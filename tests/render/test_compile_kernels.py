@@ -16,7 +16,7 @@ def test_pictures_of_all_kinds_are_made_and_the_note_is_left(monkeypatch: pytest
     monkeypatch.setattr(sys, "argv", ["compile_kernels", "cpu"])
     compile_kernels.main()
     assert compiled_kernels.are_compiled()
-    assert [state.is_moving for state in states] == [False, True, True, True, False, False]
+    assert [state.is_quick for state in states] == [False, True, True, True, False, True]
     assert states[3].kept_light is not None and states[4].rates is not None, "light was kept, and passes look unevenly"
     assert all(float((frame.gbuffer.coverage > 0).float().mean()) > 0.1 for frame in frames), "the object is seen"
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from drgs_server.live.frame_header import unpack_frame
 from drgs_server.live.messages import CameraMessage, ErrorMessage, Settings, StatusMessage
 from drgs_server.live.pace import TARGET_SECONDS
 from drgs_server.live.viewer import ANSWER_SECONDS, MOVING_SECONDS, Posed, Viewer
@@ -22,7 +23,7 @@ class SlowPose(PaintedPose):
 
 
 def moved(viewer: Viewer, number: int) -> None:
-    pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 2.0), (0.0, 0.0, 0.0, 1.0))
+    pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 2.0 + 0.01 * number), (0.0, 0.0, 0.0, 1.0))
     viewer.set_camera(CameraMessage(type="camera", number=number, world_from_camera=pose, fov_y_degrees=40, width=640, height=480))
 
 
@@ -67,3 +68,30 @@ def test_one_input_is_refined_at_once_and_those_in_a_row_when_the_next_one_does_
     work()
     due = viewer.due_at()
     assert due is not None and due <= pose.now, "refined from then on"
+
+
+def test_that_moving_pictures_are_slow_makes_none_of_an_edit_smaller_before_a_camera_that_rests() -> None:
+    pose, widths = SlowPose(0.15), list[int]()
+
+    def heard(said: bytes | StatusMessage | ErrorMessage) -> None:
+        if isinstance(said, bytes):
+            widths.append(unpack_frame(said)[0].width)
+
+    viewer = Viewer(heard, lambda: Posed(0, pose), clock=lambda: pose.now)
+    for number in range(6):
+        moved(viewer, number)
+        pose.now = max(pose.now, viewer.due_at() or 0.0)
+        viewer.work()
+        viewer.acknowledge(10_000)
+    assert widths[-1] < 640
+    pose.now += 2 * MOVING_SECONDS
+    pose.seconds = 0.03  # what the camera sees is known
+    for _ in range(3):
+        viewer.scene_changed()
+        pose.now += MOVING_SECONDS
+        viewer.work()
+        viewer.acknowledge(10_000)
+        assert widths[-1] == 640
+    moved(viewer, 7)
+    viewer.work()
+    assert widths[-1] < 640, "the camera moves again, and what its pictures take is remembered"

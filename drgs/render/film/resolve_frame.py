@@ -4,7 +4,7 @@ All but the last step happens in the window around the tiles that show something
 """
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -14,15 +14,16 @@ from torch import Tensor
 
 from drgs.render.film.blur_environment import blurred_light
 from drgs.render.film.denoise import denoise
-from drgs.render.film.denoise.svgf import MOVING, filter_light
+from drgs.render.film.denoise.svgf import EDITED, MOVING, filter_light
 from drgs.render.film.tonemap import tonemap
 from drgs.render.integrate.environment_table import EnvironmentLight, lookup_radiance, uv_from_world_direction
 from drgs.render.progressive.converge import frame_errors
 from drgs.render.progressive.frame_state import FrameState, GaussianView
 from drgs.render.progressive.invalidate import same_camera
-from drgs.render.progressive.mean_radiance import mean_gbuffer, mean_radiance, moving_radiance
+from drgs.render.progressive.mean_radiance import mean_gbuffer, mean_radiance, quick_radiance
 from drgs.render.records import Frame
 from drgs.scene.camera import Camera, world_from_pixel
+from drgs.scene.tone_curve import ToneCurve
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -32,18 +33,15 @@ def resolve_frame(state: FrameState) -> Frame:
     """The picture so far."""
     clock = time.perf_counter()
     settings, window = state.inputs.settings, state.window
-    maps, camera, moving = mean_gbuffer(state), window.camera(state.inputs.camera), state.moving_picture
-    if moving is not None and settings.denoise == "svgf":
-        shown = moving_radiance(moving, filter_light(moving.history.light, maps, camera, MOVING), state.samples)
+    maps, camera, quick = mean_gbuffer(state), window.camera(state.inputs.camera), state.quick_picture
+    if quick is not None and settings.denoise == "svgf":
+        filtered = filter_light(quick.history.light, maps, camera, EDITED if quick.of_edit else MOVING)
+        shown = quick_radiance(quick, filtered, state.samples)
     else:
         shown = denoise(mean_radiance(state), maps, camera, settings.denoise)
     denoised = time.perf_counter()
-    background = _background(state)
     linear = window.pad(shown.diffuse + shown.specular)
-    if background is None:
-        rgba = window.pad(tonemap(window.crop(linear), maps.coverage, settings.exposure, curve=settings.tone_curve))
-    else:
-        rgba = tonemap(linear, window.pad(maps.coverage), settings.exposure, background, settings.tone_curve)
+    rgba = _rgba(state, linear, maps.coverage)
     surface = state.view.gbuffer if isinstance(state.view, GaussianView) else maps
     seconds = {**state.seconds, "denoise": denoised - clock, "resolve": time.perf_counter() - denoised}
     return Frame(rgba, linear, surface, shown, window.pad, _metadata(state, seconds))
@@ -62,6 +60,29 @@ def linear_picture(state: FrameState) -> Tensor:
     return torch.cat([color, alpha], -1)
 
 
+def _rgba(state: FrameState, linear: Tensor, coverage: Tensor) -> Tensor:
+    """(height, width, 4) as it is shown.
+
+    Args:
+        linear: of the whole image. coverage: of the window.
+    """
+    settings, window = state.inputs.settings, state.window
+    if (behind := _behind(state)) is None:
+        return window.pad(tonemap(window.crop(linear), coverage, settings.exposure, curve=settings.tone_curve))
+    look = settings.exposure, settings.tone_curve
+    if look not in behind.seen:
+        behind.seen[look] = None
+        return tonemap(linear, window.pad(coverage), settings.exposure, behind.radiance, settings.tone_curve)
+    around = behind.seen[look]
+    if around is None:  # pictures of a moving camera look at each once
+        nothing = torch.zeros_like(linear[..., 0])
+        around = behind.seen[look] = tonemap(linear, nothing, settings.exposure, behind.radiance, settings.tone_curve)
+    rgba, radiance = around.clone(), behind.radiance
+    inside = radiance if radiance.ndim == 1 else window.crop(radiance)
+    rgba[window.rows, window.columns] = tonemap(window.crop(linear), coverage, settings.exposure, inside, settings.tone_curve)
+    return rgba
+
+
 def _metadata(state: FrameState, seconds: dict[str, float]) -> dict:
     """Plain JSON: how the picture was made, and what was left out."""
     return {
@@ -73,7 +94,7 @@ def _metadata(state: FrameState, seconds: dict[str, float]) -> dict:
         "skipped": [asdict(skip) for skip in state.plan.skips],
         "horizons": _horizons(state),
         "made": list(state.computed_parts),
-        "error": None if state.is_moving else round(float(frame_errors(state).max()), 6),  # history and filter are in no estimate of it
+        "error": None if state.is_quick else round(float(frame_errors(state).max()), 6),  # history and filter are in no estimate of it
         "tiles_at_rest": int((~state.tiles.active).sum()),
         "tiles": len(state.tiles.active),
         "primary": state.inputs.primary,
@@ -91,18 +112,24 @@ def _horizons(state: FrameState) -> dict[str, float]:
 
 def _background(state: FrameState) -> Tensor | None:
     """(3,) or (height, width, 3) linear; None where the picture stays transparent."""
-    background = state.inputs.settings.background
+    behind = _behind(state)
+    return None if behind is None else behind.radiance
+
+
+def _behind(state: FrameState) -> "_Behind | None":
+    """What is behind the picture; None where that stays transparent."""
+    background, inputs = state.inputs.settings.background, state.inputs
     if background == "transparent":
         return None
     if not isinstance(background, str):
-        return torch.tensor(background, device=state.sums.weight.device)
-    scene, light = state.inputs.scene, state.traced.environment_light
+        return _Behind(inputs.camera, inputs.rows, torch.tensor(background, device=state.sums.weight.device))
+    scene, light = inputs.scene, state.traced.environment_light
     if background == "blurred":
         light = blurred_light(scene.environment, scene.environment_rotation_degrees, scene.environment_intensity)
-    known = _behind.get(light)
-    if known is None or known.rows != state.inputs.rows or not same_camera(known.camera, state.inputs.camera):
-        known = _behind[light] = _Behind(state.inputs.camera, state.inputs.rows, _environment_behind(state, light))
-    return known.radiance
+    known = _behinds.get(light)
+    if known is None or known.rows != inputs.rows or not same_camera(known.camera, inputs.camera):
+        known = _behinds[light] = _Behind(inputs.camera, inputs.rows, _environment_behind(state, light))
+    return known
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +139,12 @@ class _Behind:
     camera: Camera
     rows: slice
     radiance: Tensor
+    """(height, width, 3), or the (3,) colour of a screen."""
+    seen: dict[tuple[float, ToneCurve], Tensor | None] = field(default_factory=dict)
+    """(height, width, 4) under exposures and tone curves; None where a picture was shown under one before."""
 
 
-_behind: WeakKeyDictionary[Any, _Behind] = WeakKeyDictionary()
+_behinds: WeakKeyDictionary[Any, _Behind] = WeakKeyDictionary()
 """Of lights that are used, by the last camera: pictures that get better, and those after an edit, have the same behind them."""
 
 

@@ -17,7 +17,7 @@ from drgs.render.records import FrameInputs, RenderPlan, SampleCounts, Skip
 from drgs.scene.environment import Environment
 from drgs.scene.materials import Materials
 from drgs.scene.mesh import TriangleMesh
-from drgs.scene.posed_scene import PosedScene
+from drgs.scene.posed_scene import PosedScene, PrimarySurface
 
 EVEN_SKY = 1e-3
 """A sky whose texels differ by no more than this share is sampled as well by the cosine."""
@@ -49,6 +49,11 @@ FEWER_RAYS = Skip(
     "three quarters of a moving picture's rays",
     "the pictures before it and the filter make up for them",
     "the noise of a quarter of the rays where the camera saw nothing before; none at rest, where all rays are traced",
+)
+EVERY_OTHER = Skip(
+    "rays of every other pixel in the first picture after an edit",
+    "neighbours on the same surface say what they would bring",
+    "the noise of half the rays, and mirror images finer than two pixels are blurred; none from the next picture on",
 )
 SWIFT_RAYS = Skip(
     "tests that no light ray passes between triangles with a common edge",
@@ -87,9 +92,11 @@ class SceneFacts:
     """Of the mesh's vertices, those that reflect LEAST_DIFFUSE diffusely."""
 
 
-def scene_facts(scene: PosedScene, empty_tiles: int = 0, tiles: int = 0) -> SceneFacts:
-    """Facts about the materials of mesh and Gaussians."""
-    carriers: list[TriangleMesh | Materials] = [scene.mesh] if scene.surfels is None else [scene.mesh, scene.surfels.materials]
+def scene_facts(scene: PosedScene, empty_tiles: int = 0, tiles: int = 0, primary: PrimarySurface = "gaussians") -> SceneFacts:
+    """Facts about the materials of what cameras and rays see: the mesh, and the Gaussians where those are the primary surface."""
+    carriers: list[TriangleMesh | Materials] = [scene.mesh]
+    if scene.surfels is not None and primary == "gaussians":
+        carriers.append(scene.surfels.materials)
     diffuse, metallic, roughness = zip(*map(_extremes, carriers), strict=True)
     return SceneFacts(max(diffuse), max(metallic), min(roughness), empty_tiles, tiles, _diffuse_share(scene.mesh))
 
@@ -218,8 +225,13 @@ def _rays_above_horizons(skip_error: float) -> Skip:
 
 def at_rest(plan: RenderPlan) -> RenderPlan:
     """The same for passes that trace all their rays."""
-    skips = tuple(skip for skip in plan.skips if skip not in (PIXEL_MIDDLES, FEWER_RAYS, KEPT_LIGHT, KEPT_HITS))
-    return replace(plan, moving=False, kept_light=False, skips=skips)
+    skips = tuple(skip for skip in plan.skips if skip not in (PIXEL_MIDDLES, FEWER_RAYS, KEPT_LIGHT, KEPT_HITS, EVERY_OTHER))
+    return replace(plan, moving=False, every_other=False, kept_light=False, skips=skips)
+
+
+def after_edit(plan: RenderPlan) -> RenderPlan:
+    """The same with rays in every other pixel of a first pass that is shown by itself."""
+    return replace(plan, every_other=True, skips=(*plan.skips, EVERY_OTHER)) if plan.counts.total > 0 else plan
 
 
 def moving_counts(counts: SampleCounts) -> SampleCounts:

@@ -99,6 +99,11 @@ class AbstractTracer(ABC):
         """A tracer of the same mesh that may let a ray pass between triangles with a common edge, where that is faster. Made once."""
         return self
 
+    @property
+    def swift_if_made(self) -> "AbstractTracer":
+        """`swift`, or this one where that would have to be made first."""
+        return self.__dict__.get("swift", self)
+
     kernel_query: ClassVar[KernelQuery]
 
     @property

@@ -14,7 +14,7 @@ from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.frame_sums import FrameSums
 from drgs.render.progressive.invalidate import Part
 from drgs.render.progressive.kept_light.kept_light import KeptLight
-from drgs.render.progressive.moving_picture import MovingPicture
+from drgs.render.progressive.quick_picture import QuickPicture
 from drgs.render.records import FrameInputs, GBuffer, History, PrimaryPoints, RenderPlan, Reprojected
 from drgs.render.visible.image_tiles import Window, window_of_tiles
 
@@ -77,28 +77,31 @@ class FrameState:
     """What can be used of it, in the window."""
     kept_light: KeptLight | None
     """Diffuse light on the mesh that moving pictures read; None until the camera moves."""
-    moving_picture: MovingPicture | None
-    """What the one pass so far shows, if that is a moving picture's; its sums stay empty."""
+    quick_picture: QuickPicture | None
+    """What the one pass so far shows, if that is a quick picture's; the frame's sums stay empty."""
     computed_parts: tuple[Part, ...]
     """For this frame; the others were taken over from the frame before (invalidate.py)."""
     seconds: dict[str, float]
     """Of each step, summed over passes."""
 
     @property
-    def is_moving(self) -> bool:
-        """Whether the one pass so far is a moving picture. Such sums are not gone on with: the next pass begins anew, with this picture as history."""
-        return self.moving_picture is not None
+    def is_quick(self) -> bool:
+        """Whether the one pass so far is a quick picture: the next pass begins anew, with a moving one as history."""
+        return self.quick_picture is not None
 
     @property
     def kept_samples(self) -> Float[Tensor, "pixel"] | None:
         """Rays behind the kept light that a moving picture shows, 0 where it shows none; None where it was not asked."""
-        kept = None if self.moving_picture is None else self.moving_picture.kept_samples
+        kept = None if self.quick_picture is None else self.quick_picture.kept_samples
         return None if kept is None else self.window.pad(kept).flatten()
 
     @property
     def rays_a_pass(self) -> int:
-        """Of each pixel; in the mean over pixels, where passes look through some more often (spread_places.py)."""
-        return moving_counts(self.plan.counts).total if self.is_moving else samples_per_pass(self.inputs).total
+        """Of each pixel; in the mean over pixels, where passes look through some more often (spread_places.py) and first pictures after an edit trace every other one."""
+        total = samples_per_pass(self.inputs).total
+        if self.quick_picture is None:
+            return total
+        return max(1, total // 2) if self.quick_picture.of_edit else moving_counts(self.plan.counts).total
 
     @cached_property
     def window(self) -> Window:

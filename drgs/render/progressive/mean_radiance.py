@@ -11,7 +11,7 @@ from torch import Tensor
 from drgs.render.progressive.demodulate_albedo import remodulate_albedo
 from drgs.render.progressive.frame_state import FrameState, GaussianView
 from drgs.render.progressive.frame_sums import FrameSums, SumArrays, sum_arrays
-from drgs.render.progressive.moving_picture import MovingPicture
+from drgs.render.progressive.quick_picture import QuickPicture
 from drgs.render.progressive.reproject import blend_history, remember
 from drgs.render.records import DemodulatedLight, GBuffer, History, Radiance
 from drgs.render.visible.image_tiles import Window
@@ -83,8 +83,8 @@ def mean_radiance(state: FrameState) -> Radiance:
     """Straight (alpha-normalised) radiance of the window, with what history adds; the variance is that of the mean of one pixel's passes."""
     if state in _means:
         return _means[state]
-    if state.moving_picture is not None:
-        radiance = _means[state] = moving_radiance(state.moving_picture, state.moving_picture.history.light, state.samples)
+    if state.quick_picture is not None:
+        radiance = _means[state] = quick_radiance(state.quick_picture, state.quick_picture.history.light, state.samples)
         return radiance
     own = _own_samples(state)
     height, width = own.shape[:2]
@@ -100,7 +100,7 @@ def mean_radiance(state: FrameState) -> Radiance:
     return radiance
 
 
-def moving_radiance(picture: MovingPicture, light: DemodulatedLight, samples: int) -> Radiance:
+def quick_radiance(picture: QuickPicture, light: DemodulatedLight, samples: int) -> Radiance:
     """A moving picture's, with this light, as it is or filtered. Its variance is the most that the sum of both parts can have.
 
     Args:
@@ -149,8 +149,8 @@ def mean_gbuffer(state: FrameState) -> GBuffer:
     """Of the window: the rasterised one, or the mean over passes of what rays to the mesh saw."""
     if isinstance(state.view, GaussianView):
         return GBuffer(**{name: state.window.crop(values) for name, values in vars(state.view.gbuffer).items()})
-    if state.moving_picture is not None:
-        return state.moving_picture.history.gbuffer
+    if state.quick_picture is not None:
+        return state.quick_picture.history.gbuffer
     passes = int(state.tiles.passes.sum())
     known = _gbuffers.get(state.sums)
     if known is None or known[0] != passes:
@@ -175,8 +175,8 @@ def frame_history(state: FrameState) -> History | None:
     """What the frame is worth to the next one, seen by another camera; before the first pass that of the frame before it."""
     if state.passes == 0:
         return state.history
-    if state.moving_picture is not None:
-        return state.moving_picture.history
+    if state.quick_picture is not None:
+        return state.quick_picture.history
     camera = state.window.camera(state.inputs.camera)
     return remember(mean_radiance(state), mean_gbuffer(state), camera, _own_samples(state), state.reprojected)
 

@@ -22,11 +22,12 @@ from drgs.render.intersect.ray_memory import RayMemory
 from drgs.render.intersect.trace_rays import over_slices
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.converge import MIN_PASSES, still_active
+from drgs.render.progressive.edited_picture import EditedPoints
 from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshView, Tiles, with_seconds
 from drgs.render.progressive.frame_sums import add_estimate, copy_sums, no_sums, sum_arrays
 from drgs.render.progressive.kept_light.shade_moving import shade_moving
 from drgs.render.progressive.mean_radiance import frame_history, mean_gbuffer
-from drgs.render.progressive.moving_picture import moving_picture
+from drgs.render.progressive.quick_picture import quick_picture
 from drgs.render.progressive.reproject import reproject
 from drgs.render.progressive.see_middles import see_middles
 from drgs.render.progressive.spread_places import (
@@ -63,8 +64,10 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
     Args:
         consume: the given state is not needed any more, and its sums are added to instead of copied.
     """
-    if state.is_moving:
+    if state.is_quick:
         state = _begin_anew(state)
+    if state.plan.every_other and state.passes == 0 and passes == 1:
+        return _show_edit(state)
     if state.plan.moving and state.passes == 0 and passes == 1 and state.plan.counts.total > 0:
         return _move(state)
     state = replace(state, plan=at_rest(state.plan))
@@ -91,15 +94,18 @@ def refine_frame(state: FrameState, passes: int = 1, consume: bool = False) -> F
 
 
 def _begin_anew(state: FrameState) -> FrameState:
-    """A frame whose one pass was a moving picture, before its first pass: what it showed is history."""
+    """A frame whose one pass was a quick picture, before its first pass: what a moving one showed is history."""
     inputs = state.inputs
+    if state.quick_picture is not None and state.quick_picture.of_edit:
+        tiles = Tiles(state.tiles.covered, torch.zeros_like(state.tiles.passes), state.tiles.covered.clone())
+        return replace(state, plan=at_rest(state.plan), tiles=tiles, quick_picture=None)
     covered = tiles_of_mesh(inputs.scene.mesh, inputs.camera)
     covered[0] |= ~covered.any()
     sums = no_sums(len(state.sums.weight), True, inputs.settings.split_indirect, covered.device)
     tiles = Tiles(covered, torch.zeros_like(state.tiles.passes), covered.clone())
     plan = at_rest(state.plan)
     history = frame_history(state)
-    return replace(state, plan=plan, view=MeshView(), sums=sums, tiles=tiles, history=history, reprojected=None, moving_picture=None)
+    return replace(state, plan=plan, view=MeshView(), sums=sums, tiles=tiles, history=history, reprojected=None, quick_picture=None)
 
 
 def _move(state: FrameState) -> FrameState:
@@ -116,11 +122,27 @@ def _move(state: FrameState) -> FrameState:
     else:
         found = integrator.shade(primary.points, primary.starts, light, how, 0, None, _horizon(state))
     shaded, camera = time.perf_counter(), middles.window.camera(state.inputs.camera)
-    picture = moving_picture(middles.surface, middles.place, found, kept_samples, how.counts.total, camera, state.history)
+    picture = quick_picture(middles.surface, middles.place, found, kept_samples, how.counts.total, camera, state.history)
     seconds = {"trace_primary": seen - started, "shade": shaded - seen, "history": time.perf_counter() - shaded}
     tiles = Tiles(middles.tiles, middles.tiles.long(), middles.tiles.clone())
-    state = replace(state, tiles=tiles, view=MeshView(), history=None, kept_light=kept, moving_picture=picture)
+    state = replace(state, tiles=tiles, view=MeshView(), history=None, kept_light=kept, quick_picture=picture)
     return _pay_for_horizons(with_seconds(state, seconds), primary.starts.face, len(primary.points.pixel))
+
+
+def _show_edit(state: FrameState) -> FrameState:
+    """The frame after the one pass of a picture that is shown at once after an edit; its sums stay empty."""
+    started = time.perf_counter()
+    assert isinstance(state.view, MeshView) and state.view.first_primary_points is not None
+    primary, camera, how = state.view.first_primary_points, state.window.camera(state.inputs.camera), _how(state)
+    edited = EditedPoints(primary, state.window, camera)
+    found_out = time.perf_counter()
+    integrator, light = choose_integrator(state.traced.tracer.swift_if_made), state.traced.environment_light
+    found = integrator.shade(primary.points, primary.starts, light, how, 0, None, _horizon(state), order=edited.order)
+    shaded = time.perf_counter()
+    picture = edited.picture(found, state.rays_a_pass)
+    seconds = {"trace_primary": found_out - started, "shade": shaded - found_out, "history": time.perf_counter() - shaded}
+    tiles = replace(state.tiles, passes=state.tiles.covered.long(), active=state.tiles.covered.clone())
+    return with_seconds(replace(state, tiles=tiles, history=None, quick_picture=picture), seconds)
 
 
 def _with_sums_of_its_own(state: FrameState) -> FrameState:

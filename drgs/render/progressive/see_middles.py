@@ -31,7 +31,7 @@ wp.set_module_options({"enable_backward": False})
 
 @dataclass(frozen=True, eq=False)
 class Middles:
-    """What is seen through the middles of pixels. Read by shade_moving and moving_picture."""
+    """What is seen through the middles of pixels. Read by shade_moving and quick_picture."""
 
     primary: PrimaryPoints
     """Packed, by pixel."""

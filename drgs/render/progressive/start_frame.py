@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from drgs.render.integrate.environment_table import build_environment_table, environment_light
-from drgs.render.integrate.plan import at_rest, plan_frame, samples_per_pass, scene_facts
+from drgs.render.integrate.plan import after_edit, at_rest, plan_frame, samples_per_pass, scene_facts
 from drgs.render.integrate.sample_rays import shading_points
 from drgs.render.intersect.horizon import Horizons
 from drgs.render.intersect.ray_memory import RayMemory
@@ -23,7 +23,7 @@ from drgs.render.progressive.frame_sums import brighten_sums, no_sums
 from drgs.render.progressive.invalidate import NOTHING_BEFORE, PARTS, Invalidation, Part, changed_in_scene, invalidate, parts_made_from
 from drgs.render.progressive.kept_light.kept_light import MOST_VERTICES, KeptLight, brighten_kept, no_light, without_indirect
 from drgs.render.progressive.mean_radiance import frame_history
-from drgs.render.progressive.moving_picture import brighten_picture
+from drgs.render.progressive.quick_picture import brighten_picture
 from drgs.render.progressive.reproject import brighten_light
 from drgs.render.records import FrameInputs, GBuffer, History, PrimaryPoints, RenderPlan, RenderSettings
 from drgs.render.visible.image_tiles import TILE, tile_grid, tile_of_pixels, tiles_of_box, tiles_of_mesh
@@ -64,6 +64,8 @@ def start_frame(
     view = _see_mesh(scene, reuse, clock) if inputs.primary == "mesh" else _see_gaussians(inputs, traced.tracer, gbuffer, reuse, clock)
     covered = _covered_tiles(inputs, view, reuse, clock)
     plan = _spend_samples(inputs, int((~covered).sum()), len(covered), reuse)
+    if isinstance(view, MeshView) and view.first_primary_points is not None and reuse.keeps("sums") is None and _is_live(inputs):
+        plan = after_edit(plan)
     kept_light = _kept_light(inputs, plan, reuse)
     clock.lap("kept_light")
     if (before := reuse.keeps("sums")) is not None:
@@ -83,7 +85,7 @@ def start_frame(
         history=history,
         reprojected=None,
         kept_light=kept_light,
-        moving_picture=None,
+        quick_picture=None,
         computed_parts=reuse.computed_parts,
         seconds=clock.seconds,
     )
@@ -158,11 +160,16 @@ def _turned_and_bright(scene: PosedScene) -> tuple[float, float]:
 
 def _is_moving(inputs: FrameInputs, reuse: Reuse) -> bool:
     """Of a picture that somebody sees while the camera moves."""
-    settings, changed = inputs.settings, reuse.invalidation.changed
-    moved = "camera" in changed and "shape" not in changed
+    changed = reuse.invalidation.changed
+    return "camera" in changed and "shape" not in changed and _is_live(inputs)
+
+
+def _is_live(inputs: FrameInputs) -> bool:
+    """Whether a first pass may be a quick picture: it is shown for a moment, and filtered."""
+    settings = inputs.settings
     shown = settings.keep_light and settings.skip and settings.denoise != "none"
     is_plain = settings.counts is None and not settings.split_indirect and inputs.band is None
-    return moved and shown and is_plain and inputs.primary == "mesh"
+    return shown and is_plain and inputs.primary == "mesh"
 
 
 def _spend_samples(inputs: FrameInputs, empty_tiles: int, tiles: int, reuse: Reuse) -> RenderPlan:
@@ -170,7 +177,7 @@ def _spend_samples(inputs: FrameInputs, empty_tiles: int, tiles: int, reuse: Reu
     if before is not None:
         return before.plan if reuse.keeps("sums") is not None else at_rest(before.plan)
     scene, settings = inputs.scene, inputs.settings
-    facts = scene_facts(scene, empty_tiles, tiles)
+    facts = scene_facts(scene, empty_tiles, tiles, inputs.primary)
     if len(scene.mesh.vertices) > MOST_VERTICES:
         facts = replace(facts, diffuse_share=0.0)  # too many to keep light on
     return plan_frame(
@@ -226,7 +233,7 @@ def _see_gaussians(inputs: FrameInputs, tracer: AbstractTracer, gbuffer: GBuffer
 def _covered_tiles(inputs: FrameInputs, view: GaussianView | MeshView, reuse: Reuse, clock: StepClock) -> Tensor:
     """(tile,) bool: may show a surface; at least one, for a picture of nothing is done after one pass as well."""
     before = reuse.keeps("view")
-    if before is not None and not before.is_moving:
+    if before is not None and (before.quick_picture is None or before.quick_picture.of_edit):
         return before.tiles.covered
     camera, mesh = inputs.camera, inputs.scene.mesh
     across, down = tile_grid(camera.width, inputs.height)
@@ -290,12 +297,12 @@ def _continue_sums(state: FrameState, brightness: float) -> FrameState:
     if not state.inputs.settings.split_indirect:
         state = replace(state, sums=replace(state.sums, indirect=None))
     if brightness != 1.0:
-        old, found, moving = state.history, state.reprojected, state.moving_picture
+        old, found, moving = state.history, state.reprojected, state.quick_picture
         state = replace(
             state,
             sums=brighten_sums(state.sums, brightness),
             history=None if old is None else replace(old, light=brighten_light(old.light, brightness)),
             reprojected=None if found is None else replace(found, light=brighten_light(found.light, brightness)),
-            moving_picture=None if moving is None else brighten_picture(moving, brightness),
+            quick_picture=None if moving is None else brighten_picture(moving, brightness),
         )
     return replace(state, tiles=replace(state.tiles, active=still_active(state, state.tiles.covered)))

@@ -97,6 +97,10 @@ class CameraMessage(_Message):
         check_rigid(self.world_from_camera)
         return self
 
+    def sees_as(self, other: "CameraMessage") -> bool:
+        """Whether both see the same, whatever their numbers."""
+        return self == other.model_copy(update={"number": self.number})
+
 
 class EditMessage(_Message):
     """Append an edit to the session's log. Applied in order, never dropped, answered by `accepted` or `rejected`."""

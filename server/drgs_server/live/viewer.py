@@ -71,6 +71,8 @@ class _Progress:
     picture: AbstractPicture
     scale: float
     begun_at: float
+    pace: Pace
+    """That said the scale."""
     rests_until: float = 0.0
     """Nothing is added before, unless something comes in."""
     samples_sent: int = 0
@@ -93,7 +95,8 @@ class Viewer:
         self._decodes_png = decodes_png
         self._clock = clock
         self._lock = threading.Lock()
-        self._pace = Pace()
+        self._moving_pace, self._resting_pace = Pace(), Pace()
+        """While the camera moves; and of edits before a camera that rests, which take less: what it sees is known."""
         self._generation = 0
         self._camera: CameraMessage | None = None
         self._settings = Settings()
@@ -240,16 +243,18 @@ class Viewer:
         if begun:
             if self._in_a_row:
                 progress.rests_until = self._clock() + min(ANSWER_SECONDS + (self._round_trip or 0.0), MOVING_SECONDS)
-            self._pace.measured(picture.width, picture.height, progress.scale, self._clock() - start)
+            progress.pace.measured(picture.width, picture.height, progress.scale, self._clock() - start)
 
     def _begin(self, inputs: _Inputs, moving: bool) -> _Progress:
         asked, begun_at = inputs.camera, self._clock()
-        scale = self._pace.scale(asked.width, asked.height) if moving else 1.0
+        rests = self._progress is not None and self._progress.inputs.camera.sees_as(asked)
+        pace = self._resting_pace if rests else self._moving_pace
+        scale = pace.scale(asked.width, asked.height) if moving else 1.0
         width, height = max(round(asked.width * scale), 1), max(round(asked.height * scale), 1)
         previous = self._progress.picture if self._progress else None
         picture = inputs.posed.pose.begin(asked, inputs.settings, width, height, previous)
         picture.refine()
-        return _Progress(inputs, picture, scale, begun_at)
+        return _Progress(inputs, picture, scale, begun_at, pace)
 
     def _worth_a_frame(self, progress: _Progress) -> bool:
         waited = self._clock() - progress.sent_at

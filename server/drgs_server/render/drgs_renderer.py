@@ -281,7 +281,7 @@ class Picture(AbstractPicture):
     @property
     def samples(self) -> int:  # type: ignore[override]
         # A moving picture is not finished, however few samples are asked for.
-        return min(self.state.samples, self.samples_target - 1) if self.state.is_moving else self.state.samples
+        return min(self.state.samples, self.samples_target - 1) if self.state.is_quick else self.state.samples
 
     @property
     def samples_target(self) -> int:  # type: ignore[override]

@@ -133,6 +133,6 @@ def test_a_moving_picture_reads_its_hits_with_one_bounce_and_says_so() -> None:
         settings, state = RenderSettings(samples_per_pass=16, denoise="svgf", keep_light=True, bounces=bounces), None
         for k in range(3):
             state = refine_frame(start_frame(scene, front_camera(48, distance=8 - 0.05 * k), settings, previous=state))
-        assert state is not None and state.is_moving and KEPT_LIGHT in state.plan.skips
+        assert state is not None and state.is_quick and KEPT_LIGHT in state.plan.skips
         assert (KEPT_HITS in state.plan.skips) == (bounces == 1)
         assert KEPT_HITS not in refine_frame(state).plan.skips

@@ -1,6 +1,6 @@
 """The picture of a moving camera before it is filtered: what its one pass found and what the picture before says of the same places, put together.
 
-In: the window's maps, the light of its points, the picture before. Out: a MovingPicture, which is the next one's history as it stands. Frames at
+In: the window's maps, the light of its points, the picture before. Out: a QuickPicture, which is the next one's history as it stands. Frames at
 rest go a longer way to the same: sums over passes, their mean (mean_radiance.py), history looked up and blended in (reproject.py), and all of it
 divided by what textures reflect (demodulate_albedo.py). Here one kernel goes once over the window. A test compares the two ways.
 """
@@ -35,8 +35,8 @@ wp.set_module_options({"enable_backward": False})
 
 
 @dataclass(frozen=True, eq=False)
-class MovingPicture:
-    """Of the window."""
+class QuickPicture:
+    """A picture of one pass that is in no sum: a moving camera's, or the first one after an edit. Of the window."""
 
     history: History
     """What it shows, not filtered, and what that is worth to the next picture."""
@@ -44,6 +44,8 @@ class MovingPicture:
     """Open share of the cosine-weighted sky."""
     kept_samples: Float[Tensor, "rows columns"] | None
     """Rays behind the kept light that it shows, 0 where it shows none; None where that was not asked."""
+    of_edit: bool = False
+    """It is the first one after an edit, before a camera that rests (edited_picture.py)."""
 
 
 @wp.struct
@@ -117,7 +119,7 @@ def put_together(
     light.samples[y, x] = wp.vec2(own_d + old.samples[0] * faded(own_d), own_s + old.samples[1] * faded(own_s))
 
 
-def moving_picture(
+def quick_picture(
     surface: GBuffer,
     place: Tensor,
     found: ShadedPoints,
@@ -125,7 +127,7 @@ def moving_picture(
     samples: int,
     camera: Camera,
     before: History | None,
-) -> MovingPicture:
+) -> QuickPicture:
     """What is shown, once it is filtered, and remembered.
 
     Args:
@@ -137,7 +139,7 @@ def moving_picture(
     diffuse, specular, variance, worth = (surface.coverage.new_empty(height, width, channels) for channels in (3, 3, 2, 2))
     visibility, none = torch.empty_like(surface.coverage), surface.coverage.new_empty(0, 0)
     kept = None if kept_samples is None else torch.empty_like(visibility)
-    picture = MovingPicture(History(camera, surface, DemodulatedLight(diffuse, specular, variance), worth), visibility, kept)
+    picture = QuickPicture(History(camera, surface, DemodulatedLight(diffuse, specular, variance), worth), visibility, kept)
     old = _no_picture(camera, surface.coverage) if before is None else before
     inputs = [
         width, _light_of_points(place, found, kept_samples, samples), surface_maps(surface), warp_view(surface.albedo, wp.vec3),
@@ -155,7 +157,7 @@ def _no_picture(camera: Camera, like: Tensor) -> History:
     return History(camera, maps, DemodulatedLight(vectors, vectors, pairs), pairs)
 
 
-def brighten_picture(picture: MovingPicture, factor: float) -> MovingPicture:
+def brighten_picture(picture: QuickPicture, factor: float) -> QuickPicture:
     """The same under an environment `factor` times as strong."""
     return replace(picture, history=replace(picture.history, light=brighten_light(picture.history.light, factor)))
 

@@ -9,8 +9,8 @@ from drgs.render.film.resolve_frame import resolve_frame
 from drgs.render.integrate.plan import FEWER_RAYS, KEPT_LIGHT, PIXEL_MIDDLES, moving_counts
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.progressive.frame_state import FrameState
-from drgs.render.progressive.mean_radiance import moving_radiance
-from drgs.render.progressive.moving_picture import moving_picture
+from drgs.render.progressive.mean_radiance import quick_radiance
+from drgs.render.progressive.quick_picture import quick_picture
 from drgs.render.progressive.refine import refine_frame
 from drgs.render.progressive.reproject import blend_history, remember, reproject
 from drgs.render.progressive.see_middles import see_middles
@@ -77,12 +77,12 @@ def test_a_moving_picture_of_metal_errs_less_with_a_quarter_of_its_rays(device: 
 def test_what_a_moving_picture_leaves_out_is_named_and_a_first_picture_leaves_nothing() -> None:
     scene, path = scene_of(), cameras(3)
     first, moving = moved_through(scene, path[:1]), moved_through(scene, path)
-    assert not first.is_moving and not LEFT_OUT & set(first.plan.skips)
-    assert moving.is_moving and LEFT_OUT & set(moving.plan.skips) == {PIXEL_MIDDLES, FEWER_RAYS}
+    assert not first.is_quick and not LEFT_OUT & set(first.plan.skips)
+    assert moving.is_quick and LEFT_OUT & set(moving.plan.skips) == {PIXEL_MIDDLES, FEWER_RAYS}
     named = [skip["what"] for skip in resolve_frame(moving).metadata["skipped"]]
     assert PIXEL_MIDDLES.what in named and FEWER_RAYS.what in named
     few = moved_through(scene, path, dataclasses.replace(SETTINGS, samples_per_pass=4))
-    assert few.is_moving and LEFT_OUT & set(few.plan.skips) == {PIXEL_MIDDLES}
+    assert few.is_quick and LEFT_OUT & set(few.plan.skips) == {PIXEL_MIDDLES}
 
 
 def test_a_moving_picture_sees_what_lies_in_the_middle_of_each_pixel() -> None:
@@ -97,7 +97,7 @@ def test_a_picture_at_rest_holds_nothing_of_the_moving_one() -> None:
     scene, path = scene_of(), cameras(4)
     moving, fresh = moved_through(scene, path), refine_frame(start_frame(scene, path[-1], SETTINGS), 3)
     rested = refine_frame(refine_frame(moving), 2)
-    assert rested.passes == 3 and not rested.is_moving and not LEFT_OUT & set(rested.plan.skips)
+    assert rested.passes == 3 and not rested.is_quick and not LEFT_OUT & set(rested.plan.skips)
     assert_same_sums(fresh, rested)
     # What the moving picture showed is worth something until the frame has samples of its own.
     assert rested.reprojected is not None and float(rested.reprojected.samples.max()) > 0
@@ -108,7 +108,7 @@ def test_an_edit_of_what_a_moving_picture_shows_is_traced_with_all_rays() -> Non
     edited = dataclasses.replace(scene, mesh=dataclasses.replace(scene.mesh, albedo=0.5 * scene.mesh.albedo))
     for changed in (edited, dataclasses.replace(scene, environment_rotation_degrees=40.0)):
         state = refine_frame(start_frame(changed, path[-1], SETTINGS, previous=moved_through(scene, path)))
-        assert not state.is_moving and not LEFT_OUT & set(state.plan.skips)
+        assert not state.is_quick and not LEFT_OUT & set(state.plan.skips)
         assert_same_sums(refine_frame(start_frame(changed, path[-1], SETTINGS)), state)
 
 
@@ -116,7 +116,7 @@ def test_a_moving_picture_goes_on_being_one_where_only_its_exposure_changes() ->
     scene, path = scene_of(), cameras(3)
     moving = moved_through(scene, path)
     brighter = start_frame(scene, path[-1], dataclasses.replace(SETTINGS, exposure=1.0), previous=moving)
-    assert brighter.is_moving and brighter.samples == 4
+    assert brighter.is_quick and brighter.samples == 4
     assert_same_sums(moving, brighter)
 
 
@@ -124,7 +124,7 @@ def test_a_moving_picture_goes_on_being_one_where_only_its_exposure_changes() ->
 def test_without_skips_and_where_all_rays_are_wanted_no_picture_is_a_moving_one(change: dict) -> None:
     scene, path, settings = scene_of(), cameras(3), dataclasses.replace(SETTINGS, **change)
     state, without = (moved_through(scene, path, dataclasses.replace(settings, keep_light=keep)) for keep in (True, False))
-    assert not state.is_moving and not LEFT_OUT & set(state.plan.skips)
+    assert not state.is_quick and not LEFT_OUT & set(state.plan.skips)
     assert_same_sums(without, state)
 
 
@@ -144,7 +144,7 @@ def test_a_moving_picture_is_put_together_as_pictures_at_rest_are(with_kept: boo
     light = DemodulatedLight(random(*size, 3), random(*size, 3), random(*size, 2))
     history = History(old.window.camera(before), old.surface, light, 30 * random(*size, 2))
     camera = middles.window.camera(now)
-    picture = moving_picture(middles.surface, middles.place, found, kept, 8, camera, history)
+    picture = quick_picture(middles.surface, middles.place, found, kept, 8, camera, history)
 
     covered = middles.surface.coverage > 0
 
@@ -169,9 +169,9 @@ def test_a_moving_picture_is_put_together_as_pictures_at_rest_are(with_kept: boo
     if kept is not None and picture.kept_samples is not None:
         assert torch.equal(picture.kept_samples, on_map(kept))
     # Without a picture before, it is what its own rays found.
-    alone = moving_picture(middles.surface, middles.place, found, kept, 8, camera, None)
+    alone = quick_picture(middles.surface, middles.place, found, kept, 8, camera, None)
     torch.testing.assert_close(alone.history.samples[covered], own[covered])
-    shown = moving_radiance(alone, alone.history.light, 8)
+    shown = quick_radiance(alone, alone.history.light, 8)
     torch.testing.assert_close(shown.diffuse[covered], found.diffuse, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(shown.specular[covered], found.specular, rtol=1e-4, atol=1e-5)
     assert shown.diffuse_variance is not None
@@ -182,7 +182,7 @@ def test_a_moving_picture_under_a_light_of_another_strength_shows_the_same_brigh
     scene, path = scene_of(), cameras(3)
     moving = moved_through(scene, path)
     brighter = start_frame(dataclasses.replace(scene, environment_intensity=3.0), path[-1], SETTINGS, previous=moving)
-    assert brighter.is_moving
+    assert brighter.is_quick
     shown, before = resolve_frame(brighter), resolve_frame(moving)
     torch.testing.assert_close(shown.radiance_linear, 3 * before.radiance_linear, rtol=1e-3, atol=1e-5)
 

@@ -1,0 +1,228 @@
+"""The first picture after an edit at rest: every other pixel has rays, and those between take their light.
+
+In: the points that the first pass sees, which are known of the picture before, and their new light. Out: a QuickPicture. Pixels whose rays are left out
+lie like a chessboard's black fields; one that is unlike all of its neighbours (an edge, a thin part, another material) has rays of its own.
+The passes behind it do without it: what it leaves out is in no sum.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from drgs.render.integrate.integrator import light_sums
+from drgs.render.integrate.sample_rays import PointArrays, point_arrays
+from drgs.render.integrate.sum_samples import LightSums
+from drgs.render.progressive.demodulate_albedo import diffuse_reflectance, mean_square, specular_reflectance
+from drgs.render.progressive.quick_picture import QuickPicture
+from drgs.render.progressive.reproject import LightMaps, light_maps
+from drgs.render.records import DemodulatedLight, GBuffer, History, PrimaryPoints, RayStarts, ShadedPoints
+from drgs.render.visible.image_tiles import Window
+from drgs.render.visible.rasterize.gbuffer import GBufferArrays, gbuffer_arrays
+from drgs.scene.camera import Camera
+from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+LEAST_COSINE = wp.constant(0.9)
+"""Between the normals of neighbours that take each other's light."""
+MOST_OFF_PLANE = wp.constant(2.0)
+"""That one lies off the other's tangent plane [pixel footprints]."""
+MOST_UNLIKE = wp.constant(0.1)
+"""That their roughness, or metallic, differs by."""
+
+
+@wp.struct
+class Neighbourhood:
+    """Where points lie in a window that begins at a tile's corner [pixels]."""
+
+    row: int
+    column: int
+    image_width: int
+    footprint: float
+    """Of a pixel at distance 1 [world units]."""
+    place: wp.array2d[int]
+    """Of each pixel of the window its point's number and one; 0 where there is none."""
+
+
+@wp.func
+def row_of(there: Neighbourhood, pixel: int) -> int:
+    return pixel // there.image_width - there.row
+
+
+@wp.func
+def column_of(there: Neighbourhood, pixel: int) -> int:
+    return pixel % there.image_width - there.column
+
+
+@wp.kernel
+def write_surface(
+    first: int,
+    points: PointArrays,
+    depth: wp.array[float],
+    there: Neighbourhood,
+    width: int,
+    # outputs; each pixel has one point
+    place: wp.array2d[int],
+    maps: GBufferArrays,
+):
+    """But for materials."""
+    p = first + wp.tid()
+    y = row_of(there, points.pixel[p])
+    x = column_of(there, points.pixel[p])
+    place[y, x] = p + 1
+    i = y * width + x
+    maps.coverage[i] = 1.0
+    maps.depth[i] = depth[p]
+    maps.position[i] = points.position[p]
+    maps.normal[i] = points.normal[p]
+    maps.wo[i] = points.wo[p]
+
+
+@wp.func
+def neighbour_alike(points: PointArrays, depth: wp.array[float], there: Neighbourhood, p: int, side: int) -> int:
+    """The point on this side of a point, if its light will do for both; else -1."""
+    y = row_of(there, points.pixel[p]) + wp.where(side == 0, -1, wp.where(side == 1, 1, 0))
+    x = column_of(there, points.pixel[p]) + wp.where(side == 2, -1, wp.where(side == 3, 1, 0))
+    if y < 0 or x < 0 or y >= there.place.shape[0] or x >= there.place.shape[1]:
+        return -1
+    q = there.place[y, x] - 1
+    if q < 0 or wp.dot(points.normal[p], points.normal[q]) < LEAST_COSINE:
+        return -1
+    off_plane = wp.abs(wp.dot(points.normal[p], points.position[q] - points.position[p]))
+    unlike = wp.max(wp.abs(points.roughness[p] - points.roughness[q]), wp.abs(points.metallic[p] - points.metallic[q]))
+    return wp.where(off_plane <= MOST_OFF_PLANE * there.footprint * depth[p] and unlike <= MOST_UNLIKE, q, -1)
+
+
+@wp.kernel
+def write_materials(
+    first: int,
+    points: PointArrays,
+    depth: wp.array[float],
+    there: Neighbourhood,
+    width: int,
+    # outputs
+    maps: GBufferArrays,
+    chosen: wp.array[wp.bool],
+):
+    """And choose the points that need rays."""
+    p = first + wp.tid()
+    i = row_of(there, points.pixel[p]) * width + column_of(there, points.pixel[p])
+    maps.albedo[i] = points.albedo[p]
+    maps.roughness[i] = points.roughness[p]
+    maps.metallic[i] = points.metallic[p]
+    chosen[p] = True
+    if (points.pixel[p] // there.image_width + points.pixel[p] % there.image_width) % 2 == 1:
+        for side in range(4):
+            if neighbour_alike(points, depth, there, p, side) >= 0:
+                chosen[p] = False
+
+
+@wp.kernel
+def put_light(
+    first: int,
+    points: PointArrays,
+    depth: wp.array[float],
+    there: Neighbourhood,
+    chosen: wp.array[wp.bool],
+    found: LightSums,
+    # outputs
+    light: LightMaps,
+    visibility: wp.array2d[float],
+):
+    """Light without what textures reflect: a point's own, or the mean over neighbours that are alike."""
+    p = first + wp.tid()
+    diffuse = wp.vec3(0.0, 0.0, 0.0)
+    specular = wp.vec3(0.0, 0.0, 0.0)
+    variance = wp.vec2(0.0, 0.0)
+    open_share = wp.float32(0.0)
+    count = wp.float32(0.0)
+    for side in range(4):
+        q = p
+        if not chosen[p]:
+            q = neighbour_alike(points, depth, there, p, side)
+        if q >= 0 and (side == 0 or q != p):
+            d = diffuse_reflectance(points.albedo[q], points.metallic[q])
+            s = specular_reflectance(points.albedo[q], points.metallic[q])
+            diffuse += wp.cw_div(found.diffuse[q], d)
+            specular += wp.cw_div(found.specular[q], s)
+            variance += wp.vec2(found.variance[q][1] / mean_square(d), found.variance[q][2] / mean_square(s))
+            open_share += found.visibility[q]
+            count += 1.0
+    y = row_of(there, points.pixel[p])
+    x = column_of(there, points.pixel[p])
+    light.diffuse[y, x] = diffuse / count
+    light.specular[y, x] = specular / count
+    light.variance[y, x] = variance / (count * count)
+    visibility[y, x] = open_share / count
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What a window shows of some points but for their materials."""
+
+    window: Window
+    surface: GBuffer
+    place: Tensor
+
+
+_views: WeakKeyDictionary[RayStarts, _View] = WeakKeyDictionary()
+"""Of points that live, by where their rays start: those after the next edit are the same in other materials."""
+
+
+class EditedPoints:
+    """Final. The points of a picture, which of them need rays, and the picture of their light."""
+
+    def __init__(self, primary: PrimaryPoints, window: Window, camera: Camera) -> None:
+        """
+        Args:
+            camera: of the window.
+        """
+        points, device, warp = primary.points, primary.depth.device, warp_device(primary.depth)
+        self._camera, self._count = camera, len(points.pixel)
+        self._there: Any = Neighbourhood()
+        self._there.row, self._there.column, self._there.image_width = window.rows.start, window.columns.start, window.width
+        self._there.footprint = 1.0 / float(camera.intrinsics[0, 0])
+        self._points = [point_arrays(points), warp_array(primary.depth), self._there]
+        view = _views.get(primary.starts)
+        if view is None or view.window != window:
+            view = _views[primary.starts] = self._see(window, device)
+        albedo, of_material = torch.zeros(*window.shape, 3, device=device), torch.zeros(2, *window.shape, device=device)
+        self._surface = replace(view.surface, albedo=albedo, roughness=of_material[0], metallic=of_material[1])
+        self._there.place = warp_array(view.place)
+        self._chosen = torch.empty(self._count, dtype=torch.bool, device=device)
+        outputs = [gbuffer_arrays(self._surface), warp_array(self._chosen)]
+        launch(write_materials, self._count, [*self._points, window.shape[1]], outputs, warp)
+
+    def _see(self, window: Window, device: torch.device) -> _View:
+        numbers, vectors = torch.zeros(4, *window.shape, device=device), torch.zeros(4, *window.shape, 3, device=device)
+        coverage, depth, roughness, metallic = numbers.unbind()
+        depth.fill_(torch.inf)
+        position, normal, wo, albedo = vectors.unbind()
+        surface = GBuffer(coverage, depth, position, normal, wo, albedo, roughness, metallic)
+        place = torch.zeros(window.shape, dtype=torch.int32, device=device)
+        inputs, outputs = [*self._points, window.shape[1]], [warp_array(place), gbuffer_arrays(surface)]
+        launch(write_surface, self._count, inputs, outputs, warp_device(place))
+        return _View(window, surface, place)
+
+    @property
+    def order(self) -> Tensor:
+        """(chosen,) int32, the points that need rays."""
+        return torch.nonzero(self._chosen).squeeze(-1).int()
+
+    def picture(self, found: ShadedPoints, samples: int) -> QuickPicture:
+        """Of the light that their rays found.
+
+        Args:
+            samples: rays of a pixel, in the mean.
+        """
+        shape, device = self._surface.coverage.shape, self._surface.coverage.device
+        diffuse, specular, variance = (torch.zeros(*shape, channels, device=device) for channels in (3, 3, 2))
+        visibility, worth = torch.zeros(shape, device=device), torch.full((*shape, 2), float(samples), device=device)
+        history = History(self._camera, self._surface, DemodulatedLight(diffuse, specular, variance), worth)
+        inputs = [*self._points, warp_array(self._chosen), light_sums(found)]
+        launch(put_light, self._count, inputs, [light_maps(history), warp_array(visibility)], warp_device(visibility))
+        return QuickPicture(history, visibility, None, of_edit=True)
