@@ -14,7 +14,7 @@ from torch import Tensor
 
 from drgs.render.film.blur_environment import blurred_light
 from drgs.render.film.denoise import denoise
-from drgs.render.film.denoise.svgf import EDITED, MOVING, filter_light
+from drgs.render.film.denoise.svgf import MOVING, filter_light, settings_for
 from drgs.render.film.tonemap import tonemap
 from drgs.render.integrate.environment_table import EnvironmentLight, lookup_radiance, uv_from_world_direction
 from drgs.render.progressive.converge import frame_errors
@@ -35,7 +35,7 @@ def resolve_frame(state: FrameState) -> Frame:
     settings, window = state.inputs.settings, state.window
     maps, camera, quick = mean_gbuffer(state), window.camera(state.inputs.camera), state.quick_picture
     if quick is not None and settings.denoise == "svgf":
-        filtered = filter_light(quick.history.light, maps, camera, EDITED if quick.of_edit else MOVING)
+        filtered = filter_light(quick.history.light, maps, camera, settings_for(state.samples) if quick.of_edit else MOVING)
         shown = quick_radiance(quick, filtered, state.samples)
     else:
         shown = denoise(mean_radiance(state), maps, camera, settings.denoise)

