@@ -4,7 +4,7 @@ All but the last step happens in the window around the tiles that show something
 """
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -70,14 +70,13 @@ def _rgba(state: FrameState, linear: Tensor, coverage: Tensor) -> Tensor:
     if (behind := _behind(state)) is None:
         return window.pad(tonemap(window.crop(linear), coverage, settings.exposure, curve=settings.tone_curve))
     look = settings.exposure, settings.tone_curve
-    if look not in behind.seen:
-        behind.seen[look] = None
+    if look != behind.look:  # pictures of a moving camera look at each once
+        behind.look, behind.seen = look, None
         return tonemap(linear, window.pad(coverage), settings.exposure, behind.radiance, settings.tone_curve)
-    around = behind.seen[look]
-    if around is None:  # pictures of a moving camera look at each once
+    if behind.seen is None:
         nothing = torch.zeros_like(linear[..., 0])
-        around = behind.seen[look] = tonemap(linear, nothing, settings.exposure, behind.radiance, settings.tone_curve)
-    rgba, radiance = around.clone(), behind.radiance
+        behind.seen = tonemap(linear, nothing, settings.exposure, behind.radiance, settings.tone_curve)
+    rgba, radiance = behind.seen.clone(), behind.radiance
     inside = radiance if radiance.ndim == 1 else window.crop(radiance)
     rgba[window.rows, window.columns] = tonemap(window.crop(linear), coverage, settings.exposure, inside, settings.tone_curve)
     return rgba
@@ -132,7 +131,7 @@ def _behind(state: FrameState) -> "_Behind | None":
     return known
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Behind:
     """What a camera sees of the environment where nothing is in its way."""
 
@@ -140,8 +139,10 @@ class _Behind:
     rows: slice
     radiance: Tensor
     """(height, width, 3), or the (3,) colour of a screen."""
-    seen: dict[tuple[float, ToneCurve], Tensor | None] = field(default_factory=dict)
-    """(height, width, 4) under exposures and tone curves; None where a picture was shown under one before."""
+    look: tuple[float, ToneCurve] | None = None
+    """Exposure [stops] and tone curve of the last picture."""
+    seen: Tensor | None = None
+    """(height, width, 4) under that look, from the second picture on."""
 
 
 _behinds: WeakKeyDictionary[Any, _Behind] = WeakKeyDictionary()

@@ -5,9 +5,10 @@ import dataclasses
 import torch
 
 from drgs.maths.color import srgb_from_linear
-from drgs.render.film.resolve_frame import resolve_frame
+from drgs.render.film.resolve_frame import _behinds, resolve_frame
 from drgs.render.film.tonemap import tonemap
 from drgs.render.progressive.converge import mean_variance
+from drgs.render.progressive.frame_state import with_settings
 from drgs.render.progressive.refine import refine_frame
 from drgs.render.progressive.start_frame import start_frame
 from drgs.render.records import RenderSettings
@@ -55,6 +56,21 @@ def test_the_environment_stands_behind_the_object_turned_and_scaled(device: str)
     empty = shown.gbuffer.coverage == 0
     torch.testing.assert_close(shown.rgba_srgb[empty][:, :3], exact[empty], atol=2e-3, rtol=0)
     assert bool((shown.rgba_srgb[..., 3] == 1).all())
+
+
+def test_the_second_picture_of_a_look_is_the_first_to_the_bit_and_of_looks_one_is_kept(device: str) -> None:
+    """What is behind the object under one exposure and tone curve is kept for the next picture; a drag of the exposure keeps no more."""
+    sky = Environment(torch.rand(16, 32, 3, device=device))
+    scene = PosedScene(None, on_device(sphere_mesh(2), device), sky)
+    settings = RenderSettings(samples_per_pass=4, bounces=0, background="environment")
+    state = refine_frame(start_frame(scene, CAMERA.to(device), settings))
+    for exposure in (0.0, 0.5, 1.0):
+        looked = with_settings(state, exposure=exposure)
+        first, second, third = (resolve_frame(looked).rgba_srgb for _ in range(3))
+        assert torch.equal(first, second) and torch.equal(first, third)
+        kept = vars(_behinds[state.traced.environment_light])
+        assert kept["look"] == (exposure, "standard") and kept["seen"].shape == first.shape
+        assert sum(isinstance(value, torch.Tensor) for value in kept.values()) == 2
 
 
 def test_pictures_have_the_screens_curve_and_straight_alpha(device: str) -> None:

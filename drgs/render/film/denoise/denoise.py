@@ -10,7 +10,7 @@ def denoise(radiance: Radiance, gbuffer: GBuffer, camera: Camera, method: Denois
     """Radiance as shown.
 
     Args:
-        moving: it is a moving picture's (FrameState.is_quick).
+        moving: it is one of a moving camera.
 
     Raises:
         ValueError: the method is unknown, not installed here, or misses what it goes by.
