@@ -47,13 +47,14 @@ from drgs.render.visible.points_at import points_at
 from drgs.render.visible.trace_primary import trace_primary_points
 from drgs.warp_torch import thread_count
 
-SLICES_A_THREAD = (2, 8)
-"""Slices of the image for each thread when passes run side by side, fewest and most: with few, some thread waits, for one slice's rays may
-cost twice another's; many are worth it where each still holds half of PIXELS_AT_ONCE."""
+MOST_SLICES = 8
+"""Of the image for each thread when passes run side by side, where each still holds half of PIXELS_AT_ONCE: a slice takes milliseconds of Python,
+which threads wait for in turn."""
 PIXELS_AT_ONCE = 131072
 """Camera rays that a thread takes together, of as many passes as that makes: Python's share of the time falls with it."""
-SHORTEST_RAYS = 32768
-"""Camera rays that the shortest slices still take together: slices shrink towards the end, lest a thread wait long for another's last one."""
+BLOCK_PIXELS = 256
+"""Neighbours that one slice has together, for their rays search the same boxes. Blocks are dealt out in turn, so that slices take equally long,
+though one part of the image costs twice another."""
 POOLS_AT_ONCE = 16
 """Passes that a thread takes together at most where samples choose: their pools (environment_pool.py) then take 2 MiB."""
 
@@ -185,6 +186,8 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
     started = time.perf_counter()
     camera, seed, tracer = state.inputs.camera, state.inputs.settings.seed, _light_tracer(state, index)
     pixels = _pixels(state, chosen)
+    slices = thread_count() * min(max(1, 2 * len(pixels) * count // (PIXELS_AT_ONCE * thread_count())), MOST_SLICES)
+    pixels = _dealt(pixels, slices)
     here = pixels.long() - state.inputs.first_pixel
     rates = None if index < FIRST_LOOK or state.rates is None else state.rates[here]
     places, arrays = state.sums.places[here].int(), sum_arrays(state.sums, state.inputs.first_pixel)
@@ -208,15 +211,18 @@ def _add_passes(state: FrameState, chosen: Tensor, index: int, count: int) -> Fr
 
     if state.plan.candidates > 1:
         draw_ahead(state.traced.environment_light, state.inputs.settings.seed, index, index + count, pixels.device)
-    fewest, most = (slices * thread_count() for slices in SLICES_A_THREAD)
-    slices = min(max(fewest, 2 * len(pixels) * count // PIXELS_AT_ONCE), most)
-    together = min(count, POOLS_AT_ONCE) if state.plan.candidates > 1 else count
-    done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // slices)), max(1, SHORTEST_RAYS // together))
+    done = over_slices(len(pixels), pixels.device, work, max(1, -(-len(pixels) // slices)))
     count_places(state.sums, here, None if rates is None else state.rates, index, index + count)
     traced = sum(seconds for _, seconds, _ in done) / max(1, min(thread_count(), len(done)))
     seconds = {"trace_primary": traced, "shade": max(0.0, time.perf_counter() - started - traced)}
     starts = torch.cat([faces for *_, faces in done if faces is not None])
     return _pay_for_horizons(with_seconds(state, seconds), starts, sum(points for points, *_ in done))
+
+
+def _dealt(pixels: Tensor, hands: int) -> Tensor:
+    """Pixels (pixel,) in blocks of neighbours, each hand's blocks behind one another: every so manieth of the image."""
+    blocks = pixels.split(BLOCK_PIXELS)
+    return torch.cat([block for hand in range(hands) for block in blocks[hand::hands]])
 
 
 def _primary_points(state: FrameState, chosen: Tensor, index: int, whole_first_pass: bool) -> PrimaryPoints:
