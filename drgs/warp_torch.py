@@ -82,16 +82,34 @@ def _begin_thread(threads: int) -> None:
         threads: torch's for all others.
     """
     _here.pooled = True
+    _use_torch_threads(1, threads)
+
+
+def _use_torch_threads(count: int, others: int) -> None:
+    """Of the calling thread; the others keep theirs."""
     torch.get_num_threads()  # the first question takes over what is set for all, and would undo the next line later
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     # That number is also what threads begin with that are started from now on; so it is set again, by one that ends.
-    restoring = threading.Thread(target=torch.set_num_threads, args=(threads,))
+    restoring = threading.Thread(target=torch.set_num_threads, args=(others,))
     restoring.start()
     restoring.join()
 
 
+def use_threads(most: int | None) -> None:
+    """What the calling thread launches, and torch's operations there, take at most so many threads from now on; None: all that there are."""
+    if not hasattr(_here, "torch_threads"):
+        _here.torch_threads = torch.get_num_threads()
+    _here.most = most
+    _use_torch_threads(_here.torch_threads if most is None else min(most, _here.torch_threads), _here.torch_threads)
+
+
 def thread_count() -> int:
-    """Threads that CPU launches are spread over: DRGS_THREADS, else the cores this process may use."""
+    """Threads that the caller's CPU launches are spread over: DRGS_THREADS, else the cores this process may use; fewer where use_threads says so."""
+    threads, most = _all_threads(), getattr(_here, "most", None)
+    return threads if most is None else min(most, threads)
+
+
+def _all_threads() -> int:
     asked = os.environ.get("DRGS_THREADS")
     return max(1, int(asked)) if asked else len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -101,7 +119,7 @@ def thread_pool() -> ThreadPoolExecutor:
     global _pool
     if _pool is None:
         threads = (torch.get_num_threads(),)
-        _pool = ThreadPoolExecutor(thread_count(), thread_name_prefix="drgs", initializer=_begin_thread, initargs=threads)
+        _pool = ThreadPoolExecutor(_all_threads(), thread_name_prefix="drgs", initializer=_begin_thread, initargs=threads)
     return _pool
 
 

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from drgs import warp_torch
-from drgs.warp_torch import in_thread_pool, launch, share_out, warp_array
+from drgs.warp_torch import in_thread_pool, launch, share_out, thread_count, use_threads, warp_array
 
 
 @pytest.fixture
@@ -61,3 +61,35 @@ def test_a_launch_over_threads_reaches_each_index_once(count: int) -> None:
     values = torch.zeros(count, dtype=torch.int32)
     launch(count_up, count, [3], [warp_array(values)], "cpu")
     assert torch.equal(values, 3 * torch.arange(count, dtype=torch.int32))
+
+
+@pytest.mark.usefixtures("three_threads")
+def test_a_thread_that_is_told_so_uses_fewer_and_then_all_again_and_others_all() -> None:
+    begun = torch.get_num_threads()
+    torch.set_num_threads(3)
+    told = list[tuple[int, int]]()
+
+    def tell() -> None:
+        told.append((thread_count(), torch.get_num_threads()))
+
+    def others() -> None:
+        other = threading.Thread(target=tell)
+        other.start()
+        other.join()
+
+    def work() -> None:
+        tell()
+        use_threads(1)
+        threads = set[int]()
+        share_out(lambda first, last: threads.add(threading.get_ident()), [0, 1, 2, 3])
+        assert threads == {threading.get_ident()}
+        tell()
+        others()
+        use_threads(None)
+        tell()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    torch.set_num_threads(begun)
+    assert told == [(3, 3), (1, 1), (3, 3), (3, 3)]

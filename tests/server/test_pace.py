@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from drgs_server.live.pace import Pace
+from drgs_server.live.pace import TARGET_SECONDS, Pace
 
 WIDTH, HEIGHT = 960, 720
 
@@ -27,8 +27,8 @@ def test_a_slow_machine_goes_to_half_and_no_further() -> None:
 
 def test_a_fixed_cost_a_picture_does_not_pull_the_size_down() -> None:
     pace = Pace()
-    scales = [measure(pace, 0.06, fixed_seconds=0.02) for _ in range(50)]
-    # 80 ms at full size is within the target; a controller that trusted small pictures would end at half.
+    scales = [measure(pace, 0.055, fixed_seconds=0.02) for _ in range(50)]
+    # 75 ms at full size is within the target; a controller that trusted small pictures would end at half.
     assert scales[-1] == 1.0
 
 
@@ -59,9 +59,17 @@ def test_a_larger_size_is_tried_ever_more_seldom_where_it_is_too_slow() -> None:
     assert [measure(slow, 0.5) for _ in range(200)].count(1.0) == 0
 
 
+def test_reduced_pictures_that_are_too_slow_get_smaller_and_larger_again_when_others_are_gone() -> None:
+    pace = Pace()
+    assert [measure(pace, 0.1) for _ in range(10)][-1] == 0.75
+    busy = [measure(pace, 0.2) for _ in range(10)]
+    assert busy[-1] == 0.6 and sorted(busy, reverse=True) == busy, "0.2 * 0.75**2 is more than is wanted, 0.2 * 0.6**2 is not"
+    assert [measure(pace, 0.1) for _ in range(10)][-1] == 0.75
+
+
 def test_the_size_does_not_flicker_at_a_limit() -> None:
     pace = Pace()
-    scales = [measure(pace, 1 / 12 + (0.001 if k % 2 else -0.001)) for k in range(60)]
+    scales = [measure(pace, TARGET_SECONDS + (0.001 if k % 2 else -0.001)) for k in range(60)]
     assert sum(a != b for a, b in pairwise(scales[5:])) <= 2, "but for the one picture that is tried larger"
 
 

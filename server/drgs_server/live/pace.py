@@ -3,12 +3,13 @@
 Known failure of such controllers: small pictures cost more a pixel, so an estimate taken from them asks for still smaller ones, and
 so on (service reference, 4.4). Hence: pictures at full size set the estimate, reduced ones only ever improve it, the scale has a
 floor and few steps, and a change of step needs a clear reason. For the same reason an estimate from a slow moment, such as a session's first
-pictures, would keep them small for ever: now and then one is tried a step larger, and what it costs counts like one at full size.
+pictures, would keep them small for ever: now and then one is tried a step larger, and what it costs counts like one at full size. And reduced ones that take longer than wanted do ask for
+smaller ones: others may have come to use the machine.
 """
 
-TARGET_SECONDS = 1 / 12
-"""Wanted for one moving picture; reduced ones come no faster."""
-STEPS = (1.0, 0.75, 0.5)
+TARGET_SECONDS = 1 / 13
+"""Wanted for one moving picture, so that twelve a second come though some are late; reduced ones come no faster."""
+STEPS = (1.0, 0.75, 0.6, 0.5)
 SMALLEST_SIDE = 240
 """Pixels; a picture that was asked for smaller than this is never reduced."""
 HYSTERESIS = 1.25
@@ -36,7 +37,8 @@ class Pace:
         """A first picture of `width` x `height` took this long; `scale` is its share of the asked-for width."""
         cost = seconds / (width * height)
         old, tried, self._trying = self._seconds_per_pixel, self._trying, False
-        if scale < 1 and not tried and (old is None or cost >= old):
+        too_slow = seconds > TARGET_SECONDS
+        if scale < 1 and not tried and (old is None or cost >= old) and not too_slow:
             return
         self._seconds_per_pixel = cost if old is None else old + _WEIGHT * (cost - old)
 

@@ -16,6 +16,7 @@ from concurrent.futures import Future
 from typing import Any, TypeVar
 
 from drgs_server.live.viewer import Viewer
+from drgs_server.render.crowding import Crowding
 from drgs_server.render.settle_memory import settle_memory
 
 T = TypeVar("T")
@@ -47,6 +48,7 @@ class RenderThread:
     """Final. Start it once, add and remove viewers, call functions on it."""
 
     def __init__(self) -> None:
+        self._crowding = Crowding(_use_threads)
         self._wake = threading.Condition()
         self._calls: deque[tuple[Future, Callable[[], Any]]] = deque()
         self._calls_in_turn: deque[tuple[Future, Callable[[], Any]]] = deque()
@@ -151,6 +153,7 @@ class RenderThread:
 
     def _serve(self, viewer: Viewer) -> None:
         try:
+            self._crowding.look()
             viewer.work()
             self._slices += 1
             if self._slices in SETTLE_AFTER_SLICES:
@@ -161,6 +164,12 @@ class RenderThread:
             with self._wake:
                 self._failed_until[viewer] = time.monotonic() + PAUSE_AFTER_ERROR_SECONDS
             viewer.tell_error(f"This picture could not be rendered: {type(error).__name__}: {error}")
+
+
+def _use_threads(most: int | None) -> None:
+    from drgs.warp_torch import use_threads  # no picture was made before it was loaded
+
+    use_threads(most)
 
 
 def _answer(future: Future, function: Callable[[], Any]) -> None:
