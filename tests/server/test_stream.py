@@ -312,13 +312,15 @@ def test_a_slow_machine_sends_smaller_pictures_while_moving_and_full_ones_when_s
         client.send(type="settings", settings={"spp_target": 4})
         client.socket.send_json(camera(width=640, height=512))
         client.frame(FLAG_CONVERGED)
+        widths = []
         for k in range(1, 4):
             client.socket.send_json(camera(k, x=k, width=640, height=512))
-            assert client.frame(FLAG_MOVING).width == 384
+            widths.append(client.frame(FLAG_MOVING).width)
+        assert widths == [384, 320, 320], "as long as the first, for the painter's time is not one of pixels"
         last = client.frame(FLAG_CONVERGED)
         assert (last.width, last.height) == (640, 512)
         reduced = [text for text in client.texts if text["type"] == "status" and text["scale"] < 1]
-        assert reduced and "60%" in reduced[-1]["notes"][-1]
+        assert reduced and "50%" in reduced[-1]["notes"][-1]
 
 
 def test_one_picture_over_rest(service: Service) -> None:
