@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--device", default="cpu", choices=["auto", "cpu", "cuda"])
     parser.add_argument("--check", action="store_true", help="compare the image with the float64 twin (some minutes)")
-    parser.add_argument("--depth", action="store_true", help="blend depth moments and the median as well")
+    parser.add_argument("--depth", action="store_true", help="blend the depth as well")
     given = parser.parse_args(arguments)
     if given.repeats < MIN_REPEATS:
         raise ValueError(f"--repeats is {given.repeats}; a median of fewer than {MIN_REPEATS} means little")

@@ -63,7 +63,7 @@ def rasterize(
     def blend(pixel: Tensor) -> tuple[Tensor, ...]:
         if len(opacity) == 0:
             nothing = pixel.new_zeros(len(pixel))
-            return pixel.new_zeros(len(pixel), features.shape[1]), nothing, nothing, nothing, nothing
+            return pixel.new_zeros(len(pixel), features.shape[1]), nothing, nothing, nothing
         h = side[:, None] * (pixel[:, None, :1] * ax + pixel[:, None, 1:] * ay + a1)  # (P, M, 3)
         hx, hy, hz = h.unbind(-1)
         radius2 = hx * hx + hy * hy
@@ -88,13 +88,13 @@ def rasterize(
         ordinal = torch.arange(len(opacity)).expand_as(w)
         last = torch.where(live & (before.detach() > 0.5), ordinal, torch.full_like(ordinal, -1)).amax(1)
         median = torch.where(last >= 0, z.gather(1, last.clamp(min=0)[:, None])[:, 0], torch.zeros_like(z[:, 0]))
-        return w @ feature, w.sum(1), (w * relative).sum(1), (w * relative * relative).sum(1), median
+        return w @ feature, w.sum(1), (w * relative).sum(1), median
 
     parts = [blend(pixels[k : k + block]) for k in range(0, len(pixels), block)]
-    image, coverage, first, second, median = (torch.cat(x) for x in zip(*parts, strict=True))
+    image, coverage, first, median = (torch.cat(x) for x in zip(*parts, strict=True))
     size = (camera.height, camera.width)
-    maps = (image.T.reshape(-1, *size), coverage.reshape(size), first.reshape(size), second.reshape(size), median.reshape(size))
-    return RasterMaps(*maps, depth_origin) if settings.depth else RasterMaps(*maps[:2], None, None, None, depth_origin)
+    depth_sum, median_depth = (x.reshape(size) if k < settings.depth_planes else None for k, x in enumerate((first, median)))
+    return RasterMaps(image.T.reshape(-1, *size), coverage.reshape(size), depth_sum, median_depth, depth_origin)
 
 
 def look_at_camera(width: int, height: int, focal: float, distance: float = 4.0, angle: float = 0.4) -> Camera:

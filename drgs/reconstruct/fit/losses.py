@@ -5,10 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drgs.maths.color import srgb_from_linear
-from drgs.scene.camera import Camera
-
-SSIM_SIGMA = 1.5
-SSIM_RADIUS = 5
+from drgs.reconstruct.fit.similarity import structural_similarity
 
 
 def display_image(
@@ -23,64 +20,14 @@ def display_image(
     return torch.where(saturated, srgb.clamp(max=ceiling), srgb) * coverage[..., None]
 
 
-def _window_matrix(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:
-    """(size, size) banded: the SSIM window as a product, an order of magnitude faster on the CPU than a small convolution."""
-    offsets = torch.arange(size, dtype=like.dtype, device=like.device)
-    distance = offsets[:, None] - offsets
-    kernel = torch.exp(-0.5 * (torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=like.dtype) / SSIM_SIGMA) ** 2).sum().item()
-    weights = torch.exp(-0.5 * (distance / SSIM_SIGMA) ** 2) / kernel
-    return torch.where(distance.abs() <= SSIM_RADIUS, weights, torch.zeros_like(weights))
-
-
-def _blur(images: Float[Tensor, "n height width"]) -> Float[Tensor, "n height width"]:
-    """(n, height, width) smoothed by the SSIM window, zero padding."""
-    along_x, along_y = _window_matrix(images.shape[2], images), _window_matrix(images.shape[1], images)
-    return along_y @ (images.reshape(-1, images.shape[2]) @ along_x).view_as(images)
-
-
 def structural_dissimilarity(image: Float[Tensor, "height width 3"], photo: Float[Tensor, "height width 3"]) -> Float[Tensor, ""]:
-    """Scalar (1 - SSIM) / 2 of two (height, width, 3) images: Gaussian window of 11 pixels, sigma 1.5, data range 1 (Wang et al. 2004)."""
-    a, b = image.permute(2, 0, 1), photo.permute(2, 0, 1)
-    means_a, means_b, squares_a, squares_b, products = _blur(torch.cat([a, b, a * a, b * b, a * b])).split(3)
-    variance_a, variance_b = squares_a - means_a * means_a, squares_b - means_b * means_b
-    covariance = products - means_a * means_b
-    ssim = ((2 * means_a * means_b + 1e-4) * (2 * covariance + 9e-4)) / (
-        (means_a * means_a + means_b * means_b + 1e-4) * (variance_a + variance_b + 9e-4)
-    )
-    return (1 - ssim.mean()) / 2
+    """Scalar (1 - SSIM) / 2 of two (height, width, 3) images (docs/sources.md: wang2004)."""
+    return (1 - structural_similarity(image, photo)) / 2
 
 
 def mask_loss(coverage: Float[Tensor, "height width"], mask: Float[Tensor, "height width"]) -> Float[Tensor, ""]:
     """Scalar binary cross-entropy of coverage (height, width) against the mask 0..1."""
     return torch.nn.functional.binary_cross_entropy(coverage.clamp(1e-4, 1 - 1e-4), mask)
-
-
-def normals_from_depth(depth: Float[Tensor, "height width"], camera: Camera) -> Float[Tensor, "height width 3"]:
-    """(height, width, 3) unit world normals, facing the camera, of the surface that a depth map draws; border pixels repeat."""
-    fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
-    cx, cy = camera.intrinsics[0, 2], camera.intrinsics[1, 2]
-    x = (torch.arange(camera.width, device=depth.device) + 0.5 - cx) / fx
-    y = (torch.arange(camera.height, device=depth.device) + 0.5 - cy) / fy
-    # With P = z (x, y, 1), the cross product of P_x and P_y, divided by z: no 3-vectors until the end.
-    z = depth
-    dz_dx = torch.nn.functional.pad((z[:, 2:] - z[:, :-2])[None], (1, 1), mode="replicate")[0] * (0.5 * fx)
-    dz_dy = torch.nn.functional.pad((z[2:] - z[:-2])[None, None], (0, 0, 1, 1), mode="replicate")[0, 0] * (0.5 * fy)
-    normal = torch.stack([dz_dx, dz_dy, -(z + x * dz_dx + y[:, None] * dz_dy)], -1)
-    return torch.nn.functional.normalize(normal, dim=-1) @ camera.camera_from_world[:3, :3]
-
-
-def normal_consistency(
-    normal_world: Float[Tensor, "height width 3"],
-    depth: Float[Tensor, "height width"],
-    coverage: Float[Tensor, "height width"],
-    camera: Camera,
-) -> Float[Tensor, ""]:
-    """Scalar mean over solid pixels of 1 - n . n_depth: surfels lie in the surface that they draw (Huang et al. 2024, eq. 14)."""
-    from_depth = normals_from_depth(depth, camera)
-    solid = coverage.detach() > 0.5
-    inside = -torch.nn.functional.max_pool2d(-solid.float()[None, None], 3, 1, 1)[0, 0]  # all nine neighbours solid
-    agreement = 1 - (normal_world * from_depth).sum(-1)
-    return (agreement * inside).sum() / inside.sum().clamp(min=1)
 
 
 def edge_aware_smoothness(

@@ -79,11 +79,11 @@ def mesh_from_gaussians(
         center, radius = torch.tensor(box.center), box.longest_half
     tangents, opacities = surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)
     empty = torch.zeros(len(gaussians.centers), 1, device=gaussians.centers.device)
-    raster = RasterSettings(near_plane(points.bounds_radius))
+    raster = RasterSettings(near_plane(points.bounds_radius), median=True)
     maps = []
     for camera in cameras:
         drawn = rasterize(gaussians.centers, tangents, opacities, empty, camera.to(empty.device), raster)
-        assert drawn.median_depth is not None  # asked for by RasterSettings.depth
+        assert drawn.median_depth is not None  # asked for by RasterSettings.median
         maps.append(DepthMap(camera.to(empty.device), drawn.median_depth, drawn.coverage))
     if points.hull_vertices is None or points.hull_faces is None:
         vertices, faces = extract_mesh(maps, center, radius, settings, box)

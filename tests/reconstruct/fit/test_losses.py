@@ -1,6 +1,7 @@
 """Fitting's loss terms against scikit-image, closed forms and what their gradients must do."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,19 +10,20 @@ from skimage.metrics import structural_similarity
 
 from drgs.maths.color import linear_from_srgb
 from drgs.reconstruct.fit.losses import (
-    SSIM_RADIUS,
     crossed_halves,
     crossed_squares,
     display_image,
     edge_aware_smoothness,
     mask_loss,
-    normal_consistency,
-    normals_from_depth,
     rough_light,
     structural_dissimilarity,
     texel_areas,
     white_light,
 )
+from drgs.reconstruct.fit.normal_consistency import normal_consistency
+from drgs.reconstruct.fit.similarity import RADIUS, similarity_by_matrices
+from drgs.reference.normal_consistency import normal_consistency as specified_consistency
+from drgs.reference.normal_consistency import normals_from_depth
 from drgs.scene.camera import Camera, pixel_rays_world
 from tests.render.closed_form_scenes import front_camera
 
@@ -37,7 +39,7 @@ def test_dissimilarity_equals_scikit_image_inside_a_black_frame():
     # A frame wider than the window on black makes borders alike: zero padding and reflection see the same zeros.
     generator = torch.Generator().manual_seed(0)
     a, b = torch.zeros(44, 52, 3), torch.zeros(44, 52, 3)
-    inside = (slice(SSIM_RADIUS * 2, -SSIM_RADIUS * 2), slice(SSIM_RADIUS * 2, -SSIM_RADIUS * 2))
+    inside = (slice(RADIUS * 2, -RADIUS * 2), slice(RADIUS * 2, -RADIUS * 2))
     a[inside] = torch.rand(*a[inside].shape, generator=generator)
     b[inside] = (a[inside] + 0.3 * torch.randn(*a[inside].shape, generator=generator)).clamp(0, 1)
     expected = (1 - skimage_similarity(a, b).mean()) / 2
@@ -56,6 +58,19 @@ def test_dissimilaritys_gradient_is_that_of_finite_differences():
     with torch.no_grad():
         ahead, behind = (float(structural_dissimilarity(a + step * direction, b)) for step in (1e-6, -1e-6))
     assert float((gradient * direction).sum()) == pytest.approx((ahead - behind) / 2e-6, rel=1e-5)
+
+
+@pytest.mark.parametrize(("height", "width"), [(43, 37), (11, 3), (3, 100), (30, 80), (12, 170)])
+def test_dissimilarity_by_rows_is_that_by_matrices_with_its_gradient(height: int, width: int):
+    generator = torch.Generator().manual_seed(height)
+    photo = torch.rand(height, width, 3, generator=generator)
+    image = (photo + 0.2 * torch.randn(height, width, 3, generator=generator)).requires_grad_(True)
+    exact = image.detach().double().requires_grad_(True)
+    found, expected = structural_dissimilarity(image, photo), (1 - similarity_by_matrices(exact, photo.double())) / 2
+    assert float(found.detach()) == pytest.approx(float(expected.detach()), abs=3e-7)
+    (3 * found).backward()
+    (3 * expected).backward()
+    torch.testing.assert_close(image.grad.double(), exact.grad, atol=2e-6 * float(exact.grad.abs().max()), rtol=0)
 
 
 def turned_camera() -> Camera:
@@ -115,6 +130,26 @@ def test_surfels_that_lie_in_the_surface_they_draw_cost_nothing_and_gradients_re
     assert float(tilted.grad.abs().max()) > 0 and float(depth.grad.abs().max()) > 0
     assert float(tilted.grad[:20].abs().max()) == 0.0  # outside the covered part nothing is compared
     assert float(tilted.grad[20, 30:70].abs().max()) == 0.0  # nor on its rim, where depth belongs to two surfaces
+
+
+@pytest.mark.parametrize("solid", ["all", "a part up to two borders", "none"])
+def test_normals_are_compared_as_the_specification_says_and_gradients_are_its(solid: str):
+    camera = turned_camera()
+    generator = torch.Generator().manual_seed(3)
+    normal, depth = torch.randn(90, 96, 3, generator=generator), 4 + 0.02 * torch.randn(90, 96, generator=generator)
+    coverage = {"all": torch.ones, "none": torch.zeros}.get(solid, torch.zeros)(90, 96)
+    if solid not in ("all", "none"):
+        coverage[:50, 40:] = torch.rand(50, 56, generator=generator) + 0.45
+    exact = replace(camera, intrinsics=camera.intrinsics.double(), camera_from_world=camera.camera_from_world.double())
+    results = []
+    for view, of, dtype in ((camera, normal_consistency, torch.float32), (exact, specified_consistency, torch.float64)):
+        maps = [x.to(dtype).clone().requires_grad_(True) for x in (normal, depth)]
+        loss = of(*maps, coverage.to(dtype), view)
+        (2 * loss).backward()
+        results.append([x.double() for x in (loss.detach(), *(x.grad for x in maps))])
+    assert (float(results[1][0]) > 0.1) == (solid != "none")
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-5 * float(expected.abs().max()), rtol=0)
 
 
 def gradient_of_display(radiance: float, photo: float) -> float:

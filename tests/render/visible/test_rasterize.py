@@ -21,7 +21,7 @@ def random_surfels(count, seed=0, spread=0.6, scale=0.15, channels=5):
 
 
 def assert_maps_close(maps, expected, tolerance=2e-5, outliers=0.0):
-    for name in ("features", "coverage", "depth_sum", "depth_square_sum"):
+    for name in ("features", "coverage", "depth_sum"):
         difference = (getattr(maps, name).double().cpu() - getattr(expected, name)).abs()
         assert (difference > tolerance).double().mean() <= outliers, f"{name}: {difference.max():.2e}"
 
@@ -31,8 +31,9 @@ def assert_maps_close(maps, expected, tolerance=2e-5, outliers=0.0):
 def test_maps_equal_the_twin(per_pixel, size, device):
     surfels = random_surfels(60)
     camera = look_at_camera(*size, focal=70.0)
-    expected = rasterize_reference(*(x.double() for x in surfels), camera)
-    maps = rasterize(*(x.to(device) for x in surfels), camera.to(device), per_pixel=per_pixel)
+    settings = RasterSettings(median=True)
+    expected = rasterize_reference(*(x.double() for x in surfels), camera, settings)
+    maps = rasterize(*(x.to(device) for x in surfels), camera.to(device), settings, per_pixel=per_pixel)
     assert_maps_close(maps, expected)
     flips = (maps.median_depth.double().cpu() - expected.median_depth).abs() > 1e-4
     assert flips.double().mean() < 0.005  # T = 0.5 exactly at a rounding error
@@ -64,10 +65,10 @@ def test_gradients_equal_the_twin(case, per_pixel, device):
         side = torch.nn.functional.normalize(torch.linalg.cross(view, torch.tensor([0.0, 0.0, 1.0]).expand_as(view)), dim=-1)
         tangents = torch.stack([side * 0.1, (view + 1e-3 * torch.linalg.cross(view, side)) * 0.1], -1)
     generator = torch.Generator().manual_seed(5)
-    weights = [torch.randn(n, 36, 40, generator=generator) for n in (features.shape[1], 1, 1, 1)]
+    weights = [torch.randn(n, 36, 40, generator=generator) for n in (features.shape[1], 1, 1)]
 
     def loss(maps):
-        parts = [maps.features, maps.coverage[None], maps.depth_sum[None], maps.depth_square_sum[None]]
+        parts = [maps.features, maps.coverage[None], maps.depth_sum[None]]
         return sum((w.to(p) * p).sum() for w, p in zip(weights, parts, strict=True))
 
     def gradients(function, dtype, where, **extra):
@@ -93,7 +94,7 @@ def test_the_twins_gradient_is_that_of_finite_differences():
 
     def maps(*inputs):
         m = rasterize_reference(*inputs, camera, depth_origin=4.0)
-        return m.features, m.coverage, m.depth_sum, m.depth_square_sum
+        return m.features, m.coverage, m.depth_sum
 
     assert torch.autograd.gradcheck(maps, surfels, eps=1e-6, atol=1e-5)
 
@@ -103,7 +104,7 @@ def test_median_depth_passes_its_gradient_to_one_surfel():
     camera = look_at_camera(16, 16, focal=30.0)
     forward = camera.camera_from_world[2, :3]
     tangents = torch.stack([camera.camera_from_world[0, :3], camera.camera_from_world[1, :3]], -1)[None] * 0.5
-    maps = rasterize(centers, tangents, torch.tensor([0.95]), torch.ones(1, 1), camera)
+    maps = rasterize(centers, tangents, torch.tensor([0.95]), torch.ones(1, 1), camera, RasterSettings(median=True))
     (gradient,) = torch.autograd.grad(maps.median_depth[8, 8], centers)
     torch.testing.assert_close(gradient[0], forward, atol=1e-4, rtol=0)
 

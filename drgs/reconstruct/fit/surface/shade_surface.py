@@ -115,9 +115,9 @@ def shade_places(
         tracer: its mesh has the materials that mirrors see. surface: of packed_surface. light: its tables may want a gradient.
     """
     corners, weights = seen.corners, seen.weights
-    here = at_corners(surface, corners, weights)
-    normal, albedo = torch.nn.functional.normalize(here[:, :3], dim=-1), here[:, 3:6]
-    roughness, metallic = here[:, 6].contiguous(), here[:, 7]
+    # Split once: back through a slice autograd writes zeros for all that it leaves out.
+    blended_normal, albedo, roughness, metallic = at_corners(surface, corners, weights).split([3, 3, 1, 1], 1)
+    normal, roughness, metallic = torch.nn.functional.normalize(blended_normal, dim=-1), roughness[:, 0].contiguous(), metallic[:, 0]
     diffuse, f0 = albedo * (1 - metallic)[:, None], f0_from_base(albedo, metallic)
     open_share = at_corners(light.open_share, corners, weights)
     position = at_corners(tracer.mesh.vertices, corners, weights).detach()

@@ -28,11 +28,11 @@ from drgs.reconstruct.fit.losses import (
     display_image,
     edge_aware_smoothness,
     mask_loss,
-    normal_consistency,
     rough_light,
     structural_dissimilarity,
     white_light,
 )
+from drgs.reconstruct.fit.normal_consistency import normal_consistency
 from drgs.reconstruct.fit.surfel_parameters import (
     INITIAL_LIGHT,
     LearningRates,

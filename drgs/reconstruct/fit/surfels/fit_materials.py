@@ -19,7 +19,8 @@ from torch import Tensor
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.losses import display_image, edge_aware_smoothness, mask_loss, normal_consistency, rough_light, white_light
+from drgs.reconstruct.fit.losses import display_image, edge_aware_smoothness, mask_loss, rough_light, white_light
+from drgs.reconstruct.fit.normal_consistency import normal_consistency
 from drgs.reconstruct.fit.surfel_parameters import (
     gaussians_from_parameters,
     leaves,

@@ -57,16 +57,16 @@ def render_stage_one(
     assert maps.depth_sum is not None  # asked for by RasterSettings.depth
     depth = maps.depth_sum * inverse + maps.depth_origin
     pixels = (maps.coverage.detach().flatten() > 0.02).nonzero().squeeze(1)
-    values = (maps.features.flatten(1)[:, pixels] * inverse.flatten()[pixels]).T
+    # Split as planes, once: back through a slice autograd writes zeros for all that it leaves out.
+    values = maps.features.flatten(1).index_select(1, pixels) * inverse.flatten().index_select(0, pixels)
+    blended_normal, diffuse, f0, roughness, residual = (plane.T for plane in values.split([3, 3, 3, 1, 3]))
     _, directions = pixel_rays_world(camera)
-    wo = -directions.reshape(-1, 3)[pixels]
-    normal = face_camera(values[:, :3], wo)
-    radiance = shade_split_sum(
-        values[:, 3:6], values[:, 10:13], values[:, 6:9], values[:, 9], normal, wo, tables, light_from_world=light_from_world
-    )
+    wo = -directions.reshape(-1, 3).index_select(0, pixels)
+    normal = face_camera(blended_normal, wo)
+    radiance = shade_split_sum(diffuse, residual, f0, roughness[:, 0], normal, wo, tables, light_from_world=light_from_world)
     size = (camera.height, camera.width)
 
     def image(packed: Float[Tensor, "pixel channel"]) -> Float[Tensor, "height width channel"]:
         return packed.new_zeros(camera.height * camera.width, packed.shape[1]).index_copy(0, pixels, packed).view(*size, -1)
 
-    return StageOneMaps(image(radiance), maps.coverage, image(normal), depth, image(values[:, 9:10])[..., 0], values[:, 10:13])
+    return StageOneMaps(image(radiance), maps.coverage, image(normal), depth, image(roughness)[..., 0], residual)

@@ -50,7 +50,14 @@ class RasterSettings:
     filter_sigma: float = FILTER_SIGMA
     """[pixels] of the Gaussian low-pass that no surfel is drawn narrower than."""
     depth: bool = True
-    """Also blend depth moments and the median."""
+    """Also blend the mean depth."""
+    median: bool = False
+    """Besides the mean depth, find the median one."""
+
+    @property
+    def depth_planes(self) -> int:
+        """How many maps of depth there are."""
+        return int(self.depth) + int(self.depth and self.median)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +70,6 @@ class RasterMaps:
     """sum_i w_i = 1 - transmittance, 0..1."""
     depth_sum: Float[Tensor, "height width"] | None
     """sum_i w_i (z_i - depth_origin) [world units]."""
-    depth_square_sum: Float[Tensor, "height width"] | None
-    """sum_i w_i (z_i - depth_origin)^2."""
     median_depth: Float[Tensor, "height width"] | None
     """z of the last surfel met with more than half of the light left; 0 where nothing is met."""
     depth_origin: float
@@ -129,11 +134,11 @@ class _Rasterize(torch.autograd.Function):
         first_row = rows.start // TILE
         lists = build_tile_lists(depths, tile_rects, tile_counts, tiles_x, tiles_y, None if band is None else first_row)
 
-        planes = torch.empty(channels + 1 + 3 * settings.depth, plane, device=device)
-        median_entry = torch.empty(plane if settings.depth else 0, dtype=torch.int32, device=device)
+        planes = torch.empty(channels + 1 + settings.depth_planes, plane, device=device)
+        median_entry = torch.empty(plane if settings.depth_planes > 1 else 0, dtype=torch.int32, device=device)
         per_pixel = per_pixel or device.type != "cpu"
         launch(
-            (pixel_kernel if per_pixel else tile_kernel)(channels, settings.depth),
+            (pixel_kernel if per_pixel else tile_kernel)(channels, settings.depth_planes),
             plane if per_pixel else tiles_x * tiles_y,
             [_tile_table((tiles_x, tiles_y), first_row, depth_origin, lists, parameters, features)],
             [warp_array(planes), warp_array(median_entry)],
@@ -144,7 +149,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.camera, ctx.settings, ctx.depth_origin, ctx.per_pixel = camera, settings, depth_origin, per_pixel
         images = planes.view(-1, tiles_y * TILE, tiles_x * TILE)[:, : rows.stop - rows.start, : camera.width]
-        extra = images[channels + 1 :].unbind(0) if settings.depth else (None, None, None)
+        extra = [*images[channels + 1 :].unbind(0), None, None][:2]
         return images[: ctx.feature_channels], images[channels], *extra
 
     @staticmethod
@@ -164,7 +169,7 @@ class _Rasterize(torch.autograd.Function):
         for k, image_gradient in enumerate(image_gradients[1 : 1 + len(planes) - channels]):
             images[channels + k] = 0.0 if image_gradient is None else image_gradient
         # S = sum_i w_i (g . f_i): everything blended with weight w, that is all planes but the median.
-        blended = channels + 1 + 2 * settings.depth
+        blended = channels + 1 + settings.depth
         total = gradients[0] * planes[0]
         for k in range(1, blended):  # one product of all planes would be written whole, and read again
             total.addcmul_(gradients[k], planes[k])
@@ -174,11 +179,11 @@ class _Rasterize(torch.autograd.Function):
         if ctx.per_pixel:
             # Atomic sums: one thread on the CPU (tests only).
             surfel_gradients.zero_()
-            kernel = pixel_backward_kernel(channels, settings.depth)
+            kernel = pixel_backward_kernel(channels, settings.depth_planes)
             wp.launch(kernel, dim=plane, inputs=[0, *inputs], outputs=[warp_array(surfel_gradients)], device=warp)
         else:
             pair_gradients = torch.empty(len(lists.list_pair), 16 + channels, device=device)
-            kernel = tile_backward_kernel(channels, settings.depth)
+            kernel = tile_backward_kernel(channels, settings.depth_planes)
             launch(kernel, tiles_x * tiles_y, inputs, [warp_array(pair_gradients)], warp, slices_per_thread=16)
             launch(
                 sum_pair_gradients,
@@ -234,5 +239,5 @@ def rasterize(
         depth_origin = float(centers.mean(0) @ axis + offset) if len(centers) else 0.0
         depth_origin = depth_origin if math.isfinite(depth_origin) else 0.0
     maps = _Rasterize.apply(centers, tangents, opacities, features, camera, settings, depth_origin, per_pixel, band)
-    feature_sums, coverage, depth_sum, depth_square_sum, median_depth = maps
-    return RasterMaps(feature_sums, coverage, depth_sum, depth_square_sum, median_depth, depth_origin)
+    feature_sums, coverage, depth_sum, median_depth = maps
+    return RasterMaps(feature_sums, coverage, depth_sum, median_depth, depth_origin)

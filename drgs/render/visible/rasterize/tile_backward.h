@@ -2,7 +2,7 @@
 // dL/dalpha_i = T_i (g . f_i) - (S - sum_{j <= i} w_j g . f_j) / (1 - alpha_i), so nothing but T and a running sum is kept.
 // One row of `pair_gradients` is written per tile-surfel pair, at the pair's surfel-major place: no atomics, same bits each run.
 //
-// in   as tile_forward.h, plus gradient planes (CHANNELS, coverage, with DEPTH: w z', w z'^2, median), total (plane) = S
+// in   as tile_forward.h, plus gradient planes (CHANNELS, coverage, with DEPTH above 0 w z', above 1 median), total (plane) = S
 // out  pair_gradients (pair, 16 + CHANNELS): d/d(A: 9), d/d(center: 2), d/d(opacity), d/d(T_w.x, T_w.y, T_w.z), 0, d/d(features)
 const int tiles_x = table.tiles_x, stride = table.stride, plane = table.plane;
 const float depth_origin = table.depth_origin;
@@ -76,7 +76,7 @@ for (int entry = first; entry < last; ++entry) {
             gf += load16(g_planes + (long)(k) * plane + row) * f[k];
         weight[r] = w;
         v16 dhx = v16(0.0f), dhy = v16(0.0f), dhz = v16(0.0f);
-        if (DEPTH) {
+        if (DEPTH > 0) {
             const v16 radius = sqrt16(h2);
             const v16 limit = radius * (1.0f / DEPTH_CUTOFF);
             const v16 abs_hz = abs16(hz);
@@ -85,11 +85,12 @@ for (int entry = first; entry < last; ++entry) {
             const v16 z = q[15] + q[16] * u + q[17] * v;
             const v16 z_relative = z - depth_origin;
             const v16 g1 = load16(g_planes + (long)(CHANNELS + 1) * plane + row);
-            const v16 g2 = load16(g_planes + (long)(CHANNELS + 2) * plane + row);
-            gf += g1 * z_relative + g2 * z_relative * z_relative;
-            v16 dz = w * (g1 + 2.0f * g2 * z_relative);
-            const i16 is_median = live & (*(const i16u*)(median_entry.data + corner + row) == i16(entry));
-            dz += select(is_median, load16(g_planes + (long)(CHANNELS + 3) * plane + row), v16(0.0f));
+            gf += g1 * z_relative;
+            v16 dz = w * g1;
+            if (DEPTH > 1) {
+                const i16 is_median = live & (*(const i16u*)(median_entry.data + corner + row) == i16(entry));
+                dz += select(is_median, load16(g_planes + (long)(CHANNELS + DEPTH) * plane + row), v16(0.0f));
+            }
             d[14] += dz;
             d[12] += dz * u;
             d[13] += dz * v;

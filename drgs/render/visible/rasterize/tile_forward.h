@@ -2,8 +2,8 @@
 // Body of a Warp native function; tile_kernels.py puts constants (CHANNELS, DEPTH, PARAMETERS, ...) and simd_vector.h before it.
 //
 // in   tile, table (TileTable of tile_kernels.py)
-// out  planes: CHANNELS features, coverage, and with DEPTH: sum w z', sum w z'^2 (z' = z - depth_origin), median depth; all (plane)
-//      median_entry (plane): list position behind the median depth, -1 where none
+// out  planes: CHANNELS features, coverage, with DEPTH above 0 sum w z' (z' = z - depth_origin), above 1 the median depth; all (plane)
+//      median_entry (plane), with DEPTH above 1: list position behind the median depth, -1 where none
 const int tiles_x = table.tiles_x, stride = table.stride, plane = table.plane;
 const float depth_origin = table.depth_origin;
 const int tile_x = tile % tiles_x, tile_y = tile / tiles_x;
@@ -14,10 +14,10 @@ float* const out = planes.data;
 const int first = table.starts.data[tile], last = table.starts.data[tile + 1];
 const v16 x_left = lane_centers() + (float)(tile_x * 16);
 
-v16 sums[CHANNELS + 1 + 3 * DEPTH][16];
+v16 sums[CHANNELS + 1 + DEPTH][16];
 v16 transmittance[16];
 i16 median[16];
-for (int k = 0; k < CHANNELS + 1 + 3 * DEPTH; ++k)
+for (int k = 0; k < CHANNELS + 1 + DEPTH; ++k)
     for (int r = 0; r < 16; ++r) sums[k][r] = v16(0.0f);
 for (int r = 0; r < 16; ++r) { transmittance[r] = v16(1.0f); median[r] = i16(-1); }
 
@@ -59,21 +59,21 @@ for (int entry = first; entry < last; ++entry) {
 #pragma unroll
         for (int k = 0; k < CHANNELS; ++k) sums[k][r] += w * f[k];
         sums[CHANNELS][r] += w;
-        if (DEPTH) {
+        if (DEPTH > 0) {
             const v16 reach = max16(abs16(hz), sqrt16(h2) * (1.0f / DEPTH_CUTOFF)) + 1e-30f;
             const v16 z = q[15] + (q[16] * hx + q[17] * hy) / reach;
-            const v16 z_relative = z - depth_origin;
-            sums[CHANNELS + 1][r] += w * z_relative;
-            sums[CHANNELS + 2][r] += w * z_relative * z_relative;
-            const i16 is_median = live & (T > 0.5f);
-            sums[CHANNELS + 3][r] = select(is_median, z, sums[CHANNELS + 3][r]);
-            median[r] = is_median ? i16(entry) : median[r];
+            sums[CHANNELS + 1][r] += w * (z - depth_origin);
+            if (DEPTH > 1) {
+                const i16 is_median = live & (T > 0.5f);
+                sums[CHANNELS + DEPTH][r] = select(is_median, z, sums[CHANNELS + DEPTH][r]);
+                median[r] = is_median ? i16(entry) : median[r];
+            }
         }
         transmittance[r] = T - w;
     }
 }
 const long corner = (long)(tile_y) * 16 * stride + tile_x * 16;
-for (int k = 0; k < CHANNELS + 1 + 3 * DEPTH; ++k)
+for (int k = 0; k < CHANNELS + 1 + DEPTH; ++k)
     for (int r = 0; r < 16; ++r) store16(out + (long)(k) * plane + corner + (long)(r) * stride, sums[k][r]);
-if (DEPTH)
+if (DEPTH > 1)
     for (int r = 0; r < 16; ++r) *(i16u*)(median_entry.data + corner + (long)(r) * stride) = median[r];

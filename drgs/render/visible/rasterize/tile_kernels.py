@@ -16,8 +16,8 @@ from drgs.render.visible.rasterize.project import DEPTH_CUTOFF, PARAMETERS
 
 FAR = 100.0
 """Squared distance from a surfel, in standard deviations, that counts for all farther ones. No pixel is live beyond 12: its opacity there is below MIN_ALPHA."""
-CHANNEL_STEPS = (4, 8, 12, 16, 20, 24, 32, 48)
-"""Compiled widths; features are padded with zeros to the next one."""
+CHANNEL_STEPS = (4, 8, 12, 13, 16, 20, 24, 32, 48)
+"""Compiled widths; features are padded with zeros to the next one. Stage 1 of a build blends 13."""
 
 
 def padded_channels(channels: int) -> int:
@@ -32,9 +32,9 @@ def padded_channels(channels: int) -> int:
     raise ValueError(f"the rasteriser blends at most {CHANNEL_STEPS[-1]} feature channels at once; found {channels}: split them")
 
 
-def _source(name: str, channels: int, depth: bool) -> str:
+def _source(name: str, channels: int, depth: int) -> str:
     limits = {"FAR": FAR, "MAX_ALPHA": MAX_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE, "DEPTH_CUTOFF": DEPTH_CUTOFF}
-    sizes = {"CHANNELS": channels, "DEPTH": int(depth), "PARAMETERS": PARAMETERS}
+    sizes = {"CHANNELS": channels, "DEPTH": depth, "PARAMETERS": PARAMETERS}
     return native_source(Path(__file__).with_name(name), constants={**sizes, **limits})
 
 
@@ -59,8 +59,12 @@ class TileTable:
 
 
 @cache
-def tile_kernel(channels: int, depth: bool) -> Any:
-    """Blending on the CPU, one launch index a tile."""
+def tile_kernel(channels: int, depth: int) -> Any:
+    """Blending on the CPU, one launch index a tile.
+
+    Args:
+        depth: planes of it, here and below: none, the mean, or the mean and the median.
+    """
 
     @wp.func_native(_source("tile_forward.h", channels, depth))
     def tile_forward(tile: int, table: TileTable, planes: wp.array2d[float], median_entry: wp.array[wp.int32]): ...
@@ -79,7 +83,7 @@ def tile_kernel(channels: int, depth: bool) -> Any:
 
 
 @cache
-def tile_backward_kernel(channels: int, depth: bool) -> Any:
+def tile_backward_kernel(channels: int, depth: int) -> Any:
     """Gradients on the CPU, one launch index a tile."""
 
     @wp.func_native(_source("tile_backward.h", channels, depth))
@@ -163,7 +167,7 @@ def evaluate_surfel(parameters: wp.array2d[float], surfel: int, x_pixel: float, 
 
 
 @cache
-def pixel_kernel(channels: int, depth: bool) -> Any:
+def pixel_kernel(channels: int, depth: int) -> Any:
     """Blending in plain Warp for any device, one launch index a pixel of the padded image."""
     feature_vector = wp.types.vector(length=channels, dtype=float)
 
@@ -184,7 +188,6 @@ def pixel_kernel(channels: int, depth: bool) -> Any:
         coverage = float(0.0)
         transmittance = float(1.0)
         sum_z = float(0.0)
-        sum_zz = float(0.0)
         median_z = float(0.0)
         median = int(-1)
         for entry in range(table.starts[tile], table.starts[tile + 1]):
@@ -197,7 +200,6 @@ def pixel_kernel(channels: int, depth: bool) -> Any:
                 coverage = coverage + w
                 z = s.z - table.depth_origin
                 sum_z = sum_z + w * z
-                sum_zz = sum_zz + w * z * z
                 if transmittance > 0.5:
                     median_z = s.z
                     median = entry
@@ -207,17 +209,17 @@ def pixel_kernel(channels: int, depth: bool) -> Any:
         for k in range(channels):
             planes[k, pixel] = sums[k]
         planes[channels, pixel] = coverage
-        if wp.static(depth):
+        if wp.static(depth > 0):
             planes[channels + 1, pixel] = sum_z
-            planes[channels + 2, pixel] = sum_zz
-            planes[channels + 3, pixel] = median_z
+        if wp.static(depth > 1):
+            planes[channels + depth, pixel] = median_z
             median_entry[pixel] = median
 
     return blend_pixels
 
 
 @cache
-def pixel_backward_kernel(channels: int, depth: bool) -> Any:
+def pixel_backward_kernel(channels: int, depth: int) -> Any:
     """Gradients in plain Warp for any device, one launch index a pixel of the padded image.
 
     It adds with atomics, so on the CPU it must be launched on one thread (tests do); the CPU's own is `tile_backward_kernel`.
@@ -258,14 +260,13 @@ def pixel_backward_kernel(channels: int, depth: bool) -> Any:
                 dhx = float(0.0)
                 dhy = float(0.0)
                 dhz = float(0.0)
-                if wp.static(depth):
+                if wp.static(depth > 0):
                     z = s.z - table.depth_origin
                     g1 = gradients[channels + 1, pixel]
-                    g2 = gradients[channels + 2, pixel]
-                    gf = gf + g1 * z + g2 * z * z
-                    dz = w * (g1 + 2.0 * g2 * z)
-                    if entry == median_entry[pixel]:
-                        dz = dz + gradients[channels + 3, pixel]
+                    gf = gf + g1 * z
+                    dz = w * g1
+                    if wp.static(depth > 1) and entry == median_entry[pixel]:
+                        dz = dz + gradients[channels + depth, pixel]
                     u = s.hx / s.reach
                     v = s.hy / s.reach
                     wp.atomic_add(surfel_gradients, surfel, 12, dz * u)
