@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.sparse import csr_matrix, diags
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
+from drgs.reconstruct.geometry.alike_systems import factored
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 
 
@@ -27,5 +27,4 @@ def agree_along_edges(
     )
     strength, wanted = (values.cpu().double().numpy() for values in (weight, wish))
     matrix = (diags(strength) + together * difference.T @ difference).tocsc()
-    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return torch.from_numpy(factors.solve(strength * wanted)).to(wish)
+    return torch.from_numpy(factored(matrix).solve(strength * wanted)).to(wish)

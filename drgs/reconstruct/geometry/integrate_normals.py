@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix, diags, identity
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
+from drgs.reconstruct.geometry.alike_systems import AlikeSystems
 from drgs.reconstruct.geometry.mask_outlines import OutlineResiduals
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.scene.mesh import vertex_normals
@@ -73,12 +73,13 @@ def integrate_normals(
     settings: IntegrationSettings,
     homes: Places | None = None,
     texture: Places | None = None,
+    systems: AlikeSystems | None = None,
 ) -> Tensor:
     """(vertex, 3) positions after one solve.
 
     Args:
         vertices: (vertex, 3). faces: (face, 3). wanted_normals: (vertex, 3) unit. outlines: of these vertices.
-        homes, texture: None: there are none.
+        homes, texture: None: there are none. systems: of solves before, of these vertices not far from here.
     """
     direction = vertex_normals(vertices, faces)
     start, end = edges.vertices.unbind(1)
@@ -114,7 +115,7 @@ def integrate_normals(
         shape=(edge_count, count),
     )
     fixed = anchor + settings.even * differences.T @ differences
-    moved = np.zeros(count)
+    moved, systems = np.zeros(count), systems or AlikeSystems()
     for _ in range(settings.reweightings):
         now = jacobian @ moved + residual
         weight = np.concatenate(
@@ -124,8 +125,7 @@ def integrate_normals(
             ]
         )
         normal_matrix = (jacobian.T @ diags(weight) @ jacobian + fixed).tocsc()
-        factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        moved = factors.solve(pull - jacobian.T @ (weight * residual))
+        moved = systems.solved(normal_matrix, pull - jacobian.T @ (weight * residual), moved)
     step = torch.maximum(torch.minimum(torch.from_numpy(moved).to(vertices), reach), -reach)
     return vertices + unfolded(vertices, direction, step, faces, edges)[:, None] * direction
 
