@@ -1,4 +1,4 @@
-"""Differentiable blending of surfels into maps: features, coverage, depth moments, median depth.
+"""Differentiable blending of surfels into maps: features, coverage, mean and median depth.
 
 In: world centres (N, 3), tangent columns (N, 3, 2), opacities (N,), features (N, C), a camera. Out: un-normalised sums; callers divide
 by coverage where Eq. 2 of the paper says so. Gradients reach centres, tangents, opacities and features. Deterministic on the CPU.
