@@ -133,7 +133,7 @@ def build(
     )
     with StopOnInterrupt() as interrupt, build_progress(json_progress) as report:
         try:
-            asset = build_asset(dataset, out, settings, progress=report, should_stop=interrupt.is_set)
+            asset = build_asset(dataset, out, settings, progress=report, should_stop=interrupt.is_set, previews=False)
         except BuildStopped:
             chosen = "" if binding == BindingKind.particles else f" --binding {binding.value}"
             chosen += "" if light == LightKind.auto else f" --light {light.value}"

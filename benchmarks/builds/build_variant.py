@@ -23,7 +23,7 @@ def main(argument: str) -> None:
     out = Path(job["out"])
     settings = BuildSettings(preset=name, device=job["device"], seed=job["seed"], resume=Path(f"{out}.build").is_dir())
     with build_progress(True) as report:
-        asset = build_asset(Path(job["dataset"]), out, settings, progress=report)
+        asset = build_asset(Path(job["dataset"]), out, settings, progress=report, previews=False)
     print(json.dumps({"stage": "done", "provenance": asset.provenance}), flush=True)
 
 

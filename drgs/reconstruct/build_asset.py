@@ -120,6 +120,7 @@ def build_asset(
     settings: BuildSettings,
     progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    previews: bool = True,
 ) -> Asset:
     """Build an asset folder from a capture.
 
@@ -127,12 +128,13 @@ def build_asset(
         dataset: a capture folder (see load_views), a folder of pictures without cameras, or a film: those are posed first (drgs/reconstruct/pose).
         out: the asset folder to write; OUT.build/ beside it holds checkpoints.
         should_stop: asked between steps; when true the checkpoint is written and BuildStopped raised.
+        previews: False: `progress` is told without pictures, for whom shows none.
 
     Raises:
         ValueError: the capture, a setting or a checkpoint is wrong, in one sentence.
         BuildStopped: as asked.
     """
-    *_, (_, asset) = build_stages(dataset, out, settings, progress, should_stop)
+    *_, (_, asset) = build_stages(dataset, out, settings, progress, should_stop, previews)
     assert asset is not None
     return asset
 
@@ -143,6 +145,7 @@ def build_stages(
     settings: BuildSettings,
     progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    previews: bool = True,
 ) -> Iterator[tuple[str, Asset | None]]:
     """build_asset in stages: gives the name of each as it is finished, its result on disk, and with the last one the asset.
 
@@ -152,7 +155,7 @@ def build_stages(
     preset = PRESETS[settings.preset]
     device = device_from_name(settings.device)
     seconds: dict[str, float] = {}
-    reporter = BuildReporter(progress, STAGE_SHARES[settings.binding])
+    reporter = BuildReporter(progress, STAGE_SHARES[settings.binding], previews)
 
     @contextmanager
     def timed(stage: str) -> Iterator[None]:

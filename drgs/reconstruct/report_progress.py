@@ -22,8 +22,9 @@ REPORT_SECONDS = 0.2
 class BuildReporter:
     """Final. Turns step reports into Progress, with a preview every few seconds and a checkpoint every half minute."""
 
-    def __init__(self, progress: Callable[[Progress], None] | None, shares: Mapping[str, float]) -> None:
+    def __init__(self, progress: Callable[[Progress], None] | None, shares: Mapping[str, float], previews: bool = True) -> None:
         self.progress = progress
+        self.previews = previews
         self.shares = shares
         self.started = time.monotonic()
         self.begun: dict[str, float] = {}
@@ -51,7 +52,7 @@ class BuildReporter:
             return
         self.last_report = now
         jpeg = None
-        if preview is not None and now - self.last_preview > PREVIEW_SECONDS:
+        if self.previews and preview is not None and now - self.last_preview > PREVIEW_SECONDS:
             jpeg = preview()
             self.last_preview = time.monotonic()
         names = list(self.shares)

@@ -32,7 +32,7 @@ from drgs.reconstruct.geometry.divide_faces import DivisionSettings
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import drop_unseen
 from drgs.reconstruct.presets import PRESETS, Preset
-from drgs.reconstruct.report_progress import encode_preview
+from drgs.reconstruct.report_progress import BuildReporter, encode_preview
 from drgs.reconstruct.stages import stage_two_preview
 from drgs.render.records import SampleCounts
 from drgs.scene.asset import Asset, load_asset, load_photographs
@@ -365,6 +365,14 @@ def test_surfels_that_no_camera_sees_are_dropped():
     assert float(distance.min()) > 0.9
     assert float(kept.centers[:, 1].median()) < 0 and 400 < len(kept.centers) < 900
     assert len(kept.sh) == len(kept.albedo) == len(kept.centers)
+
+
+@pytest.mark.parametrize("previews", [True, False])
+def test_pictures_are_made_for_those_who_show_them(previews: bool, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(report_progress, "PREVIEW_SECONDS", -1.0)
+    told: list[Progress] = []
+    BuildReporter(told.append, {"fit": 1.0}, previews).report("fit", 0.5, "half", preview=lambda: b"jpeg")
+    assert [one.preview_jpeg for one in told] == [b"jpeg" if previews else None]
 
 
 def test_a_preview_is_a_jpeg_of_the_picture_on_grey():

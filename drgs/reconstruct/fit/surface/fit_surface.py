@@ -81,6 +81,8 @@ class SurfaceSettings:
     to_surface_end: float = 0.1
     """Of all passes: the share by which normals return to the surface's own after the last one (MoveSettings.to_surface after the others). Relief
     that is finer than faces is in the normals alone."""
+    light_at_end: bool = True
+    """After the last move the light that arrives is traced again. A pass that another one follows need not: that begins with a move of its own."""
     weight_bend: float = 0.05
     weight_bend_end: float = 0.0015
     """Of the mean difference of normals along edges, at the start and at the end."""
@@ -160,11 +162,11 @@ class _Steps:
 
     def end_round(self, done: int) -> None:
         if not self.settings.still and done % self.settings.steps_a_round == 0:
-            self.move_surface()
+            self.move_surface(self.settings.light_at_end or done < self.settings.iterations)
 
-    def move_surface(self) -> None:
+    def move_surface(self, relight: bool = True) -> None:
         """Where normals and outlines say, and what is metal there."""
-        self.surface.move(self.settings.moves)
+        self.surface.move(self.settings.moves, relight)
         if self.state.iteration > self.settings.metal_from * self.settings.iterations:
             self.surface.look_for_metal(self.targets, self.settings.moves)
 

@@ -76,8 +76,12 @@ class MovingSurface:
         return tracer
 
     @torch.no_grad()
-    def move(self, settings: MoveSettings) -> None:
-        """Positions from normals and outlines, then light that the moved surface blocks and sends back."""
+    def move(self, settings: MoveSettings, relight: bool = True) -> None:
+        """Positions from normals and outlines, then light that the moved surface blocks and sends back.
+
+        Args:
+            relight: False: what arrives stays what it was, for the surface is meshed anew, and moves, before it is shaded again.
+        """
         parameters = self._state.parameters
         normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
         systems = AlikeSystems()
@@ -96,7 +100,10 @@ class MovingSurface:
         own = vertex_normals(parameters["vertices"], self.faces)
         back = (1 - settings.to_surface) * normals + settings.to_surface * own
         parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))
-        self.relight(settings.share_rays)
+        if relight:
+            self.relight(settings.share_rays)
+        else:
+            self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
 
     @torch.no_grad()
     def look_for_texture(self, settings: MoveSettings) -> None:

@@ -113,6 +113,7 @@ def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
         weight_smooth=between(given.weight_smooth, given.weight_smooth_end, index),
         weight_smooth_end=between(given.weight_smooth, given.weight_smooth_end, index + 1),
         fall_from=given.fall_from if last else 1.0,
+        light_at_end=last,
         moves=replace(given.moves, to_surface=given.to_surface_end) if last else given.moves,
         seed=given.seed + index,
     )

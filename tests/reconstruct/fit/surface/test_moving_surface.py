@@ -1,5 +1,6 @@
 """Light on a surface that moved."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, irradiance_share
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings
-from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.environment import Environment
@@ -60,3 +61,15 @@ def test_shares_of_a_few_rays_are_as_good_as_those_of_many(tmp_path: Path) -> No
 
     assert error(state.parameters["open_share"]) < 0.5 * error(shares(RAYS))
     assert error(state.parameters["open_share"]) < error(shares(4 * RAYS))
+
+
+@pytest.mark.parametrize("relight", [True, False])
+def test_a_surface_that_moved_is_lit_anew_where_it_is_shaded_next_and_met_where_it_is(relight: bool, tmp_path: Path):
+    state, faces = two_spheres()
+    state.parameters["vertices"].mul_(1.01)
+    surface = MovingSurface(replace(painted_views(tmp_path, count=3), has_masks=False), faces, state)
+    before = state.parameters["vertices"].clone()
+    surface.move(MoveSettings(solves=1, share_rays=RAYS), relight)
+    assert not torch.equal(state.parameters["vertices"], before)
+    torch.testing.assert_close(surface.tracer.mesh.vertices, state.parameters["vertices"])
+    assert bool((state.parameters["open_share"] != 1).any()) == relight
