@@ -66,7 +66,7 @@ PRESETS = {
     "fast": Preset(
         15_000,
         512,
-        FitSettings(iterations=740, densify=DensifySettings(budget=30_000)),
+        FitSettings(iterations=660, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carve_after=(2,)),
         MeshMaterialSettings(iterations=180),
