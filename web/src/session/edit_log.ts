@@ -137,7 +137,9 @@ export const editsToRestore = () => revised(splice?.after ?? sent());
 export function sendEdit(edit: Edit, coalesce: string | null): void {
   if (!stream) return;
   const last = pending.value.at(-1)?.edit ?? log.value.edits.at(-1);
-  if (last && sameEdits([last], [edit])) return; // Enter behind a number that is in force already
+  // Enter behind a number that is in force already, and stays so: an undo, a redo or a splice on its way may take it back.
+  const stays = !splice && !stream.awaits('undo') && !stream.awaits('redo');
+  if (stays && last && sameEdits([last], [edit])) return;
   wanted = null; // what the user does last counts
   const id = stream.sendEdit(edit, coalesce);
   pending.value = [...pending.value, { id, edit, revision: null }];

@@ -10,10 +10,13 @@ const logWith = (revision: number, ...rotations: number[]): EditLog => ({ revisi
 /** The other end: what was sent there, each under the next id. */
 let sent: unknown[] = [];
 let idle = true;
+/** Whether the server has not answered an undo. */
+let undoing = false;
 
 beforeEach(() => {
   sent = [];
   idle = true;
+  undoing = false;
   let id = 0;
   const record = (...what: unknown[]) => {
     sent.push(what);
@@ -27,7 +30,7 @@ beforeEach(() => {
     splice: (revision: number, start: number, remove: number, put: Edit[], key: string | null) => record('splice', revision, start, remove, put, key),
     undo: () => record('undo'),
     redo: () => record('redo'),
-    awaits: () => false,
+    awaits: (type: string) => undoing && type === 'undo',
   };
   attachStream(stream as unknown as Stream);
   resetLog(logWith(1, 10, 20));
@@ -42,6 +45,16 @@ it('an edit is in force before the server has it, once, and an edit that changes
   receiveLog(logWith(2, 10, 20, 30));
   expect(edits.value).toEqual(log.value.edits);
   expect(sent).toEqual([['edit', turned(30), 'drag']]);
+});
+
+it('the last edit made again is not lost while an undo, or a change of the list, takes it back', () => {
+  undoing = true;
+  sendEdit(turned(20), null);
+  undoing = false;
+  resetLog(logWith(1, 10, 20));
+  reviseEdits(() => []);
+  sendEdit(turned(20), null);
+  expect(sent.filter((what) => (what as string[])[0] === 'edit')).toEqual([0, 1].map(() => ['edit', turned(20), null]));
 });
 
 it('a splice waits for what was sent before it, and then counts in the newest log', () => {
