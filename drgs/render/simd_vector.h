@@ -3,7 +3,6 @@
 typedef float v16 __attribute__((ext_vector_type(16)));
 typedef int i16 __attribute__((ext_vector_type(16)));
 typedef float v16u __attribute__((ext_vector_type(16), aligned(4)));
-typedef int i16u __attribute__((ext_vector_type(16), aligned(4)));
 typedef float v8 __attribute__((ext_vector_type(8)));
 typedef float v4 __attribute__((ext_vector_type(4)));
 const auto select = [](i16 mask, v16 a, v16 b) { return mask ? a : b; };
@@ -32,9 +31,6 @@ const auto sums16 = [](const v16* a) -> v16 {
     for (int k = 0; k < 4; ++k) c[k] = PAIR_SUM(b[2 * k], b[2 * k + 1], 2);
     const v16 d0 = PAIR_SUM(c[0], c[1], 4), d1 = PAIR_SUM(c[2], c[3], 4);
     return PAIR_SUM(d0, d1, 8);
-};
-const auto lane_centers = []() -> v16 {
-    return v16{0.5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f, 8.5f, 9.5f, 10.5f, 11.5f, 12.5f, 13.5f, 14.5f, 15.5f};
 };
 // exp(-a) for a >= 0: 2^n 2^f with f in [-0.5, 0.5], a degree-6 polynomial; relative error below 2e-7, 0 beyond a = 87
 const auto exp_negative = [](v16 a) -> v16 {

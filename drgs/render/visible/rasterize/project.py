@@ -205,6 +205,20 @@ def project_surfels(
     projected.depths[i] = along + wp.float64(m[2, 2]) * wp.float64(c[2]) + wp.float64(m[2, 3])
 
 
+@wp.func_native("""
+// Four numbers at a time, each sum in a register; the last four may overlap those before. There are at least twenty.
+typedef float v4 __attribute__((ext_vector_type(4), aligned(4)));
+const float* const first = pair_gradients.data + (long)begin * columns;
+for (int step = 0; step < columns; step += 4) {
+    const int k = step < columns - 4 ? step : columns - 4;
+    v4 sum = v4(0.0f);
+    for (int pair = 0; pair < end - begin; ++pair) sum += *(const v4*)(first + (long)pair * columns + k);
+    *(v4*)(sums.data + (long)surfel * columns + k) = sum;
+}
+""")
+def _sum_rows(surfel: int, begin: int, end: int, columns: int, pair_gradients: wp.array2d[float], sums: wp.array2d[float]): ...
+
+
 @wp.kernel(enable_backward=False)
 def sum_pair_gradients(
     first: int,
@@ -214,12 +228,9 @@ def sum_pair_gradients(
     # outputs
     surfel_gradients: wp.array2d[float],
 ):
+    """On the CPU, where they are written pair by pair."""
     i = first + wp.tid()
-    for k in range(columns):
-        surfel_gradients[i, k] = 0.0
-    for pair in range(offsets[i], offsets[i + 1]):
-        for k in range(columns):
-            surfel_gradients[i, k] += pair_gradients[pair, k]
+    _sum_rows(i, offsets[i], offsets[i + 1], columns, pair_gradients, surfel_gradients)
 
 
 @wp.kernel(enable_backward=False)

@@ -168,14 +168,9 @@ class _Rasterize(torch.autograd.Function):
         images[: ctx.feature_channels] = 0.0 if image_gradients[0] is None else image_gradients[0]
         for k, image_gradient in enumerate(image_gradients[1 : 1 + len(planes) - channels]):
             images[channels + k] = 0.0 if image_gradient is None else image_gradient
-        # S = sum_i w_i (g . f_i): everything blended with weight w, that is all planes but the median.
-        blended = channels + 1 + settings.depth
-        total = gradients[0] * planes[0]
-        for k in range(1, blended):  # one product of all planes would be written whole, and read again
-            total.addcmul_(gradients[k], planes[k])
         surfel_gradients = torch.empty(count, 16 + channels, device=device)
         table = _tile_table((tiles_x, tiles_y), 0, ctx.depth_origin, lists, parameters, features)
-        inputs = [table, warp_array(gradients), warp_array(total), warp_array(median_entry)]
+        inputs = [table, warp_array(planes), warp_array(gradients), warp_array(median_entry)]
         if ctx.per_pixel:
             # Atomic sums: one thread on the CPU (tests only).
             surfel_gradients.zero_()

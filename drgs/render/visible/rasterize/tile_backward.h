@@ -2,7 +2,7 @@
 // dL/dalpha_i = T_i (g . f_i) - (S - sum_{j <= i} w_j g . f_j) / (1 - alpha_i), so nothing but T and a running sum is kept.
 // One row of `pair_gradients` is written per tile-surfel pair, at the pair's surfel-major place: no atomics, same bits each run.
 //
-// in   as tile_forward.h, plus gradient planes (CHANNELS, coverage, with DEPTH above 0 w z', above 1 median), total (plane) = S
+// in   as tile_forward.h and what that wrote, plus gradient planes (CHANNELS, coverage, with DEPTH above 0 w z', above 1 median)
 // out  pair_gradients (pair, 16 + CHANNELS): d/d(A: 9), d/d(center: 2), d/d(opacity), d/d(T_w.x, T_w.y, T_w.z), 0, d/d(features)
 const int tiles_x = table.tiles_x, stride = table.stride, plane = table.plane;
 const float depth_origin = table.depth_origin;
@@ -12,14 +12,22 @@ const int* const list_pair = table.list_pair.data;
 const float* const surfel_rows = table.parameters.data;
 const float* const feature_rows = table.features.data;
 const int first = table.starts.data[tile], last = table.starts.data[tile + 1];
-const v16 x_left = lane_centers() + (float)(tile_x * 16);
+const v16 lane_x = block_x(), lane_y = block_y();
+const float left = (float)(tile_x * 16), top = (float)(tile_y * 16);
 const long corner = (long)(tile_y) * 16 * stride + tile_x * 16;
 const float* const g_planes = gradients.data + corner;
 
-v16 transmittance[16], behind[16];
+// What pixels of this tile ask for, block by block.
+v16 asked[CHANNELS + 1 + DEPTH][16], transmittance[16], behind[16];
+i16 median[16];
 for (int r = 0; r < 16; ++r) {
     transmittance[r] = v16(1.0f);
-    behind[r] = load16(total.data + corner + (long)(r) * stride);
+    behind[r] = v16(0.0f);  // S of all that is blended with weight w, which the median is not
+    for (int k = 0; k < CHANNELS + 1 + DEPTH; ++k) {
+        asked[k][r] = load_block(g_planes + (long)(k) * plane, stride, r);
+        if (k < CHANNELS + 1 + (DEPTH > 0)) behind[r] += asked[k][r] * load_block(planes.data + (long)(k) * plane + corner, stride, r);
+    }
+    if (DEPTH > 1) median[r] = __builtin_bit_cast(i16, load_block((const float*)median_entry.data + corner, stride, r));
 }
 for (int entry = first; entry < last; ++entry) {
     float* const out = pair_gradients.data + (long)(list_pair[entry]) * (16 + CHANNELS);
@@ -34,47 +42,48 @@ for (int entry = first; entry < last; ++entry) {
             break;
         }
     }
+    const long ahead = list_surfel[min_int(entry + AHEAD, last - 1)];
+    prefetch_rows(surfel_rows + ahead * PARAMETERS, PARAMETERS);
+    prefetch_rows(feature_rows + ahead * CHANNELS, CHANNELS);
+    const float* const out_ahead = pair_gradients.data + (long)(list_pair[min_int(entry + AHEAD, last - 1)]) * (16 + CHANNELS);
+    for (int k = 0; k < 16 + CHANNELS; k += 16) __builtin_prefetch(out_ahead + k, 1);
     const int surfel = list_surfel[entry];
     const float* const q = surfel_rows + (long)(surfel) * PARAMETERS;
     const float* const f = feature_rows + (long)(surfel) * CHANNELS;
-    const float top = (float)(tile_y * 16);
-    const int row_first = max_int(0, (int)(q[21] - top)), row_last = min_int(15, (int)(q[22] - top));
-    const v16 x = x_left - q[9];
-    const v16 dx = x_left - q[11];
-    const v16 dx2 = q[24] * dx * dx;
-    const v16 hx_row = q[0] * x, hy_row = q[3] * x, hz_row = q[6] * x;
+    const int column_first = max_int(0, (int)(q[19] - left)) / 4, column_last = min_int(15, (int)(q[20] - left)) / 4;
+    const int row_first = max_int(0, (int)(q[21] - top)) / 4, row_last = min_int(15, (int)(q[22] - top)) / 4;
+    const v16 hx_lane = q[0] * lane_x + q[1] * lane_y, hy_lane = q[3] * lane_x + q[4] * lane_y, hz_lane = q[6] * lane_x + q[7] * lane_y;
     v16 d[16];  // A (9), filter centre (2), opacity, T_w (3), nothing
     v16 weight[16];
+    int touched[16], touched_count = 0;
     for (int k = 0; k < 16; ++k) d[k] = v16(0.0f);
-    for (int r = row_first; r <= row_last; ++r) weight[r] = v16(0.0f);
-    bool touched = false;
-    for (int r = row_first; r <= row_last; ++r) {
-        const float y_pixel = top + (float)(r) + 0.5f;
-        const float y = y_pixel - q[10], dy = y_pixel - q[12];
-        const v16 hx = hx_row + (q[1] * y + q[2]);
-        const v16 hy = hy_row + (q[4] * y + q[5]);
-        const v16 hz = hz_row + (q[7] * y + q[8]);
+    for (int row = row_first; row <= row_last; ++row) for (int column = column_first; column <= column_last; ++column) {
+        const int r = 4 * row + column;
+        const float block_left = left + (float)(4 * column), block_top = top + (float)(4 * row);
+        const v16 x = lane_x + (block_left - q[9]), y = lane_y + (block_top - q[10]);
+        const v16 dx = lane_x + (block_left - q[11]), dy = lane_y + (block_top - q[12]);
+        const v16 hx = hx_lane + (q[0] * (block_left - q[9]) + q[1] * (block_top - q[10]) + q[2]);
+        const v16 hy = hy_lane + (q[3] * (block_left - q[9]) + q[4] * (block_top - q[10]) + q[5]);
+        const v16 hz = hz_lane + (q[6] * (block_left - q[9]) + q[7] * (block_top - q[10]) + q[8]);
         const v16 h2 = hx * hx + hy * hy, hz2 = hz * hz;
-        const v16 rho_screen = dx2 + q[24] * dy * dy;
+        const v16 rho_screen = q[24] * (dx * dx + dy * dy);
         i16 front = hz > 0.0f;
         if (q[18] > 0.0f) front &= (q[15] - q[18]) * hz + q[16] * hx + q[17] * hy > 0.0f;
         const i16 inside = ((h2 <= q[14] * hz2) & front) | (rho_screen <= q[14]);
         const v16 T = transmittance[r];
         const i16 live = inside & (T >= MIN_TRANSMITTANCE);
         if (!any(live)) continue;
-        touched = true;
         const v16 rho_plane = select(front, h2 / (hz2 + 1e-30f), v16(1e30f));
         const v16 rho = min16(min16(rho_plane, rho_screen), v16(FAR));  // tile_forward.h says why
         const v16 e = exp_negative(0.5f * rho);
         const v16 raw = q[13] * e;
         const v16 alpha = min16(v16(MAX_ALPHA), raw);
         const v16 w = select(live, alpha * T, v16(0.0f));
-        const long row = (long)(r) * stride;
-        v16 gf = load16(g_planes + (long)(CHANNELS) * plane + row);  // coverage: a feature that is 1
+        v16 gf = asked[CHANNELS][r];  // coverage: a feature that is 1
 #pragma unroll
-        for (int k = 0; k < CHANNELS; ++k)
-            gf += load16(g_planes + (long)(k) * plane + row) * f[k];
-        weight[r] = w;
+        for (int k = 0; k < CHANNELS; ++k) gf += asked[k][r] * f[k];
+        touched[touched_count] = r;
+        weight[touched_count++] = w;
         v16 dhx = v16(0.0f), dhy = v16(0.0f), dhz = v16(0.0f);
         if (DEPTH > 0) {
             const v16 radius = sqrt16(h2);
@@ -84,12 +93,12 @@ for (int entry = first; entry < last; ++entry) {
             const v16 u = hx * inverse_reach, v = hy * inverse_reach;
             const v16 z = q[15] + q[16] * u + q[17] * v;
             const v16 z_relative = z - depth_origin;
-            const v16 g1 = load16(g_planes + (long)(CHANNELS + 1) * plane + row);
+            const v16 g1 = asked[CHANNELS + 1][r];
             gf += g1 * z_relative;
             v16 dz = w * g1;
             if (DEPTH > 1) {
-                const i16 is_median = live & (*(const i16u*)(median_entry.data + corner + row) == i16(entry));
-                dz += select(is_median, load16(g_planes + (long)(CHANNELS + DEPTH) * plane + row), v16(0.0f));
+                const i16 is_median = live & (median[r] == i16(entry));
+                dz += select(is_median, asked[CHANNELS + DEPTH][r], v16(0.0f));
             }
             d[14] += dz;
             d[12] += dz * u;
@@ -121,7 +130,7 @@ for (int entry = first; entry < last; ++entry) {
         d[6] += dhz * x; d[7] += dhz * y; d[8] += dhz;
         transmittance[r] = T - w;
     }
-    if (!touched) {
+    if (touched_count == 0) {
         for (int k = 0; k < 16 + CHANNELS; ++k) out[k] = 0.0f;
         continue;
     }
@@ -131,9 +140,8 @@ for (int entry = first; entry < last; ++entry) {
         v16 df[16];
         for (int k = 0; k < 16; ++k) df[k] = v16(0.0f);
         for (int k = 0; k < 16 && block + k < CHANNELS; ++k) {
-            const float* const g = g_planes + (long)(block + k) * plane;
             v16 sum = v16(0.0f);
-            for (int r = row_first; r <= row_last; ++r) sum += load16(g + (long)r * stride) * weight[r];
+            for (int n = 0; n < touched_count; ++n) sum += asked[block + k][touched[n]] * weight[n];
             df[k] = sum;
         }
         const v16 sums = sums16(df);

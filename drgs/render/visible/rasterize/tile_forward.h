@@ -1,5 +1,6 @@
-// Blends the surfels of one 16x16 tile, front to back, 16 pixels of a row at a time.
-// Body of a Warp native function; tile_kernels.py puts constants (CHANNELS, DEPTH, PARAMETERS, ...) and simd_vector.h before it.
+// Blends the surfels of one 16x16 tile, front to back, 16 pixels of a block of 4x4 at a time: most surfels are a few pixels wide,
+// and boxes of 4x4 that they touch are two thirds of the rows of 16 that they touch.
+// Body of a Warp native function; tile_kernels.py puts constants (CHANNELS, DEPTH, PARAMETERS, ...), simd_vector.h and tile_blocks.h before it.
 //
 // in   tile, table (TileTable of tile_kernels.py)
 // out  planes: CHANNELS features, coverage, with DEPTH above 0 sum w z' (z' = z - depth_origin), above 1 the median depth; all (plane)
@@ -12,7 +13,8 @@ const float* const surfel_rows = table.parameters.data;
 const float* const feature_rows = table.features.data;
 float* const out = planes.data;
 const int first = table.starts.data[tile], last = table.starts.data[tile + 1];
-const v16 x_left = lane_centers() + (float)(tile_x * 16);
+const v16 lane_x = block_x(), lane_y = block_y();
+const float left = (float)(tile_x * 16), top = (float)((table.first_row + tile_y) * 16);
 
 v16 sums[CHANNELS + 1 + DEPTH][16];
 v16 transmittance[16];
@@ -27,24 +29,26 @@ for (int entry = first; entry < last; ++entry) {
         for (int r = 0; r < 16; ++r) open |= transmittance[r] >= MIN_TRANSMITTANCE;
         if (!any(open)) break;
     }
+    const long ahead = list_surfel[min_int(entry + AHEAD, last - 1)];
+    prefetch_rows(surfel_rows + ahead * PARAMETERS, PARAMETERS);
+    prefetch_rows(feature_rows + ahead * CHANNELS, CHANNELS);
     const int surfel = list_surfel[entry];
     const float* const q = surfel_rows + (long)(surfel) * PARAMETERS;
     const float* const f = feature_rows + (long)(surfel) * CHANNELS;
-    const float top = (float)((table.first_row + tile_y) * 16);
-    const int row_first = max_int(0, (int)(q[21] - top)), row_last = min_int(15, (int)(q[22] - top));
-    const v16 x = x_left - q[9];
-    const v16 dx = x_left - q[11];
-    const v16 dx2 = q[24] * dx * dx;
-    const v16 hx_row = q[0] * x, hy_row = q[3] * x, hz_row = q[6] * x;
-    for (int r = row_first; r <= row_last; ++r) {
-        const float y_pixel = top + (float)(r) + 0.5f;
-        const float y = y_pixel - q[10], dy = y_pixel - q[12];
-        const v16 hx = hx_row + (q[1] * y + q[2]);
-        const v16 hy = hy_row + (q[4] * y + q[5]);
-        const v16 hz = hz_row + (q[7] * y + q[8]);
+    const int column_first = max_int(0, (int)(q[19] - left)) / 4, column_last = min_int(15, (int)(q[20] - left)) / 4;
+    const int row_first = max_int(0, (int)(q[21] - top)) / 4, row_last = min_int(15, (int)(q[22] - top)) / 4;
+    const v16 hx_lane = q[0] * lane_x + q[1] * lane_y, hy_lane = q[3] * lane_x + q[4] * lane_y, hz_lane = q[6] * lane_x + q[7] * lane_y;
+    for (int row = row_first; row <= row_last; ++row) for (int column = column_first; column <= column_last; ++column) {
+        const int r = 4 * row + column;
+        const float block_left = left + (float)(4 * column), block_top = top + (float)(4 * row);
+        const float x = block_left - q[9], y = block_top - q[10];
+        const v16 dx = lane_x + (block_left - q[11]), dy = lane_y + (block_top - q[12]);
+        const v16 hx = hx_lane + (q[0] * x + q[1] * y + q[2]);
+        const v16 hy = hy_lane + (q[3] * x + q[4] * y + q[5]);
+        const v16 hz = hz_lane + (q[6] * x + q[7] * y + q[8]);
         const v16 h2 = hx * hx + hy * hy, hz2 = hz * hz;
         // rho <= rho_max in the plane's branch, without dividing first
-        const v16 rho_screen = dx2 + q[24] * dy * dy;
+        const v16 rho_screen = q[24] * (dx * dx + dy * dy);
         i16 front = hz > 0.0f;
         if (q[18] > 0.0f) front &= (q[15] - q[18]) * hz + q[16] * hx + q[17] * hy > 0.0f;  // nearer than the near plane
         const i16 inside = ((h2 <= q[14] * hz2) & front) | (rho_screen <= q[14]);
@@ -74,6 +78,6 @@ for (int entry = first; entry < last; ++entry) {
 }
 const long corner = (long)(tile_y) * 16 * stride + tile_x * 16;
 for (int k = 0; k < CHANNELS + 1 + DEPTH; ++k)
-    for (int r = 0; r < 16; ++r) store16(out + (long)(k) * plane + corner + (long)(r) * stride, sums[k][r]);
+    for (int r = 0; r < 16; ++r) store_block(out + (long)(k) * plane + corner, stride, r, sums[k][r]);
 if (DEPTH > 1)
-    for (int r = 0; r < 16; ++r) *(i16u*)(median_entry.data + corner + (long)(r) * stride) = median[r];
+    for (int r = 0; r < 16; ++r) store_block((float*)median_entry.data + corner, stride, r, __builtin_bit_cast(v16, median[r]));

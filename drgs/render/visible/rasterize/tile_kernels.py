@@ -1,4 +1,4 @@
-"""Tile loops, one compiled variant per channel count: hand-vectorised rows on the CPU, a thread a pixel on CUDA.
+"""Tile loops, one compiled variant per channel count: hand-vectorised blocks of 4x4 pixels on the CPU, a thread a pixel on CUDA.
 
 The CPU body is C++ with Clang's vector types, kept in the .h files beside this one and compiled by Warp itself, so a user needs no
 toolchain. Both follow drgs/reference/rasterize_gbuffer.py, which is their specification.
@@ -16,6 +16,7 @@ from drgs.render.visible.rasterize.project import DEPTH_CUTOFF, PARAMETERS
 
 FAR = 100.0
 """Squared distance from a surfel, in standard deviations, that counts for all farther ones. No pixel is live beyond 12: its opacity there is below MIN_ALPHA."""
+TILE_BLOCKS = Path(__file__).with_name("tile_blocks.h")
 CHANNEL_STEPS = (4, 8, 12, 13, 16, 20, 24, 32, 48)
 """Compiled widths; features are padded with zeros to the next one. Stage 1 of a build blends 13."""
 
@@ -35,7 +36,7 @@ def padded_channels(channels: int) -> int:
 def _source(name: str, channels: int, depth: int) -> str:
     limits = {"FAR": FAR, "MAX_ALPHA": MAX_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE, "DEPTH_CUTOFF": DEPTH_CUTOFF}
     sizes = {"CHANNELS": channels, "DEPTH": depth, "PARAMETERS": PARAMETERS}
-    return native_source(Path(__file__).with_name(name), constants={**sizes, **limits})
+    return native_source(Path(__file__).with_name(name), TILE_BLOCKS, constants={**sizes, **limits})
 
 
 @wp.struct
@@ -90,8 +91,8 @@ def tile_backward_kernel(channels: int, depth: int) -> Any:
     def tile_backward(
         tile: int,
         table: TileTable,
+        planes: wp.array2d[float],
         gradients: wp.array2d[float],
-        total: wp.array[float],
         median_entry: wp.array[wp.int32],
         pair_gradients: wp.array2d[float],
     ): ...
@@ -100,13 +101,13 @@ def tile_backward_kernel(channels: int, depth: int) -> Any:
     def blend_tiles_backward(
         first: int,
         table: TileTable,
+        planes: wp.array2d[float],
         gradients: wp.array2d[float],
-        total: wp.array[float],
         median_entry: wp.array[wp.int32],
         # outputs
         pair_gradients: wp.array2d[float],
     ):
-        tile_backward(first + wp.tid(), table, gradients, total, median_entry, pair_gradients)
+        tile_backward(first + wp.tid(), table, planes, gradients, median_entry, pair_gradients)
 
     return blend_tiles_backward
 
@@ -230,8 +231,8 @@ def pixel_backward_kernel(channels: int, depth: int) -> Any:
     def blend_pixels_backward(
         first: int,
         table: TileTable,
+        planes: wp.array2d[float],
         gradients: wp.array2d[float],
-        total: wp.array[float],
         median_entry: wp.array[wp.int32],
         # outputs
         surfel_gradients: wp.array2d[float],
@@ -244,7 +245,10 @@ def pixel_backward_kernel(channels: int, depth: int) -> Any:
         g = feature_vector()
         for k in range(channels):
             g[k] = gradients[k, pixel]
-        behind = total[pixel]
+        # S of all that is blended with weight w, which the median is not.
+        behind = float(0.0)
+        for k in range(channels + 1 + min(depth, 1)):
+            behind = behind + gradients[k, pixel] * planes[k, pixel]
         transmittance = float(1.0)
         for entry in range(table.starts[tile], table.starts[tile + 1]):
             surfel = table.list_surfel[entry]
