@@ -20,7 +20,7 @@ from drgs.render.integrate.path_arrays import PathArrays, path_arrays
 from drgs.render.integrate.ray_scene import RayScene
 from drgs.render.integrate.sample_rays import PointArrays, SampleSet, StartArrays, point_at
 from drgs.render.integrate.sum_samples import LightSums, RaySamples, ray_samples, sum_point
-from drgs.render.integrate.surface_light import light_of_hit
+from drgs.render.integrate.surface_light import SurfaceLightArrays, light_of_hit
 from drgs.render.intersect.ray_memory import TracedArrays, traced_arrays
 from drgs.render.intersect.tracer_embree import EMBREE_RAY, EmbreeHandles
 from drgs.render.native_source import native_source
@@ -74,11 +74,26 @@ def scatter_sixteen_hits(
 ): ...  # fmt: skip
 
 
+@wp.func_native("""
+// Faces and their corners lie anywhere in memory: what a later path needs is asked for now.
+const float* const lights = (const float*)known.vertex.data;
+if (path + 16 < count) {
+    const long face = paths.face.data[path + 16];
+    __builtin_prefetch((const float*)known.face_normal.data + 3 * face);
+    __builtin_prefetch(faces.data + 3 * face);
+}
+if (path + 8 < count)
+    for (int c = 0; c < 3; ++c) __builtin_prefetch(lights + 4 * (long)faces.data[3 * (long)paths.face.data[path + 8] + c]);
+""")
+def ask_for_known(path: int, count: int, known: SurfaceLightArrays, faces: wp.array[int], paths: PathArrays): ...
+
+
 @wp.func
 def leave_known_paths(scene: RayScene, paths: PathArrays, count: int, rays: RaySamples) -> int:
     """Paths at whose surfaces light is known end there; the others move up. How many are left."""
     left = wp.int32(0)
     for path in range(count):
+        ask_for_known(path, count, scene.known, scene.mesh.faces, paths)
         light = light_of_hit(scene.known, scene.mesh.faces, paths.face[path], paths.barycentric[path], paths.arriving[path])
         if light[3] > 0.0:
             rays.indirect[int(paths.ray[path])] = wp.vec3(light[0], light[1], light[2])

@@ -19,6 +19,18 @@ const float* const albedos = (const float*)mesh.albedo.data;
 alignas(64) float corner[3][11][16], uv_lane[2][16], arriving[3][16], carried[3][16];
 alignas(64) unsigned pixel_lane[16], index_lane[16], strategy_lane[16];
 int triangles[16], pool_lane[16];
+// Corners of the next group's triangles lie anywhere in memory: they are asked for now, and the triangles of the one after it.
+for (int path = base + 16; path < min_int(base + 32, paths); ++path) {
+    const int* const corners = mesh.faces.data + 3 * (long)from.face.data[path];
+    for (int c = 0; c < 3; ++c) {
+        __builtin_prefetch(positions + 3 * (long)corners[c]);
+        __builtin_prefetch(normals + 3 * (long)corners[c]);
+        __builtin_prefetch(albedos + 3 * (long)corners[c]);
+        __builtin_prefetch(mesh.roughness.data + corners[c]);
+        __builtin_prefetch(mesh.metallic.data + corners[c]);
+    }
+}
+for (int path = base + 32; path < min_int(base + 48, paths); ++path) __builtin_prefetch(mesh.faces.data + 3 * (long)from.face.data[path]);
 for (int lane = 0; lane < 16; ++lane) {
     const int path = base + min_int(lane, lanes - 1), triangle = from.face.data[path];
     triangles[lane] = triangle;
@@ -154,9 +166,14 @@ if (chooses) {
     store16(u_lane, u0);
     store16(share_lane, share);
     const Places places = places_of(lobes, outward, albedo, metallic);
+    const float* blocks[16];
+    for (int lane = 0; lane < lanes; ++lane) {  // all are asked for before the first is needed
+        blocks[lane] = pool_block(scene.pools, pool_lane[lane], 1, block_lane[lane]);
+        for (int k = 0; k < 8 && outside_lane[lane] != 0; ++k) __builtin_prefetch(blocks[lane] + 16 * k);
+    }
     for (int lane = 0; lane < lanes; ++lane) {
         if (outside_lane[lane] == 0) continue;
-        const float* const block = pool_block(scene.pools, pool_lane[lane], 1, block_lane[lane]);
+        const float* const block = blocks[lane];
         const float shares[3] = {1.0f - share_lane[lane], share_lane[lane], candidates};
         const int chosen = choose_candidate(block, places, lane, shares, 0.0f, u_lane[lane], choice[7][lane]);
         for (int k = 0; k < 7 && chosen >= 0; ++k) choice[k][lane] = block[16 * k + chosen];

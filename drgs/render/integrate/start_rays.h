@@ -74,9 +74,14 @@ if (chooses && any(is_environment)) {
     store16(share_lane[1], split_there[1]);
     store16(share_lane[2], environment_share);
     const Places places = places_of(lobes, triangle, albedo_at, metal);
+    const float* blocks[16];
+    for (int lane = 0; lane < lanes; ++lane) {  // all are asked for before the first is needed
+        blocks[lane] = pool_block(scene.pools, pool_lane[lane], 0, block_lane[lane]);
+        for (int k = 0; k < 8 && choosing_lane[lane] != 0; ++k) __builtin_prefetch(blocks[lane] + 16 * k);
+    }
     for (int lane = 0; lane < lanes; ++lane) {
         if (choosing_lane[lane] == 0) continue;
-        const float* const block = pool_block(scene.pools, pool_lane[lane], 0, block_lane[lane]);
+        const float* const block = blocks[lane];
         const float shares[3] = {share_lane[0][lane], share_lane[1][lane], share_lane[2][lane]};
         // With the floor even where no bounces follow: the same rays with and without them say what they add.
         const int chosen = choose_candidate(block, places, lane, shares, 1.0f, u_lane[lane], choice[7][lane]);
