@@ -64,7 +64,7 @@ def filter_level(
             both = smooth + neighbour_variance * shifted(smooth, *at)
             for k, part in enumerate(parts):
                 other = shifted(part, *at)
-                difference = (luminance(other) - luminance(part)).abs() / (sigma_luminance * both[..., k].sqrt() + 1e-6)
+                difference = (luminance(other) - luminance(part)).abs() / (sigma_luminance**2 * both[..., k] + 1e-12).sqrt()
                 w = shared * torch.exp(-off - difference)
                 sums[k] += w[..., None] * other
                 sum_variance[..., k] += w * w * shifted(variance, *at)[..., k]

@@ -23,4 +23,6 @@ def luminance_of(linear: wp.vec3) -> float:
 def srgb_of(linear: float) -> float:
     """maths.color.srgb_from_linear, clipped to 0..1."""
     c = wp.clamp(linear, 0.0, 1.0)
-    return wp.where(c <= SRGB_LINEAR_END, SRGB_SLOPE * c, SRGB_SCALE * wp.pow(wp.max(c, SRGB_LINEAR_END), 1.0 / SRGB_GAMMA) - SRGB_OFFSET)
+    if c <= SRGB_LINEAR_END:
+        return SRGB_SLOPE * c
+    return SRGB_SCALE * wp.pow(c, 1.0 / SRGB_GAMMA) - SRGB_OFFSET

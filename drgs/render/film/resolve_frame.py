@@ -78,7 +78,8 @@ def _rgba(state: FrameState, linear: Tensor, coverage: Tensor) -> Tensor:
         behind.seen = tonemap(linear, nothing, settings.exposure, behind.radiance, settings.tone_curve)
     rgba, radiance = behind.seen.clone(), behind.radiance
     inside = radiance if radiance.ndim == 1 else window.crop(radiance)
-    rgba[window.rows, window.columns] = tonemap(window.crop(linear), coverage, settings.exposure, inside, settings.tone_curve)
+    shown = rgba[window.rows, window.columns]
+    tonemap(window.crop(linear), coverage, settings.exposure, inside, settings.tone_curve, shown)
     return rgba
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from drgs.maths.constants import F0
 from drgs.render.color_warp import srgb_of
 from drgs.scene.tone_curve import ToneCurve
-from drgs.warp_torch import launch, warp_array, warp_device, warp_view
+from drgs.warp_torch import launch, warp_device, warp_view
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,6 +48,7 @@ def tonemap(
     exposure: float = 0.0,
     background_linear: Tensor | None = None,
     curve: ToneCurve = "standard",
+    behind_srgb: Tensor | None = None,
 ) -> Tensor:
     """(height, width, 4) sRGB in [0, 1] with straight alpha.
 
@@ -57,10 +58,11 @@ def tonemap(
         exposure: [stops]; scales radiance of object and background alike.
         background_linear: (height, width, 3) radiance behind the object, or the (3,) colour of a screen, which neither exposure nor curve
             change; None leaves it transparent.
+        behind_srgb: (height, width, 4) the background as it is shown, which pictures of one look share: pixels that nothing covers stay it. It is written to.
     """
     plain = background_linear is not None and background_linear.ndim == 1
     height, width = coverage.shape
-    rgba = radiance_linear.new_empty(height, width, 4)
+    rgba = radiance_linear.new_empty(height, width, 4) if behind_srgb is None else behind_srgb
     behind = radiance_linear.new_empty(0, 0, 3)
     if background_linear is not None:
         behind = background_linear.to(radiance_linear).expand(height, width, 3)
@@ -69,11 +71,12 @@ def tonemap(
         2.0**exposure,
         CURVES.index(curve),
         plain,
+        behind_srgb is not None,
         warp_view(radiance_linear, wp.vec3),
         warp_view(coverage),
         warp_view(behind, wp.vec3),
     ]
-    launch(show, height * width, inputs, [warp_array(rgba, wp.vec4)], warp_device(rgba))
+    launch(show, height * width, inputs, [warp_view(rgba, wp.vec4)], warp_device(rgba))
     return rgba
 
 
@@ -155,6 +158,7 @@ def show(
     scale: float,
     curve: int,
     plain: bool,
+    behind_is_there: bool,
     radiance: wp.array2d[wp.vec3],
     coverage: wp.array2d[float],
     background: wp.array2d[wp.vec3],
@@ -165,6 +169,8 @@ def show(
     y = i / width
     x = i - y * width
     alpha = wp.clamp(coverage[y, x], 0.0, 1.0)
+    if behind_is_there and alpha <= 0.0:
+        return
     color = wp.vec3(0.0, 0.0, 0.0)
     if alpha > 0.0:
         color = radiance[y, x]

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import torch
+from torch import Tensor
 
 from drgs.maths.constants import F0
 from drgs.render.integrate.environment_pool import CANDIDATES
@@ -108,9 +109,14 @@ _known_extremes: WeakKeyDictionary[TriangleMesh | Materials, tuple[float, float,
 def _extremes(m: TriangleMesh | Materials) -> tuple[float, float, float]:
     """Largest diffuse part, largest metallic, smallest roughness."""
     if m not in _known_extremes:
-        diffuse = float(((1 - m.metallic) * m.albedo.amax(-1)).max())
+        diffuse = float(((1 - m.metallic) * _largest_channel(m.albedo)).max())
         _known_extremes[m] = diffuse, float(m.metallic.max()), float(m.roughness.min())
     return _known_extremes[m]
+
+
+def _largest_channel(albedo: Tensor) -> Tensor:
+    red, green, blue = albedo.unbind(-1)  # torch takes twenty times as long for rows of three
+    return torch.maximum(torch.maximum(red, green), blue)
 
 
 _diffuse_shares: WeakKeyDictionary[TriangleMesh, float] = WeakKeyDictionary()
@@ -118,7 +124,7 @@ _diffuse_shares: WeakKeyDictionary[TriangleMesh, float] = WeakKeyDictionary()
 
 def _diffuse_share(mesh: TriangleMesh) -> float:
     if mesh not in _diffuse_shares:
-        base = mesh.albedo.amax(-1)
+        base = _largest_channel(mesh.albedo)
         diffuse, specular = (1 - mesh.metallic) * base, F0 * (1 - mesh.metallic) + mesh.metallic * base
         _diffuse_shares[mesh] = float((diffuse >= LEAST_DIFFUSE * (diffuse + specular)).float().mean())
     return _diffuse_shares[mesh]

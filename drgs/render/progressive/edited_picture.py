@@ -83,13 +83,19 @@ def write_surface(
 
 
 @wp.func
-def neighbour_alike(points: PointArrays, depth: wp.array[float], there: Neighbourhood, p: int, side: int) -> int:
-    """The point on this side of a point, if its light will do for both; else -1."""
+def point_beside(points: PointArrays, there: Neighbourhood, p: int, side: int) -> int:
+    """The point above, below, left or right of a point; -1 where there is none."""
     y = row_of(there, points.pixel[p]) + wp.where(side == 0, -1, wp.where(side == 1, 1, 0))
     x = column_of(there, points.pixel[p]) + wp.where(side == 2, -1, wp.where(side == 3, 1, 0))
     if y < 0 or x < 0 or y >= there.place.shape[0] or x >= there.place.shape[1]:
         return -1
-    q = there.place[y, x] - 1
+    return there.place[y, x] - 1
+
+
+@wp.func
+def neighbour_alike(points: PointArrays, depth: wp.array[float], there: Neighbourhood, p: int, side: int) -> int:
+    """The point on this side of a point, if its light will do for both; else -1."""
+    q = point_beside(points, there, p, side)
     if q < 0 or wp.dot(points.normal[p], points.normal[q]) < LEAST_COSINE:
         return -1
     off_plane = wp.abs(wp.dot(points.normal[p], points.position[q] - points.position[p]))
@@ -106,28 +112,32 @@ def write_materials(
     width: int,
     # outputs
     maps: GBufferArrays,
-    chosen: wp.array[wp.bool],
+    alike: wp.array[wp.uint8],
 ):
-    """And choose the points that need rays."""
+    """And choose the points that need rays.
+
+    Args:
+        alike: of each point the sides on which neighbours lend it their light, a bit each; 0: it needs rays.
+    """
     p = first + wp.tid()
     i = row_of(there, points.pixel[p]) * width + column_of(there, points.pixel[p])
     maps.albedo[i] = points.albedo[p]
     maps.roughness[i] = points.roughness[p]
     maps.metallic[i] = points.metallic[p]
-    chosen[p] = True
+    sides = int(0)
     if (points.pixel[p] // there.image_width + points.pixel[p] % there.image_width) % 2 == 1:
         for side in range(4):
             if neighbour_alike(points, depth, there, p, side) >= 0:
-                chosen[p] = False
+                sides = sides | (1 << side)
+    alike[p] = wp.uint8(sides)
 
 
 @wp.kernel
 def put_light(
     first: int,
     points: PointArrays,
-    depth: wp.array[float],
     there: Neighbourhood,
-    chosen: wp.array[wp.bool],
+    alike: wp.array[wp.uint8],
     found: LightSums,
     # outputs
     light: LightMaps,
@@ -141,10 +151,11 @@ def put_light(
     open_share = wp.float32(0.0)
     count = wp.float32(0.0)
     for side in range(4):
-        q = p
-        if not chosen[p]:
-            q = neighbour_alike(points, depth, there, p, side)
-        if q >= 0 and (side == 0 or q != p):
+        own = alike[p] == wp.uint8(0) and side == 0
+        if own or (int(alike[p]) & (1 << side)) != 0:
+            q = p
+            if not own:
+                q = point_beside(points, there, p, side)
             d = diffuse_reflectance(points.albedo[q], points.metallic[q])
             s = specular_reflectance(points.albedo[q], points.metallic[q])
             diffuse += wp.cw_div(found.diffuse[q], d)
@@ -193,8 +204,8 @@ class EditedPoints:
         albedo, of_material = torch.zeros(*window.shape, 3, device=device), torch.zeros(2, *window.shape, device=device)
         self._surface = replace(view.surface, albedo=albedo, roughness=of_material[0], metallic=of_material[1])
         self._there.place = warp_array(view.place)
-        self._chosen = torch.empty(self._count, dtype=torch.bool, device=device)
-        outputs = [gbuffer_arrays(self._surface), warp_array(self._chosen)]
+        self._alike = torch.empty(self._count, dtype=torch.uint8, device=device)
+        outputs = [gbuffer_arrays(self._surface), warp_array(self._alike)]
         launch(write_materials, self._count, [*self._points, window.shape[1]], outputs, warp)
 
     def _see(self, window: Window, device: torch.device) -> _View:
@@ -211,7 +222,7 @@ class EditedPoints:
     @property
     def order(self) -> Tensor:
         """(chosen,) int32, the points that need rays."""
-        return torch.nonzero(self._chosen).squeeze(-1).int()
+        return torch.nonzero(self._alike == 0).squeeze(-1).int()
 
     def picture(self, found: ShadedPoints, samples: int) -> QuickPicture:
         """Of the light that their rays found.
@@ -223,6 +234,7 @@ class EditedPoints:
         diffuse, specular, variance = (torch.zeros(*shape, channels, device=device) for channels in (3, 3, 2))
         visibility, worth = torch.zeros(shape, device=device), torch.full((*shape, 2), float(samples), device=device)
         history = History(self._camera, self._surface, DemodulatedLight(diffuse, specular, variance), worth)
-        inputs = [*self._points, warp_array(self._chosen), light_sums(found)]
+        points, _, there = self._points
+        inputs = [points, there, warp_array(self._alike), light_sums(found)]
         launch(put_light, self._count, inputs, [light_maps(history), warp_array(visibility)], warp_device(visibility))
         return QuickPicture(history, visibility, None, of_edit=True)

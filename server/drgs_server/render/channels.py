@@ -74,7 +74,7 @@ def _over_nothing(color: "Tensor", coverage: "Tensor") -> "Tensor":
 def eight_bit(rgba: "Tensor") -> Pixels:
     import torch
 
-    return (rgba.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+    return rgba.clamp(0, 1).mul_(255).add_(0.5).to(torch.uint8).cpu().numpy()
 
 
 def _indirect(frame: "Frame", settings: Settings) -> "Tensor":

@@ -14,10 +14,9 @@ for (int dy = -2; dy <= 2; ++dy) {
     for (int dx = -2; dx <= 2; ++dx) {
         const long q = at + (long)dy * step * pitch + dx * step;
         const float w = (float)((3 - (dx < 0 ? -dx : dx)) * (3 - (dy < 0 ? -dy : dy)));
-        const v16 there = select(load16(cover + q) > 0.0f, v16(w), v16(0.0f));
-        total[0] += there * load16(variance.data + q);
-        total[1] += there * load16(variance.data + plane + q);
-        weights += there;
+        total[0] += w * load16(variance.data + q);  // 0 where nothing is covered
+        total[1] += w * load16(variance.data + plane + q);
+        weights += select(load16(cover + q) > 0.0f, v16(w), v16(0.0f));
     }
 }
 const v16 inverse = 1.0f / max16(weights, v16(1e-12f));

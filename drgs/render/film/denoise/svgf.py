@@ -150,6 +150,7 @@ def filter_level(
     here = guides.position[p]
     y_d = luminance_of(source.diffuse[p])
     y_s = luminance_of(source.specular[p])
+    variance_scale = level.sigma_luminance * level.sigma_luminance
     plane_scale = 1.0 / wp.max(level.sigma_plane * level.footprint * guides.depth[p] * float(level.step), 1.0e-12)
     sum_d = wp.vec3(0.0, 0.0, 0.0)
     sum_s = wp.vec3(0.0, 0.0, 0.0)
@@ -170,8 +171,8 @@ def filter_level(
                         off_plane = wp.abs(wp.dot(n, guides.position[q] - here)) * plane_scale
                         shared = row * column * wp.pow(alike, NORMAL_POWER) * guides.coverage[q]
                         both = local + level.neighbour_variance * smooth[q]
-                        difference_d = wp.abs(luminance_of(source.diffuse[q]) - y_d) / (level.sigma_luminance * wp.sqrt(both[0]) + 1.0e-6)
-                        difference_s = wp.abs(luminance_of(source.specular[q]) - y_s) / (level.sigma_luminance * wp.sqrt(both[1]) + 1.0e-6)
+                        difference_d = wp.abs(luminance_of(source.diffuse[q]) - y_d) / wp.sqrt(variance_scale * both[0] + 1.0e-12)
+                        difference_s = wp.abs(luminance_of(source.specular[q]) - y_s) / wp.sqrt(variance_scale * both[1] + 1.0e-12)
                         w_d = shared * wp.exp(-off_plane - difference_d)
                         w_s = shared * wp.exp(-off_plane - difference_s)
                         sum_d += w_d * source.diffuse[q]
