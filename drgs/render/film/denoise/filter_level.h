@@ -8,8 +8,8 @@ const float* const guide = guides.data;
 const float* const from = source.data;
 const float* const soft = smooth.data;
 const i16 covered = load16(guide + at) > 0.0f;
+const v16 x = load16(guide + 2 * plane + at), y = load16(guide + 3 * plane + at), z = load16(guide + 4 * plane + at);
 const v16 nx = load16(guide + 5 * plane + at), ny = load16(guide + 6 * plane + at), nz = load16(guide + 7 * plane + at);
-const v16 here = nx * load16(guide + 2 * plane + at) + ny * load16(guide + 3 * plane + at) + nz * load16(guide + 4 * plane + at);
 const auto luminance = [&](const float* p) { return LUMINANCE_RED * load16(p) + LUMINANCE_GREEN * load16(p + plane) + LUMINANCE_BLUE * load16(p + 2 * plane); };
 const v16 y_d = luminance(from + at), y_s = luminance(from + 3 * plane + at);
 // The square of sigma_luminance standard deviations, and 1e-12.
@@ -38,7 +38,8 @@ for (int dy = -2; dy <= 2; ++dy) {
         // Weights below 1e-12 are none: numbers too small for a float's exponent take the processor many times as long.
         alike = select(alike > 0.65f, alike, v16(0.0f));
         for (int k = 1; k < NORMAL_POWER; k *= 2) alike *= alike;
-        const v16 off = nx * load16(g + 2 * plane) + ny * load16(g + 3 * plane) + nz * load16(g + 4 * plane) - here;
+        // Differences first: far from the origin products with a normal have lost the footprint's digits.
+        const v16 off = nx * (load16(g + 2 * plane) - x) + ny * (load16(g + 3 * plane) - y) + nz * (load16(g + 4 * plane) - z);
         const v16 off_plane = abs16(off) * plane_scale;
         const v16 shared = (hat[dx < 0 ? -dx : dx] * hat[dy < 0 ? -dy : dy]) * alike * there;
         const v16 both_d = scaled_d + neighbour_scale * load16(v), both_s = scaled_s + neighbour_scale * load16(v + plane);

@@ -48,10 +48,11 @@ def test_kernel_filters_as_the_reference_does(moving: bool, device: str) -> None
     torch.testing.assert_close(ours.specular.cpu()[covered].double(), (parts[1] * factors[1])[covered], atol=1e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize("size", [40, 7])
-def test_sixteen_pixels_at_once_are_the_pixels_one_by_one(size: int) -> None:
+@pytest.mark.parametrize(("size", "far"), [(40, 0.0), (7, 0.0), (40, 1000.0)])
+def test_sixteen_pixels_at_once_are_the_pixels_one_by_one(size: int, far: float) -> None:
     camera = front_camera(size)
     gbuffer = trace_primary(sphere_mesh(3), camera)
+    gbuffer = dataclasses.replace(gbuffer, position_world=gbuffer.position_world + far)
     light = DemodulatedLight(torch.rand(size, size, 3), torch.rand(size, size, 3), 0.1 * torch.rand(size, size, 2))
     covered = gbuffer.coverage > 0
     footprint = 1 / float(camera.intrinsics[0, 0])
