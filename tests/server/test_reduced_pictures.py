@@ -4,7 +4,7 @@ import pytest
 
 from drgs_server.live.frame_header import unpack_frame
 from drgs_server.live.messages import CameraMessage, ErrorMessage, Settings, StatusMessage
-from drgs_server.live.pace import TARGET_SECONDS
+from drgs_server.live.pace import REDUCED_SECONDS
 from drgs_server.live.viewer import ANSWER_SECONDS, MOVING_SECONDS, Posed, Viewer
 from drgs_server.render.interface import AbstractPicture
 from tests.server.painter import PaintedPose, Painter, Painting
@@ -38,9 +38,9 @@ def test_only_after_a_reduced_picture_the_next_one_waits(seconds: float, waits: 
         viewer.work()
         viewer.acknowledge(10_000)
     moved(viewer, 6)
-    assert viewer.due_at() == (pytest.approx(began + TARGET_SECONDS) if waits else 0.0)
+    assert viewer.due_at() == (pytest.approx(began + REDUCED_SECONDS) if waits else 0.0)
     notes = [note for message in said if isinstance(message, StatusMessage) for note in message.notes]
-    assert any(f"at most {1 / TARGET_SECONDS:.0f} a second" in note for note in notes) == waits
+    assert any(f"at most {1 / REDUCED_SECONDS:.0f} a second" in note for note in notes) == waits
 
 
 def test_one_input_is_refined_at_once_and_those_in_a_row_when_the_next_one_does_not_come() -> None:

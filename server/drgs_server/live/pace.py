@@ -8,7 +8,9 @@ smaller ones: others may have come to use the machine.
 """
 
 TARGET_SECONDS = 1 / 13
-"""Wanted for one moving picture, so that twelve a second come though some are late; reduced ones come no faster."""
+"""Wanted for one moving picture, so that twelve a second come though some are late."""
+REDUCED_SECONDS = 1 / 15
+"""From one reduced picture to the next at least: what is left is for those who made the reduction necessary."""
 STEPS = (1.0, 0.75, 0.6, 0.5)
 SMALLEST_SIDE = 240
 """Pixels; a picture that was asked for smaller than this is never reduced."""

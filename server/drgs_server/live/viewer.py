@@ -21,7 +21,7 @@ from drgs_server.live.frame_header import (
     pack_frame,
 )
 from drgs_server.live.messages import MAX_FRAMES_IN_FLIGHT, CameraMessage, ErrorMessage, Phase, Settings, StatusMessage
-from drgs_server.live.pace import TARGET_SECONDS, Pace
+from drgs_server.live.pace import REDUCED_SECONDS, Pace
 from drgs_server.render.encode import encode_jpeg, encode_png, has_alpha
 from drgs_server.render.interface import AbstractPicture, AbstractPose
 
@@ -199,7 +199,7 @@ class Viewer:
             return 0.0
         if progress.inputs.generation != inputs.generation:
             # Other work, for which a picture was reduced, gets the rest of the time.
-            return 0.0 if progress.scale == 1 else progress.begun_at + TARGET_SECONDS
+            return 0.0 if progress.scale == 1 else progress.begun_at + REDUCED_SECONDS
         if progress.scale < 1:
             return self._input_at + MOVING_SECONDS
         return None if progress.converged_sent else progress.rests_until
@@ -303,7 +303,7 @@ class Viewer:
         notes = list(picture.notes)
         if progress.scale < 1:
             notes.append(
-                f"moving: {progress.scale:.0%} of the width, because this machine needs longer for all of it; at most {1 / TARGET_SECONDS:.0f} a second"
+                f"moving: {progress.scale:.0%} of the width, because this machine needs longer for all of it; at most {1 / REDUCED_SECONDS:.0f} a second"
             )
         self._deliver(
             StatusMessage(
