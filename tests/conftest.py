@@ -27,7 +27,7 @@ def load_blas_of_one_thread() -> None:
 if "PYTEST_XDIST_WORKER" in os.environ and "OPENBLAS_NUM_THREADS" not in os.environ:
     load_blas_of_one_thread()
 
-from tests.shape_checks import check_imports_of  # noqa: E402
+from tests.shape_checks import check_imports_of, count_calls_anew  # noqa: E402
 
 # Until all is imported and collected: what comes then stays, and looking through it for garbage takes a quarter of the time that it takes.
 gc.disable()
@@ -124,6 +124,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return f"browser, lot {browser_lot(nodeid)}" if is_in_browser(nodeid) else nodeid.split("::")[0]
 
     return Shares(config, log)
+
+
+@pytest.fixture(autouse=True)
+def _counted_calls() -> None:
+    count_calls_anew()
 
 
 @pytest.fixture(autouse=True)

@@ -7,6 +7,8 @@ jaxtyping's own decorator makes both checks of a function when it is defined, th
 function is given before it and behind it: a fifth of a build's time. Here checks are made at the first call, once for all functions of one
 source, and whatever comes and goes is looked at once. Arrays of the right type and shape, which nearly all are, are known for that by a shorter
 way than jaxtyping's, which takes ten times as long; whatever else comes is left to jaxtyping's.
+
+Of a function that one test calls often, in the steps of a fit, the first calls are checked and then every sixteenth (FIRST_CALLS, CALLS_A_CHECK).
 """
 
 import ast
@@ -21,6 +23,11 @@ from jaxtyping import TypeCheckError, _array_types, _import_hook, install_import
 from jaxtyping._decorator import _destring_annotation, _make_fn_with_signature
 from jaxtyping._storage import _shape_storage, pop_shape_memo, push_shape_memo
 
+FIRST_CALLS = 48
+"""Of each function in each test, all checked."""
+CALLS_A_CHECK = 16
+"""Of the calls behind those, one of so many is checked: a step of a fit is as the one before it, and checks took a twelfth of the time of such tests."""
+
 _refuse_wrong_types = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeCheckError))
 
 
@@ -34,6 +41,21 @@ class Checks:
     """Is given what the function returned; None where that is not annotated."""
     signature: inspect.Signature | None
     """Where shapes name arguments ("{count} 3"), whose values are needed then."""
+
+
+@dataclasses.dataclass
+class _Counting:
+    """Of calls, anew in each test."""
+
+    test: int = 0
+
+
+_counting = _Counting()
+
+
+def count_calls_anew() -> None:
+    """For a test that begins: what the ones before it called does not count."""
+    _counting.test += 1
 
 
 _checks: dict[tuple, Checks] = {}
@@ -55,11 +77,17 @@ def checked(thing: Any) -> Any:
 
 def _checked_function(function: Callable) -> Callable:
     checks: Checks | None = None
+    calls = counted_test = 0
 
     @functools.wraps(function)
     def checking(*arguments: Any, **named: Any) -> Any:
         __tracebackhide__ = True
-        nonlocal checks
+        nonlocal checks, calls, counted_test
+        if counted_test != _counting.test:
+            calls, counted_test = 0, _counting.test
+        calls += 1
+        if calls > FIRST_CALLS and calls % CALLS_A_CHECK:
+            return function(*arguments, **named)
         if checks is None:
             checks = _checks_of(function)
         push_shape_memo(_bound(checks.signature, arguments, named) if checks.signature else {})

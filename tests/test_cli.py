@@ -1,13 +1,11 @@
 """The command line keeps its manners: fast help, one sentence for wrong input, clean stdout."""
 
 import json
-import os
 import re
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -47,10 +45,10 @@ for arguments in json.loads(sys.argv[1]):
 """
 
 
-def drgs_one_by_one(commands: Sequence[Sequence[str | Path]], **options: Any) -> list[subprocess.CompletedProcess[str]]:
+def drgs_one_by_one(commands: Sequence[Sequence[str | Path]]) -> list[subprocess.CompletedProcess[str]]:
     """What each command says and ends with, of several in one process: to load what they need takes it two seconds of a core."""
     given = json.dumps([[*map(str, arguments)] for arguments in commands])
-    done = subprocess.run([sys.executable, "-c", ONE_BY_ONE, given], capture_output=True, text=True, timeout=PATIENCE_SECONDS, **options)
+    done = subprocess.run([sys.executable, "-c", ONE_BY_ONE, given], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert done.returncode == 0, done.stderr
     said, complained = (re.split(r"\nended with (.*)\n", text) for text in (done.stdout, done.stderr))
     assert said[1::2] == complained[1::2] and len(said) == 2 * len(commands) + 1 and said[-1] == complained[-1] == ""
@@ -119,6 +117,7 @@ def test_wrong_input_is_one_sentence_of_each_command_that_loads_much(tmp_path: P
         ["doctor", tmp_path / "nothing_here"],
         ["build", tmp_path, tmp_path / "out"],
         ["simulate", tmp_path, tmp_path, "--scene", scene],
+        ["export", tmp_path / "asset", tmp_path / "x.glb"],
     ]
     results = drgs_one_by_one(commands)
     for result in results:
@@ -223,15 +222,19 @@ def test_export_takes_the_format_from_the_ending(ball: Path, name: str, start: b
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
-def test_files_that_cannot_be_written_whole_are_one_sentence_and_leave_nothing(ball: Path, tmp_path: Path):
+def test_files_that_cannot_be_written_whole_are_one_sentence_and_leave_nothing(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     import resource
 
     pytest.importorskip("pxr", reason="the optional package usd-core is not installed")
-    files = [tmp_path / name for name in ("a.glb", "a.usda", "a.usdc", "a.usdz")]
     # Compiled modules are files, too: cut short they would be kept, and nothing could import them any more.
-    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
-    commands = [["export", ball, file] for file in files]
-    for result in drgs_one_by_one(commands, env=environment, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))):
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for name in ("a.glb", "a.usda", "a.usdc", "a.usdz"):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+        try:
+            result = drgs_here("export", ball, tmp_path / name)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert_one_sentence(result)
         assert "File too large" in result.stderr
     assert list(tmp_path.iterdir()) == []

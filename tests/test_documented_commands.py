@@ -21,7 +21,7 @@ from drgs.reconstruct.presets import PRESETS
 from drgs.scene.asset import load_asset
 from drgs.scene.load_environment import load_environment
 from drgs_server.client import Client
-from tests.reconstruct.pose.textured_scene import orbit, write_photographs
+from tests.reconstruct.pose.textured_scene import PLAIN_SIZE, orbit, write_photographs
 from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS
 from tests.reconstruct.tiny_capture import sphere_views, write_nerf_synthetic
 from tests.web.browser import RunningServer
@@ -79,7 +79,7 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (sample / "transforms_test.json").write_text((sample / "transforms_train.json").read_text().replace("./train/", "./test/"))
     (tmp_path / "examples" / "environments").symlink_to(ROOT / "examples" / "environments", target_is_directory=True)
     if find_spec("pycolmap"):
-        write_photographs(tmp_path / "pictures", orbit(AROUND)[:PLAIN_VIEWS])
+        write_photographs(tmp_path / "pictures", orbit(AROUND)[:PLAIN_VIEWS], size=PLAIN_SIZE)
     else:
         (tmp_path / "photos").symlink_to(sample, target_is_directory=True)
     monkeypatch.chdir(tmp_path)

@@ -13,13 +13,26 @@ from drgs.reconstruct.fit.densify import ScreenGradientStats
 from drgs.reconstruct.fit.losses import mask_loss
 from drgs.reconstruct.geometry.bind_gaussians import query_closest_faces
 from drgs.scene.edits import TwistMap
-from tests.shape_checks import is_array_of, is_array_of_jaxtyping
+from tests.shape_checks import CALLS_A_CHECK, FIRST_CALLS, count_calls_anew, is_array_of, is_array_of_jaxtyping
 
 
 def test_arguments_of_other_shapes_are_refused():
     mask_loss(torch.full((4, 5), 0.5), torch.ones(4, 5))
     with pytest.raises(TypeCheckError, match="mask_loss"):
         mask_loss(torch.full((4, 5), 0.5), torch.ones(5, 4))
+
+
+def test_of_many_calls_the_first_and_then_one_of_sixteen_are_checked():
+    refused = []
+    for call in range(1, FIRST_CALLS + 10 * CALLS_A_CHECK + 1):
+        try:
+            ScreenGradientStats(torch.zeros(3), torch.zeros(4))
+        except TypeCheckError:
+            refused.append(call)
+    assert refused[:FIRST_CALLS] == list(range(1, FIRST_CALLS + 1)) and len(refused) == FIRST_CALLS + 10
+    count_calls_anew()
+    with pytest.raises(TypeCheckError, match="ScreenGradientStats"):
+        ScreenGradientStats(torch.zeros(3), torch.zeros(4))
 
 
 def test_records_whose_fields_disagree_are_refused():

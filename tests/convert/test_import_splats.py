@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from drgs.convert import bake_transfer
 from drgs.convert.export_asset import export_asset
 from drgs.convert.import_mesh import import_mesh
 from drgs.convert.import_splats import import_splats
@@ -16,6 +17,12 @@ from drgs.scene.asset import load_asset, save_asset
 from drgs.scene.gaussians import Gaussians
 from tests.convert.test_export_asset import ball_asset
 from tests.exchange.write_splats import flat_splats, glb_with_splats, with_document
+
+
+@pytest.fixture(autouse=True)
+def few_directions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How finely shadows are baked is not asked here."""
+    monkeypatch.setattr(bake_transfer, "DIRECTIONS", 16)
 
 
 def unit_directions(count: int) -> torch.Tensor:

@@ -78,7 +78,7 @@ def test_a_free_fall_before_a_camera_that_falls_along_changes_no_picture():
     eye = torch.eye(4, dtype=torch.float64)
     eye[:3, 3] = torch.tensor([2.0, -1.0, 8.0])
     intrinsics = torch.tensor([[100.0, 0, 24], [0, 100, 24], [0, 0, 1]])
-    settings = RenderSettings(samples_per_pixel=4096, bounces=0, primary="mesh")
+    settings = RenderSettings(samples_per_pixel=512, bounces=0, primary="mesh")
     before = render_frame(pose(asset), camera_from_opengl(eye, intrinsics, 48, 48), settings)
     eye[:3, 3] += fallen
     after = render_frame(scene, camera_from_opengl(eye, intrinsics, 48, 48), settings)

@@ -22,7 +22,7 @@ QUIET = settings(
     phases=[Phase.generate],
     suppress_health_check=list(HealthCheck),
 )
-REQUESTS_AN_OPERATION = 12
+REQUESTS_AN_OPERATION = 9
 DOWNLOADS = ("/export", "/save", "/healthz")
 """Exports and saves start a process; test_versions and test_service do that."""
 

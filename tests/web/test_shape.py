@@ -83,7 +83,9 @@ def test_a_handle_dragged_on_the_picture_pulls_the_object_and_is_one_step_of_und
             drawn = screen(ball).min(-1) < 200
             if ball.stage()["picture"] == "stale":  # no traced picture came while the screen was taken
                 break
-    assert ball.stage()["picture"] == "stale" and 2 * np.nonzero(drawn[:, round(middle / 2)])[0].min() < top - 15, "drawn here, pulled up"
+    else:
+        pytest.fail("no screen was taken between two traced pictures")
+    assert 2 * np.nonzero(drawn[:, round(middle / 2)])[0].min() < top - 15, "drawn here, pulled up"
     held = wait_until(lambda: (now := outline(ball))[1] < top - 15 and now, "a picture pulled up")
     assert held[3] - held[1] > bottom - top + 4, "drawn out, since the lower handle holds its part"
     page.mouse.up()

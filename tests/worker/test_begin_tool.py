@@ -83,7 +83,7 @@ def test_a_tool_that_is_stopped_or_forgotten_is_over_while_others_go_on(waiting:
 
 def large_mesh() -> str:
     """So large that torch shares out its loops among threads."""
-    side = 200
+    side = 120
     corners = [f"v {x / side} {y / side} 0" for y in range(side) for x in range(side)]
     lower = [y * side + x + 1 for y in range(side - 1) for x in range(side - 1)]
     faces = [f"f {a} {a + 1} {a + side}\nf {a + 1} {a + side + 1} {a + side}" for a in lower]

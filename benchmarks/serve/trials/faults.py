@@ -22,7 +22,8 @@ JOB_SECONDS = 240.0
 
 
 def trials() -> Iterator[Trial]:
-    yield Trial("starts", "an empty token is refused", partial(_refused_start, _write_token("")))
+    yield Trial("starts", "an empty token in a new folder is refused", _empty_token)
+    yield Trial("starts", "an empty token is refused", partial(_refused_start, _write_token("")), quick=False)
     yield Trial("starts", "a token of three characters is refused", partial(_refused_start, _write_token("abc\n")), quick=False)
     yield Trial("starts", "a token of spaces is refused", partial(_refused_start, _write_token(" " * 64)), quick=False)
     yield Trial("starts", "a full folder without its database is refused", partial(_refused_start, _lose_database), quick=False)
@@ -107,6 +108,18 @@ def _prepared(site: Site) -> Site:
 def _refused_start(spoil: Callable[[Site], None], site: Site) -> str | None:
     own = _prepared(site)
     spoil(own)
+    return _refused(own)
+
+
+def _empty_token(site: Site) -> str | None:
+    """Of a folder that no server has begun: the short form needs none beside the one that refuses."""
+    own = Site(Path(tempfile.mkdtemp(dir=site.folder)))
+    own.data.mkdir()
+    _write_token("")(own)
+    return _refused(own)
+
+
+def _refused(own: Site) -> str | None:
     line, said = _begin(own)
     if line:
         return f"it started: {line.partition('#')[0]}"

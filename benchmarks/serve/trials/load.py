@@ -23,7 +23,8 @@ PATIENCE_SECONDS = 1800.0
 
 
 def trials() -> Iterator[Trial]:
-    yield Trial("load", "16 stills of 512x512 at once", partial(_stills, 16, 512, 512, 4))
+    yield Trial("load", "16 stills of 256x256 at once", partial(_stills, 16, 256, 256, 4))
+    yield Trial("load", "16 stills of 512x512 at once", partial(_stills, 16, 512, 512, 4), quick=False)
     yield Trial("load", "24 stills of 1024x1024 at once", partial(_stills, 24, 1024, 1024, 4), quick=False)
     yield Trial("load", "200 stills of 4096x2160 at once", partial(_stills, 200, 4096, 2160, 1), quick=False)
     yield Trial("load", "200 stills of 256x256 at once", partial(_stills, 200, 256, 256, 32), quick=False)

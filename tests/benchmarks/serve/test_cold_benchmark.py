@@ -61,8 +61,22 @@ def test_medians_stand_beside_all_that_was_measured(tmp_path: Path, monkeypatch:
     assert "fresh_next_open_to_traced_s" not in found and [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
 
 
+ANSWERS = """
+import http.server
+class Well(http.server.BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.send_response(200)
+        self.end_headers()
+server = http.server.HTTPServer(("127.0.0.1", 0), Well)
+print(f"http://127.0.0.1:{server.server_port}/#token=x", flush=True)
+server.serve_forever()
+"""
+"""A server that is started and answers as `drgs serve` does, which the first test here starts and ends, without what takes it seconds to load."""
+
+
 @pytest.mark.slow
-def test_a_server_is_ended_where_its_user_fails(tmp_path: Path) -> None:
+def test_a_server_is_ended_where_its_user_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cold, "DRGS", ("-c", ANSWERS))
     others = descendants()  # of tests before, in the same process
     with pytest.raises(RuntimeError, match="on purpose"), served(tmp_path / "data", tmp_path / "kernels") as (address, seconds):
         assert seconds > 0 and "#token=" in address

@@ -17,7 +17,7 @@ from drgs.reconstruct.build_asset import BuildSettings, build_asset
 from drgs.reconstruct.capture.load_views import load_unmasked_views, load_views, read_capture
 from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
-from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
+from drgs.reconstruct.capture.masks_by_strokes import StrokeSettings, masks_by_strokes
 from drgs.reconstruct.capture.masks_by_strokes.color_shares import CELLS, cells_of, color_shares, log_odds
 from drgs.reconstruct.capture.masks_by_strokes.cut_picture import cut_picture, edges_of, undecided
 from drgs.reconstruct.capture.masks_by_strokes.vote_volume import Region, silhouette, vote_volume
@@ -28,9 +28,21 @@ from drgs.scene.views import Views
 from tests.one_torch_thread import one_torch_thread  # noqa: F401
 from tests.reconstruct.capture.test_find_masks import before_surroundings
 from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS
-from tests.reconstruct.tiny_capture import HEIGHT, SPHERE_CENTER, SPHERE_RADIUS, WIDTH, TinyView, sphere_views, write_nerf_synthetic
+from tests.reconstruct.tiny_capture import (
+    FEW_VIEWS,
+    HEIGHT,
+    SPHERE_CENTER,
+    SPHERE_RADIUS,
+    WIDTH,
+    TinyView,
+    sphere_views,
+    write_nerf_synthetic,
+)
 
 VIEW_COUNT, STROKED = 14, (3, 9)
+STROKED_OF_FEW = (2, 6)
+COARSE = StrokeSettings(rounds=tuple(dataclasses.replace(step, cells=step.cells * 3 // 5) for step in StrokeSettings().rounds))
+"""Volumes with cells as fine as pictures this small can tell: nearly all of the time is theirs."""
 BLUE = np.array([0.2, 0.5, 0.9])
 """Of the surroundings, so that their colours are few of the ball's."""
 
@@ -43,9 +55,19 @@ def before_blue(view: TinyView) -> TinyView:
     return TinyView(view.name, np.round(picture).astype(np.uint8), view.camera_from_world)
 
 
+def photographed(folder: Path, count: int) -> Path:
+    return write_nerf_synthetic(folder, [before_blue(view) for view in sphere_views(count, square=True)])
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_nerf_synthetic(tmp_path_factory.mktemp("stroked"), [before_blue(view) for view in sphere_views(VIEW_COUNT, square=True)])
+    return photographed(tmp_path_factory.mktemp("stroked"), VIEW_COUNT)
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """For what goes through programs, which know no coarser settings."""
+    return photographed(tmp_path_factory.mktemp("few"), FEW_VIEWS)
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +80,10 @@ def truth() -> torch.Tensor:
     return torch.from_numpy(np.stack([view.rgba[..., 3] for view in sphere_views(VIEW_COUNT, square=True)])) > 127
 
 
-def strokes_over(views: Views) -> list[Stroke]:
+def strokes_over(views: Views, stroked: tuple[int, int] = STROKED) -> list[Stroke]:
     """A cross over the ball's middle and a frame near the picture's edge, in two pictures."""
     strokes = []
-    for number in STROKED:
+    for number in stroked:
         camera = views.cameras[number]
         place = camera.camera_from_world.double().numpy() @ np.append(SPHERE_CENTER, 1)
         x, y = (place[:2] / place[2] * camera.intrinsics[0, 0].item() + [WIDTH / 2, HEIGHT / 2]) / [WIDTH, HEIGHT]
@@ -81,12 +103,12 @@ def agreement(views: Views, truth: torch.Tensor) -> torch.Tensor:
 @pytest.mark.slow
 def test_strokes_in_two_pictures_mask_all(views: Views, truth: torch.Tensor) -> None:
     told: list[float] = []
-    found = masks_by_strokes(views, strokes_over(views), report=told.append)
+    found = masks_by_strokes(views, strokes_over(views), COARSE, report=told.append)
     assert found is not None and found.has_masks and found.cameras == views.cameras
     same = agreement(found, truth)
     assert float(same.mean()) > 0.9 and float(same.min()) > 0.8
     assert told == sorted(told) and told[0] >= 0 and told[-1] <= 1
-    again = masks_by_strokes(views, strokes_over(views))
+    again = masks_by_strokes(views, strokes_over(views), COARSE)
     assert again is not None and all(torch.equal(a, b) for a, b in zip(found.coverage, again.coverage, strict=True)), "the same bits"
 
 
@@ -98,7 +120,7 @@ def test_a_caller_that_stops_gets_nothing(views: Views) -> None:
 def test_what_was_stroked_is_what_it_was_stroked_as(views: Views) -> None:
     """Even against all colours and all other pictures."""
     corner = Stroke(picture=views.cameras[3].name, shows="object", radius=0.05, points=[(0.06, 0.5)])
-    found = masks_by_strokes(views, [*strokes_over(views), corner])
+    found = masks_by_strokes(views, [*strokes_over(views), corner], COARSE)
     assert found is not None
     assert int(found.coverage[3][HEIGHT // 2, round(0.06 * WIDTH)]) > 127
 
@@ -214,23 +236,23 @@ def test_a_ball_is_voted_for_and_covers_its_masks(views: Views, truth: torch.Ten
 
 
 @pytest.mark.slow
-def test_the_doctor_draws_the_outlines_that_strokes_give(views: Views, folder: Path, tmp_path: Path) -> None:
+def test_the_doctor_draws_the_outlines_that_strokes_give(few: Path, tmp_path: Path) -> None:
     file, sheet = tmp_path / "strokes.json", tmp_path / "sheet.png"
-    file.write_text(json.dumps({"strokes": plain_strokes(strokes_over(views))}))
-    done = CliRunner().invoke(app, ["doctor", str(folder), "--strokes", str(file), "--sheet", str(sheet)])
+    file.write_text(json.dumps({"strokes": plain_strokes(strokes_over(load_unmasked_views(few), STROKED_OF_FEW))}))
+    done = CliRunner().invoke(app, ["doctor", str(few), "--strokes", str(file), "--sheet", str(sheet)])
     assert done.exit_code == 0, done.output
     with Image.open(sheet) as drawn:
         green = (np.asarray(drawn.convert("RGB"), int) == GOOD).all(-1)
-    assert green.sum() > VIEW_COUNT * 70, "an outline in each of the pictures, of a ball that is some 35 pixels wide"
-    alone = CliRunner().invoke(app, ["doctor", str(folder), "--strokes", str(file)])
+    assert green.sum() > FEW_VIEWS * 70, "an outline in each of the pictures, of a ball that is some 35 pixels wide"
+    alone = CliRunner().invoke(app, ["doctor", str(few), "--strokes", str(file)])
     assert alone.exit_code == 2 and "expected --sheet FILE" in alone.output
 
 
 @pytest.mark.slow
-def test_a_build_takes_its_masks_from_strokes(views: Views, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_takes_its_masks_from_strokes(few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "tiny", WITHOUT_HOLLOWS)
-    strokes = tuple(strokes_over(views))
-    asset = build_asset(folder, tmp_path / "ball", BuildSettings(preset="tiny", device="cpu", strokes=strokes))
+    strokes = tuple(strokes_over(load_unmasked_views(few), STROKED_OF_FEW))
+    asset = build_asset(few, tmp_path / "ball", BuildSettings(preset="tiny", device="cpu", strokes=strokes))
     assert asset.provenance["strokes"] == plain_strokes(strokes)
     away = (asset.mesh.vertices - torch.from_numpy(SPHERE_CENTER).float()).norm(dim=-1)
     assert float(away.max()) < 1.3 * SPHERE_RADIUS and float(away.median()) == pytest.approx(SPHERE_RADIUS, rel=0.1)

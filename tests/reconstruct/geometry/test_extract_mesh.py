@@ -261,12 +261,12 @@ def test_views_of_different_sizes_and_small_batches_give_the_same_mesh(torus_vie
 
 @pytest.mark.slow
 def test_the_same_depth_maps_give_the_same_bits(torus_views):
-    first, second = (extract_mesh(torus_views, torch.zeros(3), 1.0, DRAFT) for _ in range(2))
+    first, second = (extract_mesh(torus_views, torch.zeros(3), 1.0, MeshSettings(resolution=48, face_limit=3000)) for _ in range(2))
     assert torch.equal(first[0], second[0]) and torch.equal(first[1], second[1])
 
 
 def test_marched_faces_look_outward(torus_views):
-    vertices, faces = march(fuse_depth(torus_views, torch.zeros(3), 1.0, DRAFT))
+    vertices, faces = march(fuse_depth(torus_views, torch.zeros(3), 1.0, MeshSettings(resolution=48)))
     assert mesh_report(vertices, faces).volume > 0
 
 

@@ -16,7 +16,7 @@ from drgs.reconstruct.pose.prepare_photos import PreparedPhoto, with_backdrop_ma
 from drgs.reconstruct.presets import PRESETS
 from drgs.reconstruct.progress import Progress
 from tests.reconstruct import tiny_capture
-from tests.reconstruct.pose.textured_scene import orbit, write_photographs
+from tests.reconstruct.pose.textured_scene import PLAIN_SIZE, orbit, write_photographs
 from tests.reconstruct.test_build_asset import WITHOUT_HOLLOWS
 
 
@@ -63,7 +63,7 @@ def test_frames_are_not_written_over_what_is_somebody_elses(tmp_path: Path) -> N
 @pytest.mark.slow
 def test_a_build_of_a_film_chooses_frames_poses_them_and_tells_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "tiny", WITHOUT_HOLLOWS)
-    pictures = sorted((write_photographs(tmp_path / "photos", orbit(14))).iterdir())
+    pictures = sorted((write_photographs(tmp_path / "photos", orbit(24)[:8], size=PLAIN_SIZE)).iterdir())
     film = tmp_path / "film.mp4"
     with av.open(str(film), "w") as container, Image.open(pictures[0]) as first:
         stream = container.add_stream("libx264", rate=10, options={"crf": "8"})

@@ -8,6 +8,8 @@ from scipy.ndimage import map_coordinates
 
 SIZE = 300
 """Of pictures [pixels]: most of the time that poses take goes with their number. Before a plain backdrop fewer than 240 are too few."""
+PLAIN_SIZE = 240
+"""Enough where the ground is in the picture."""
 FOCAL = 1.2 * SIZE
 DISTORTION = -0.06
 """COLMAP's k of SIMPLE_RADIAL."""
@@ -66,13 +68,13 @@ def noise(points: np.ndarray) -> np.ndarray:
     return np.clip((total / len(CELLS) - 0.5) * 2.5 + 0.5, 0, 1)[..., None]
 
 
-def write_photographs(folder: Path, poses: np.ndarray, masks: bool = False) -> Path:
-    """Distorted pictures 00.png, 01.png, ... (with masks/, everything but the egg is white)."""
+def write_photographs(folder: Path, poses: np.ndarray, masks: bool = False, size: int = SIZE) -> Path:
+    """Distorted pictures 00.png, 01.png, ... of the same angle, however large (with masks/, everything but the egg is white)."""
     folder.mkdir(parents=True)
     if masks:
         (folder / "masks").mkdir()
     for number, pose in enumerate(poses):
-        color, on_egg = picture(pose, distortion=DISTORTION, egg_alone=masks)
+        color, on_egg = picture(pose, FOCAL / SIZE * size, DISTORTION, size, egg_alone=masks)
         if masks:
             Image.fromarray((255 * on_egg).astype(np.uint8)).save(folder / "masks" / f"{number:02d}.png")
         Image.fromarray(color).save(folder / f"{number:02d}.png")

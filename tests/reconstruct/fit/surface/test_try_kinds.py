@@ -24,6 +24,8 @@ SETTINGS = SurfaceSettings(
     weight_smooth=0.02,
     pixels_a_step=1000,
 )
+METAL_SETTINGS = dataclasses.replace(SETTINGS, steps_a_round=40)
+"""What is of metal is told sooner: its error over paint's is 0.25 to 0.29 with seeds, and 0.5 after 160 steps."""
 
 
 def sphere_of(metallic: float) -> TriangleMesh:
@@ -55,7 +57,8 @@ def believed(mesh: TriangleMesh, metallic: float) -> dict[str, torch.Tensor]:
 
 def tried(metallic: float, belief: float) -> TriedKinds:
     mesh = sphere_of(metallic)
-    found = try_kinds(turned_views(mesh), believed(mesh, belief), mesh.faces, SETTINGS)
+    settings = METAL_SETTINGS if metallic == 1 else SETTINGS
+    found = try_kinds(turned_views(mesh), believed(mesh, belief), mesh.faces, settings)
     assert found is not None
     return found
 
