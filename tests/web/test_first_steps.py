@@ -51,16 +51,6 @@ def test_the_mesh_is_not_drawn_before_the_camera_has_its_place(page: Viewer, bal
     page.settle()
 
 
-def test_each_page_of_the_inspector_begins_at_its_top(ball: Viewer) -> None:
-    for name, first in (("Light", "Captured"), ("Shape", "Twist"), ("Export", "Width"), ("Material", "Region")):
-        panel = ball.page.get_by_role("tabpanel")
-        panel.evaluate("panel => { panel.scrollTop = panel.scrollHeight; }")
-        assert panel.evaluate("panel => panel.scrollTop") > 0
-        ball.open_tab(name)
-        expect(ball.page.get_by_role("tabpanel", name=name)).to_be_visible()
-        assert ball.page.get_by_role("tabpanel").evaluate("panel => panel.scrollTop") == 0, f"{name}, where {first} is on top"
-
-
 PHONE, LAPTOP = {"width": 390, "height": 844}, {"width": 1280, "height": 800}
 
 

@@ -12,6 +12,7 @@ from playwright.sync_api import expect
 
 from tests.web.browser import ROOT
 from tests.web.conftest import Viewer, wait_until
+from tests.web.test_viewer_turns_light import SWITCH
 
 TOO_SMALL_TO_SEE = 6.0
 AXE = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"
@@ -240,6 +241,23 @@ def test_scripts_hold_the_edits_and_the_camera(ball: Viewer) -> None:
     script = ball.page.evaluate("navigator.clipboard.readText()")
     compile(script, "script", "exec")
     assert '"roughness": 0.85' in script and "world_from_camera=camera" in script
+
+
+def test_each_page_of_the_inspector_begins_at_its_top(ball: Viewer) -> None:
+    ball.open_tab("Material")
+    for name, first in (("Light", "Captured"), ("Shape", "Twist"), ("Export", "Width"), ("Material", "Region")):
+        panel = ball.page.get_by_role("tabpanel")
+        panel.evaluate("panel => { panel.scrollTop = panel.scrollHeight; }")
+        assert panel.evaluate("panel => panel.scrollTop") > 0
+        ball.open_tab(name)
+        expect(ball.page.get_by_role("tabpanel", name=name)).to_be_visible()
+        assert ball.page.get_by_role("tabpanel").evaluate("panel => panel.scrollTop") == 0, f"{name}, where {first} is on top"
+
+
+def test_an_object_whose_light_stands_still_has_no_switch_that_turns_it(ball: Viewer) -> None:
+    ball.open_tab("Light")
+    expect(ball.page.get_by_role("slider", name="Intensity")).to_be_visible()
+    expect(ball.page.get_by_role("switch", name=SWITCH)).to_have_count(0)
 
 
 @pytest.mark.parametrize("theme", ["dark", "light"])

@@ -31,12 +31,14 @@ def missed(measured: dict[str, float]) -> list[str]:
 def test_the_viewer_is_as_quick_as_promised(built: None) -> None:
     taken = {"bundle_gz_kb": bundle_bytes() / 1000}
     with started(None) as viewer:
-        for take in (
-            lambda: measure_bare_local(viewer, TURN_SECONDS) | measure_edits_and_local(viewer, REPEATS, TURN_SECONDS),
-            lambda: measure_bare_traced(viewer, TURN_SECONDS) | measure_traced(viewer, TURN_SECONDS),
+        for take, take_bare in (
+            (lambda: measure_edits_and_local(viewer, REPEATS, TURN_SECONDS), lambda: measure_bare_local(viewer, TURN_SECONDS)),
+            (lambda: measure_traced(viewer, TURN_SECONDS), lambda: measure_bare_traced(viewer, TURN_SECONDS)),
         ):
             for _ in range(ATTEMPTS):
                 measured = take()
+                if missed(measured):  # only then it matters what the machine allows
+                    measured |= take_bare()
                 print(measured)
                 if not missed(measured):
                     break

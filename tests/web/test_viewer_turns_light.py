@@ -66,9 +66,3 @@ def test_the_light_of_a_turntable_turns_with_the_camera_where_it_is_switched_on(
         viewer.page.screenshot(path=str(Path(folder) / "turning_light.png"))
     assert still > 15 and turning < 4, (still, turning)
     assert viewer.complaints == [] and viewer.refusals == []
-
-
-def test_an_object_whose_light_stands_still_has_no_such_switch(ball: Viewer) -> None:
-    ball.open_tab("Light")
-    expect(ball.page.get_by_role("slider", name="Intensity")).to_be_visible()
-    expect(ball.page.get_by_role("switch", name=SWITCH)).to_have_count(0)
