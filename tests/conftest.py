@@ -6,6 +6,7 @@ there is none instead of passing by doing nothing.
 
 import gc
 import os
+import sys
 from collections.abc import Generator
 from typing import Any
 
@@ -27,15 +28,19 @@ def load_blas_of_one_thread() -> None:
 if "PYTEST_XDIST_WORKER" in os.environ and "OPENBLAS_NUM_THREADS" not in os.environ:
     load_blas_of_one_thread()
 
-from tests.shape_checks import check_imports_of, count_calls_anew  # noqa: E402
+HANDS_OUT = "PYTEST_XDIST_WORKER" not in os.environ and any(word.startswith("--numprocesses") for word in sys.argv)
+"""This process runs no test: it hands them out to others, which begin when it has loaded what it needs."""
 
 # Until all is imported and collected: what comes then stays, and looking through it for garbage takes a quarter of the time that it takes.
 gc.disable()
 
-# Before anything imports them: what enters and leaves functions and records must be of the shape that the annotation says.
-check_imports_of(["drgs.scene", "drgs.deform", "drgs.render.records", "drgs.reconstruct", "drgs.convert", "drgs.evaluate"])
+if not HANDS_OUT:
+    from tests.shape_checks import check_imports_of, count_calls_anew
 
-import torch  # noqa: E402
+    # Before anything imports them: what enters and leaves functions and records must be of the shape that the annotation says.
+    check_imports_of(["drgs.scene", "drgs.deform", "drgs.render.records", "drgs.reconstruct", "drgs.convert", "drgs.evaluate"])
+
+    import torch
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -5,6 +5,7 @@ A worker that DRGS_BUILDER tells to use it goes through every stage as any other
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from unittest.mock import patch
 
 from drgs_worker.jobs.builders import BuildRequest, build_with_drgs
@@ -14,9 +15,12 @@ FIT_ITERATIONS, MATERIAL_ITERATIONS = 40, 15
 POINTS, MOST_SURFELS, SIDE = 3000, 4000, 128
 MESH, PASS = {"resolution": 96, "face_limit": 10_000}, {"resolution": 80, "face_limit": 8000}
 """Of the first surface, and of the one that is fitted."""
+HULL = {"coarse_cells": 32, "fine_cells": 96}
 
 
 def build(request: BuildRequest, tell: Tell, should_stop: Callable[[], bool]) -> Iterator[str]:
+    from drgs.reconstruct.capture import initial_points
+    from drgs.reconstruct.capture.visual_hull import VisualHullSettings, visual_hull
     from drgs.reconstruct.presets import PRESETS
 
     draft = PRESETS["draft"]
@@ -25,5 +29,6 @@ def build(request: BuildRequest, tell: Tell, should_stop: Callable[[], bool]) ->
     passes = replace(draft.surface, passes=1, surface=surface, mesh=replace(draft.surface.mesh, **PASS))
     materials = replace(draft.materials, iterations=MATERIAL_ITERATIONS, points_a_step=256)
     short = replace(draft, points=POINTS, image_side=SIDE, fit=fit, mesh=replace(draft.mesh, **MESH), surface=passes, materials=materials)
-    with patch.dict(PRESETS, draft=short):
+    hull = partial(visual_hull, settings=VisualHullSettings(**HULL))
+    with patch.dict(PRESETS, draft=short), patch.object(initial_points, "visual_hull", hull):
         yield from build_with_drgs(request, tell, should_stop)
