@@ -1,6 +1,7 @@
 """DR-GS: photos in, a relightable, deformable, editable object out.
 
-The names below are the public ones; each is imported when it is first used, so that `import drgs` costs nothing.
+The names below are the public ones; each is imported when it is first used, so that `import drgs` costs nothing. Import it before torch: it chooses how
+torch's idle threads wait (GOMP_SPINCOUNT, unless it is set), which two programs on one machine would else stop each other by.
 See docs/roadmap.md for what works.
 
     asset = drgs.load_asset("out/teapot")
@@ -12,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from drgs.installation import missing_package
+from drgs.openmp import spin_briefly_unless_told
 
 if TYPE_CHECKING:  # what a type checker knows of the names that come late; a test compares the two lists
     from drgs.convert.export_asset import export_asset as export_asset
@@ -30,6 +32,9 @@ if TYPE_CHECKING:  # what a type checker knows of the names that come late; a te
     from drgs_server.client import Client as Client
 
 __version__ = "0.2.0"
+
+# Torch reads it when it is loaded, which the modules behind these names do.
+spin_briefly_unless_told()
 
 _modules = {
     "Asset": "drgs.scene.asset",

@@ -22,6 +22,12 @@ def spin_briefly() -> None:
     _choose(SPINS)
 
 
+def spin_briefly_unless_told() -> None:
+    """For who imports the library: what the user has set holds, and what the program that started this one chose."""
+    if "GOMP_SPINCOUNT" not in os.environ:
+        spin_briefly()
+
+
 def sleep_at_once() -> None:
     """For a server, whose threads must not be in each other's way. What the user has set holds."""
     _choose(ASLEEP)

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from drgs.openmp import ASLEEP, BLAS_ASLEEP, SPINS, sleep_at_once, spin_briefly
+from drgs.openmp import ASLEEP, BLAS_ASLEEP, SPINS, sleep_at_once, spin_briefly, spin_briefly_unless_told
 
 
 @pytest.fixture(autouse=True)
@@ -34,8 +34,26 @@ def test_what_the_user_has_set_holds(monkeypatch: pytest.MonkeyPatch, name: str,
     assert dict(os.environ) == before
 
 
-@pytest.mark.parametrize(("command", "spins"), [("doctor", SPINS), ("serve", None)])
-def test_the_command_line_chooses_before_torch_is_loaded(command: str, spins: str | None) -> None:
+@pytest.mark.parametrize(("given", "found"), [({}, SPINS), ({"GOMP_SPINCOUNT": ASLEEP}, ASLEEP), ({"OMP_WAIT_POLICY": "active"}, None)])
+def test_importing_the_library_chooses_what_nobody_has(given: dict[str, str], found: str | None) -> None:
+    code = "import json, os, sys, drgs; print(json.dumps([os.environ.get('GOMP_SPINCOUNT'), 'torch' in sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | given)
+    assert json.loads(done.stdout) == [found, False]
+
+
+def test_a_server_changes_what_importing_the_library_chose() -> None:
+    spin_briefly_unless_told()
+    assert os.environ["GOMP_SPINCOUNT"] == SPINS
+    sleep_at_once()
+    assert os.environ["GOMP_SPINCOUNT"] == ASLEEP
+    spin_briefly_unless_told()
+    assert os.environ["GOMP_SPINCOUNT"] == ASLEEP
+
+
+@pytest.mark.parametrize(("command", "chosen"), [("doctor", SPINS), ("serve", ASLEEP)])
+def test_the_command_line_chooses_before_torch_is_loaded(monkeypatch: pytest.MonkeyPatch, command: str, chosen: str) -> None:
+    """Whatever started it chose for itself; but for a server, which does so when it begins."""
+    monkeypatch.setenv("GOMP_SPINCOUNT", ASLEEP)
     code = """
 import json, os, sys
 sys.argv = ["drgs", sys.argv[1], "--help"]
@@ -46,4 +64,4 @@ except SystemExit:
     print(json.dumps([os.environ.get("GOMP_SPINCOUNT"), "torch" in sys.modules]), file=sys.stderr)
 """
     done = subprocess.run([sys.executable, "-c", code, command], capture_output=True, text=True)
-    assert json.loads(done.stderr.splitlines()[-1]) == [spins, False]
+    assert json.loads(done.stderr.splitlines()[-1]) == [chosen, False]
