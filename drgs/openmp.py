@@ -9,12 +9,15 @@ few among torch's operations: they sleep at once. 50 small solves with pauses be
 """
 
 import os
+import sys
 
 SPINS = "3000"
 """Of GNU's OpenMP, which torch's packages for Linux bring: a fraction of a millisecond."""
 ASLEEP = "0"
 BLAS_ASLEEP = "4"
 """OPENBLAS_THREAD_TIMEOUT, in log2 of clock ticks: the least that it takes. Its own is 26."""
+CHOSEN_IN_TIME = "torch" not in sys.modules or not os.environ.keys().isdisjoint(("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"))
+"""Whether torch's threads wait as is chosen here, or as the user says. Else torch was loaded before drgs, and brief_waits.py does what is left."""
 
 
 def spin_briefly() -> None:

@@ -23,12 +23,14 @@ LAYERS = (
 """Each may import those before it."""
 TOP_FILES = {
     "drgs/__init__.py",
+    "drgs/brief_waits.py",
     "drgs/cli.py",
     "drgs/cli_answers.py",
     "drgs/cli_endings.py",
     "drgs/cli_options.py",
     "drgs/cli_progress.py",
     "drgs/compiled_kernels.py",
+    "drgs/crowding.py",
     "drgs/installation.py",
     "drgs/openmp.py",
     "drgs/warp_torch.py",

@@ -1,11 +1,12 @@
 """A build beside other work on the same cores: beside another build, and beside a viewer whose camera never rests.
 
-    python -m benchmarks beside DATASET ASSET [--preset draft] [--size 400] [--seconds 20] [--json]
+    python -m benchmarks beside DATASET ASSET [--preset draft] [--size 400] [--seconds 20] [--script] [--json]
 
 The same build is run four times: alone; twice at once; and, as the service's worker runs it (giving way to others by some steps of priority), while a
 viewer of ASSET moves its camera with each picture that comes. A viewer that has the machine to itself is measured for `--seconds` before.
 beside_build_ratio, beside_viewer_ratio: seconds over those alone, of the two builds the longer one's; ..._cpu_ratio: the same of processor time, which says
 what threads that wait for each other burn. viewer_kept: pictures a second that the viewer gets while the build runs, over those without it.
+With --script a build is not a command but a script's call of drgs.build_asset, which imports torch before drgs and chooses nothing of how threads wait.
 """
 
 import argparse
@@ -28,6 +29,18 @@ from drgs_worker.run import MODESTY
 
 GIVING_WAY = f"import os, sys; os.nice({MODESTY}); sys.argv[0] = 'drgs'; from drgs.cli import main; main()"
 """`drgs` with the priority of the service's worker; its arguments follow."""
+SCRIPT = """
+import json, os, sys
+for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OPENBLAS_THREAD_TIMEOUT"):
+    os.environ.pop(name, None)
+import torch
+import drgs
+from pathlib import Path
+dataset, out, preset, device, modesty = sys.argv[1:]
+os.nice(int(modesty))
+asset = drgs.build_asset(Path(dataset), Path(out), drgs.BuildSettings(preset=preset, device=device))
+print(json.dumps({"stage": "done", "provenance": asset.provenance}))
+"""
 FIELD_OF_VIEW_DEGREES = 31.5
 """Of the viewer's camera."""
 
@@ -42,14 +55,15 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--size", type=int, default=400, help="of the viewer's picture [pixels]")
     parser.add_argument("--seconds", type=float, default=20.0, help="how long a viewer alone is measured")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
+    parser.add_argument("--script", action="store_true", help="builds by a script that imports torch before drgs, not by the command")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="drgs-beside-") as folder:
-        result = measure(given.dataset, given.asset, given.preset, given.device, given.size, given.seconds, Path(folder))
+        result = measure(given.dataset, given.asset, given.preset, given.device, given.size, given.seconds, Path(folder), given.script)
     print(json.dumps(result, indent=None if given.json else 1))
 
 
-def measure(dataset: Path, asset: Path, preset: str, device: str, size: int, seconds: float, folder: Path) -> dict:
+def measure(dataset: Path, asset: Path, preset: str, device: str, size: int, seconds: float, folder: Path, by_script: bool = False) -> dict:
     """All four builds and both viewers.
 
     Raises:
@@ -57,6 +71,8 @@ def measure(dataset: Path, asset: Path, preset: str, device: str, size: int, sec
     """
 
     def build(name: str, giving_way: bool = False) -> BuildRun:
+        if by_script:
+            return run_build(["-c", SCRIPT, str(dataset), str(folder / name), preset, device, str(MODESTY if giving_way else 0)])
         command = cli_command(dataset, folder / name, preset, device=device, resume=False)
         # The first two words are what Python is to run.
         return run_build(["-c", GIVING_WAY, *command[2:]] if giving_way else command)
@@ -87,6 +103,7 @@ def measure(dataset: Path, asset: Path, preset: str, device: str, size: int, sec
         "dataset": dataset.name,
         "asset": asset.name,
         "preset": preset,
+        "by_script": by_script,
         "size": size,
     }
 

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from drgs.brief_waits import brief_waits_where_crowded
 from drgs.exchange.photographs import encode_photographs
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
 from drgs.reconstruct.capture.cut_to_box import views_of
@@ -134,7 +135,8 @@ def build_asset(
         ValueError: the capture, a setting or a checkpoint is wrong, in one sentence.
         BuildStopped: as asked.
     """
-    *_, (_, asset) = build_stages(dataset, out, settings, progress, should_stop, previews)
+    with brief_waits_where_crowded():
+        *_, (_, asset) = build_stages(dataset, out, settings, progress, should_stop, previews)
     assert asset is not None
     return asset
 
@@ -169,7 +171,9 @@ def build_stages(
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
         stop = should_stop or (lambda: False)
         masked_by = _by_strokes(settings.strokes, reporter, stop) if settings.strokes else None
-        found, views, points = open_capture(capture, preset.image_side, preset.points, settings.seed, settings.up, settings.box, masked_by)
+        found, views, points = open_capture(
+            capture, preset.image_side, preset.points, settings.seed, settings.up, settings.box, masked_by, preset.hull
+        )
         photographs = views
         views = with_gains_of_points(views, points)
         identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views, settings.box)}
@@ -187,7 +191,7 @@ def build_stages(
             # Hollows are found by paint that looks alike from all sides, which it does not under such light.
             views, place = with_light_of_camera(views), place.of(light="camera")
         else:
-            points = hollows_stage(place, masked, points, preset.points, preset.hollows, settings.seed, device, settings.box)
+            points = hollows_stage(place, masked, points, preset.points, preset.hollows, settings.seed, device, settings.box, preset.hull)
     yield "read", None
 
     with timed("fit"):
@@ -261,12 +265,12 @@ def _with_found_masks(
 ) -> tuple[Views, Views, InitialPoints]:
     """Views without masks, but with the ground where there is one; the same with masks, for what looks at the object; points on those."""
     views = ground_stage(place, views, settings.seed)
-    points = points_on_ground(views, points, preset.points, settings.seed, settings.box)
+    points = points_on_ground(views, points, preset.points, settings.seed, settings.box, preset.hull)
     masked = masks_stage(place, views, points, fit_settings, device, settings.box)
     views = views_of(views, masked)  # without those in which the box's content is hidden
     if views.ground is not None:
         views, masked = ground_again_stage(place, views, masked, settings.seed)
-    return views, masked, points_of_found_masks(masked, points, preset.points, settings.seed, settings.box)
+    return views, masked, points_of_found_masks(masked, points, preset.points, settings.seed, settings.box, preset.hull)
 
 
 def _light(settings: BuildSettings, preset: Preset, capture: Capture, views: Views, points: InitialPoints) -> LightFound:

@@ -8,6 +8,7 @@ from typing import Literal
 
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
+from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.evidence.solve_albedo import DetailSettings
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
@@ -42,6 +43,8 @@ class Preset:
     are idle."""
     surfel_materials: MaterialSettings = field(default_factory=MaterialSettings)
     """Of materials_on surfels. Bound to the mesh, that one has as many faces at most as surfels are allowed (fit.densify.budget)."""
+    hull: VisualHullSettings = field(default_factory=VisualHullSettings)
+    """Of the masks, on whose surface points begin."""
 
 
 PRESETS = {

@@ -20,7 +20,7 @@ from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
 from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.on_ground.stands_on_ground import look_again, stands_on_ground
-from drgs.reconstruct.capture.visual_hull import VisualHull
+from drgs.reconstruct.capture.visual_hull import VisualHull, VisualHullSettings
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
@@ -163,15 +163,21 @@ def _with_ground(views: Views, kept: dict[str, Tensor]) -> Views:
     return replace(views, ground=ground, coverage=tuple(kept[f"coverage.{number}"] for number in range(len(views.cameras))))
 
 
-def points_on_ground(views: Views, points: InitialPoints, count: int, seed: int, box: BuildBox | None) -> InitialPoints:
+def points_on_ground(
+    views: Views, points: InitialPoints, count: int, seed: int, box: BuildBox | None, hull_settings: VisualHullSettings
+) -> InitialPoints:
     """Points where the object may be; the given ones where no ground tells."""
-    return points if views.ground is None else points_of_found_masks(replace(views, has_masks=True), points, count, seed, box)
+    if views.ground is None:
+        return points
+    return points_of_found_masks(replace(views, has_masks=True), points, count, seed, box, hull_settings)
 
 
-def points_of_found_masks(masked: Views, points: InitialPoints, count: int, seed: int, box: BuildBox | None) -> InitialPoints:
+def points_of_found_masks(
+    masked: Views, points: InitialPoints, count: int, seed: int, box: BuildBox | None, hull_settings: VisualHullSettings
+) -> InitialPoints:
     """Points on the found masks' hull; the given ones where the masks have none."""
     try:
-        return initial_points(masked, count, seed, box=box)
+        return initial_points(masked, count, seed, box=box, hull_settings=hull_settings)
     except ValueError:  # a first guess may be wrong where the user's own masks may not: the fit then starts from random points
         return points
 
@@ -185,6 +191,7 @@ def hollows_stage(
     seed: int,
     device: torch.device,
     box: BuildBox | None,
+    hull_settings: VisualHullSettings,
 ) -> InitialPoints:
     """find_hollows: the points on the hull, moved to what the photographs show behind it. The bounds stay the hull's."""
     if points.hull_vertices is None or points.hull_faces is None or points.normals_world is None or not settings.grid.levels:
@@ -198,7 +205,7 @@ def hollows_stage(
         surface = find_hollows(views, hull, settings, seed, device, report, place.should_stop)
         if surface is None:
             raise BuildStopped
-        found = points if surface is hull else initial_points(views, count, seed, surface, box)
+        found = points if surface is hull else initial_points(views, count, seed, surface, box, hull_settings)
         assert found.normals_world is not None  # those of a surface
         return {"points": found.points_world, "normals": found.normals_world, "colors": found.colors_srgb}
 

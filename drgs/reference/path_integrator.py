@@ -24,8 +24,8 @@ from drgs.render.integrate.environment_table import EnvironmentTable, environmen
 from drgs.scene.environment import Environment, environment_radiance
 from drgs.scene.mesh import TriangleMesh
 
-PAIRS_AT_ONCE = 1 << 21
-"""Rays times triangles that are held against each other together: bounds memory."""
+PAIRS_AT_ONCE = 1 << 15
+"""Rays times triangles that are held against each other together: what they need stays in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)

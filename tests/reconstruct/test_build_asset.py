@@ -4,9 +4,7 @@ import io
 import json
 import shutil
 import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +16,9 @@ from PIL import Image
 from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photograph
 from drgs.reconstruct import report_progress
 from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, Progress, build_asset, calibrations, kept_photographs
-from drgs.reconstruct.capture import initial_points as initial_points_module
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
-from drgs.reconstruct.capture.visual_hull import VisualHullSettings, visual_hull
+from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
@@ -62,8 +59,9 @@ TINY = Preset(
     hollows=HollowSettings(RadianceGridSettings(levels=((12, 4),), rays_a_step=64)),
     mesh_surfels=MeshFitSettings(iterations=6),
     surfel_materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
+    hull=VisualHullSettings(coarse_cells=32, cell_pixels=1.0),
 )
-WITHOUT_HOLLOWS = replace(TINY, image_side=72, hollows=HollowSettings(RadianceGridSettings(levels=())))
+WITHOUT_HOLLOWS = replace(TINY, image_side=72, hollows=HollowSettings(RadianceGridSettings(levels=())), hull=VisualHullSettings())
 """For tests of other files that ask nothing about hollows, as the preset `draft` does; pictures as they are, for some of them compare those."""
 ON_SURFELS = replace(TINY, hollows=WITHOUT_HOLLOWS.hollows, materials_on="surfels")
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
@@ -75,15 +73,6 @@ def _tiny_preset(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(PRESETS, "other", TINY)
     monkeypatch.setitem(PRESETS, "surfels", ON_SURFELS)
     monkeypatch.setattr(report_progress, "REPORT_SECONDS", 0.0)  # every step is told: some tests stop at one
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _coarse_hull() -> Iterator[None]:
-    """Each build and each that goes on carves the hull anew, two dozen times here, which took a quarter of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        settings = VisualHullSettings(coarse_cells=32, cell_pixels=1.0)
-        patch.setattr(initial_points_module, "visual_hull", partial(visual_hull, settings=settings))
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,6 @@ from drgs.render.intersect.tracer_embree import EmbreeTracer
 from drgs.render.records import RayStarts, SampleCounts, ShadingPoints
 from drgs.scene.environment import Environment, environment_radiance
 from drgs.scene.mesh import TriangleMesh
-from tests.reference.few_pairs_at_once import few_pairs_at_once  # noqa: F401
 from tests.render.closed_form_scenes import constant_sky, mesh_of, sphere_mesh, sunny_sky
 
 LIFT = 1e-4

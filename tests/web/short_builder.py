@@ -5,7 +5,6 @@ A worker that DRGS_BUILDER tells to use it goes through every stage as any other
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from unittest.mock import patch
 
 from drgs_worker.jobs.builders import BuildRequest, build_with_drgs
@@ -19,8 +18,7 @@ HULL = {"coarse_cells": 32, "fine_cells": 96}
 
 
 def build(request: BuildRequest, tell: Tell, should_stop: Callable[[], bool]) -> Iterator[str]:
-    from drgs.reconstruct.capture import initial_points
-    from drgs.reconstruct.capture.visual_hull import VisualHullSettings, visual_hull
+    from drgs.reconstruct.capture.visual_hull import VisualHullSettings
     from drgs.reconstruct.presets import PRESETS
 
     draft = PRESETS["draft"]
@@ -28,7 +26,7 @@ def build(request: BuildRequest, tell: Tell, should_stop: Callable[[], bool]) ->
     surface = replace(draft.surface.surface, steps_a_round=MATERIAL_ITERATIONS)
     passes = replace(draft.surface, passes=1, surface=surface, mesh=replace(draft.surface.mesh, **PASS))
     materials = replace(draft.materials, iterations=MATERIAL_ITERATIONS, points_a_step=256)
-    short = replace(draft, points=POINTS, image_side=SIDE, fit=fit, mesh=replace(draft.mesh, **MESH), surface=passes, materials=materials)
-    hull = partial(visual_hull, settings=VisualHullSettings(**HULL))
-    with patch.dict(PRESETS, draft=short), patch.object(initial_points, "visual_hull", hull):
+    mesh, hull = replace(draft.mesh, **MESH), VisualHullSettings(**HULL)
+    short = replace(draft, points=POINTS, image_side=SIDE, fit=fit, mesh=mesh, surface=passes, materials=materials, hull=hull)
+    with patch.dict(PRESETS, draft=short):
         yield from build_with_drgs(request, tell, should_stop)

@@ -3,15 +3,13 @@
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from drgs.reconstruct.capture import initial_points as initial_points_module
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
-from drgs.reconstruct.capture.visual_hull import VisualHullSettings, visual_hull
+from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
@@ -48,11 +46,10 @@ TINY = Preset(
     materials=MeshMaterialSettings(iterations=4, points_a_step=64, samples=SampleCounts(4, 2, 2)),
     hollows=HollowSettings(RadianceGridSettings(levels=((12, 4),), rays_a_step=64)),
     mesh_surfels=MeshFitSettings(iterations=3),
+    hull=VisualHullSettings(coarse_cells=32, cell_pixels=1.0),
 )
 BOUND = replace(TINY, hollows=HollowSettings(RadianceGridSettings(levels=())))
 """Hollows are looked for before anything is bound to a mesh: the other build says whether what is found of them is kept."""
-COARSE_HULL = partial(visual_hull, settings=VisualHullSettings(coarse_cells=32, cell_pixels=1.0))
-"""Each run of a step carves the hull anew, which took a quarter of the time."""
 MORE = replace(TINY, materials=MeshMaterialSettings(iterations=8, points_a_step=64, samples=SampleCounts(4, 2, 2)))
 
 
@@ -61,7 +58,6 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DataD
     monkeypatch.setitem(PRESETS, "tiny", TINY)
     monkeypatch.setitem(PRESETS, "bound", BOUND)
     monkeypatch.setitem(PRESETS, "more", MORE)
-    monkeypatch.setattr(initial_points_module, "visual_hull", COARSE_HULL)
     write_nerf_synthetic(tmp_path, sphere_views(FEW_VIEWS, square=True))
     yield open_data_directory(tmp_path / "data")
 

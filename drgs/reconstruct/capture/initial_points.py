@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox
-from drgs.reconstruct.capture.visual_hull import VisualHull, axes_meeting_point, camera_geometry, visual_hull
+from drgs.reconstruct.capture.visual_hull import HULL, VisualHull, VisualHullSettings, axes_meeting_point, camera_geometry, visual_hull
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
@@ -43,7 +43,14 @@ class InitialPoints:
     hull_faces: Int[Tensor, "face 3"] | None
 
 
-def initial_points(views: Views, count: int, seed: int, surface: VisualHull | None = None, box: BuildBox | None = None) -> InitialPoints:
+def initial_points(
+    views: Views,
+    count: int,
+    seed: int,
+    surface: VisualHull | None = None,
+    box: BuildBox | None = None,
+    hull_settings: VisualHullSettings = HULL,
+) -> InitialPoints:
     """`count` points (fewer when the capture's own sparse points are all there is).
 
     Args:
@@ -54,7 +61,7 @@ def initial_points(views: Views, count: int, seed: int, surface: VisualHull | No
         ValueError: the masks have no common shape.
     """
     random = np.random.default_rng(seed)
-    hull = visual_hull(views, box=box) if views.has_masks else None
+    hull = visual_hull(views, hull_settings, box) if views.has_masks else None
     sparse = _sparse_points_on_object(views, box)
     surface = hull if surface is None else surface
     if sparse is not None and len(sparse[0]) >= FEWEST_SPARSE_POINTS:

@@ -20,7 +20,7 @@ from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.mask_agreement import mask_agreement
 from drgs.reconstruct.capture.turn_up import UP, Direction, turn_up
-from drgs.reconstruct.capture.visual_hull import axes_meeting_point
+from drgs.reconstruct.capture.visual_hull import HULL, VisualHullSettings, axes_meeting_point
 from drgs.scene.views import Views
 
 SAME_PLACE = 1e-6
@@ -46,6 +46,7 @@ def open_capture(
     up: Direction = UP,
     box: BuildBox | None = None,
     masked: Callable[[Views], Views] | None = None,
+    hull_settings: VisualHullSettings = HULL,
 ) -> tuple[Capture, Views, InitialPoints]:
     """The capture, its pictures of at most `max_side` pixels a side, and points to begin with.
 
@@ -67,7 +68,7 @@ def open_capture(
         views = masked(views)
     if box is not None and views.has_masks:
         views = _cut(views, box, folder)
-    points = initial_points(views, point_count, seed, box=box)
+    points = initial_points(views, point_count, seed, box=box, hull_settings=hull_settings)
     _check_points(views, points, folder)
     return capture, views, points
 

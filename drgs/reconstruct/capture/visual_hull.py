@@ -50,6 +50,10 @@ class VisualHullSettings:
     """Parts smaller than this share of the largest are dropped."""
 
 
+HULL = VisualHullSettings()
+"""Where nobody says otherwise."""
+
+
 @dataclass(frozen=True, eq=False)
 class VisualHull:
     """A closed surface around the object."""
@@ -109,7 +113,7 @@ def outvote(
     seen_by[i] = seen
 
 
-def visual_hull(views: Views, settings: VisualHullSettings = VisualHullSettings(), box: BuildBox | None = None) -> VisualHull | None:
+def visual_hull(views: Views, settings: VisualHullSettings = HULL, box: BuildBox | None = None) -> VisualHull | None:
     """Carve the hull; None where the masks have no common shape.
 
     Args:

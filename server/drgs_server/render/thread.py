@@ -15,8 +15,8 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
+from drgs.crowding import Crowding
 from drgs_server.live.viewer import Viewer
-from drgs_server.render.crowding import Crowding
 from drgs_server.render.settle_memory import settle_memory
 
 T = TypeVar("T")
@@ -48,7 +48,7 @@ class RenderThread:
     """Final. Start it once, add and remove viewers, call functions on it."""
 
     def __init__(self) -> None:
-        self._crowding = Crowding(_use_threads)
+        self._crowding = Crowding(_spare_cores)
         self._wake = threading.Condition()
         self._calls: deque[tuple[Future, Callable[[], Any]]] = deque()
         self._calls_in_turn: deque[tuple[Future, Callable[[], Any]]] = deque()
@@ -166,10 +166,14 @@ class RenderThread:
             viewer.tell_error(f"This picture could not be rendered: {type(error).__name__}: {error}")
 
 
-def _use_threads(most: int | None) -> None:
-    from drgs.warp_torch import use_threads  # no picture was made before it was loaded
+def _spare_cores(crowded: bool) -> None:
+    """Leave half of the cores to others where these want them: beside a build on two cores one thread makes as many moving pictures as two, in two thirds
+    of the processor time."""
+    from drgs.warp_torch import thread_count, use_threads  # no picture was made before it was loaded
 
-    use_threads(most)
+    use_threads(None)
+    if crowded:
+        use_threads(max(1, thread_count() // 2))
 
 
 def _answer(future: Future, function: Callable[[], Any]) -> None:

@@ -1,12 +1,14 @@
 """What a build beside other work is held against; the viewer that never rests, on a real server."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from benchmarks.builds.build_process import BuildRun
 from benchmarks.render.frame import served
-from benchmarks.serve.beside import GIVING_WAY, camera_path, figures, pictures_a_second
+from benchmarks.serve.beside import GIVING_WAY, SCRIPT, camera_path, figures, pictures_a_second
 from drgs.scene.asset import Asset, save_asset
 from drgs_worker.run import MODESTY
 from tests.render.closed_form_scenes import sunny_sky, two_spheres
@@ -23,13 +25,17 @@ def test_ratios_are_of_the_longer_build_and_of_the_mean_of_their_processor_time(
 
 
 def test_a_build_that_gives_way_is_the_command_itself(tmp_path: Path):
-    import subprocess
-    import sys
-
     asked = f"import os; print(os.nice(0), end=' '); {GIVING_WAY.replace('main()', 'print(os.nice(0), sys.argv)')}"
     said = subprocess.run([sys.executable, "-c", asked, "build", "x"], capture_output=True, text=True, check=True).stdout
     before, after, *arguments = said.split(maxsplit=2)
     assert int(after) == min(int(before) + MODESTY, 19) and arguments == ["['drgs', 'build', 'x']\n"]
+
+
+def test_a_script_loads_torch_before_anything_is_chosen():
+    loading = SCRIPT.split("asset =")[0] + "from drgs.openmp import CHOSEN_IN_TIME; print(CHOSEN_IN_TIME, out)"
+    arguments = ["capture", "out", "draft", "cpu", "0"]
+    said = subprocess.run([sys.executable, "-c", loading, *arguments], capture_output=True, text=True, check=True).stdout
+    assert said == "False out\n"
 
 
 @pytest.mark.slow

@@ -33,7 +33,6 @@ from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedScene
-from tests.reference.few_pairs_at_once import few_pairs_at_once  # noqa: F401
 from tests.render.closed_form_scenes import constant_sky, front_camera, mesh_of, on_device, sphere_mesh, sunny_sky, two_spheres
 
 SETTINGS = RenderSettings(samples_per_pass=16, denoise="svgf", keep_light=True, bounces=1)

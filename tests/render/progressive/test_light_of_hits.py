@@ -21,7 +21,6 @@ from drgs.render.progressive.start_frame import start_frame
 from drgs.render.records import RayStarts, RenderSettings, SampleCounts, ShadedPoints, ShadingPoints
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedScene
-from tests.reference.few_pairs_at_once import few_pairs_at_once  # noqa: F401
 from tests.render.closed_form_scenes import constant_sky, front_camera, on_device, sphere_mesh, sunny_sky, two_spheres
 
 INTEGRATORS = pytest.mark.parametrize("integrator", [FusedEmbreeIntegrator, WavefrontIntegrator])

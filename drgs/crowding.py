@@ -1,10 +1,8 @@
-"""Whether others want the cores that a thread runs on: then work that is spread over all of them waits for its last part again and again, and fewer
-threads get more done. Beside a build on two cores one thread makes as many moving pictures as two, in two thirds of the processor time.
+"""Whether others want the cores that a thread runs on: then work that is spread over all of them waits for its last part again and again.
 
 Linux says how long a thread waited for a core; elsewhere nobody is ever in the way.
 """
 
-import os
 from collections.abc import Callable
 
 OTHERS_COME, OTHERS_GO = 0.2, 0.1
@@ -13,10 +11,14 @@ LOOK_SECONDS = 0.25
 """Of such time between two looks."""
 
 
-def scheduled_seconds() -> tuple[float, float]:
-    """How long the calling thread ran, and waited for a core while it could have run; zeros where the system does not say."""
+def scheduled_seconds(thread: int | None = None) -> tuple[float, float]:
+    """How long a thread of this process ran, and waited for a core while it could have run; zeros where the system does not say.
+
+    Args:
+        thread: its native id; None: the calling one.
+    """
     try:
-        with open("/proc/thread-self/schedstat") as told:
+        with open("/proc/thread-self/schedstat" if thread is None else f"/proc/self/task/{thread}/schedstat") as told:
             ran, waited, _ = told.read().split()
     except (OSError, ValueError):
         return 0.0, 0.0
@@ -24,19 +26,18 @@ def scheduled_seconds() -> tuple[float, float]:
 
 
 class Crowding:
-    """Final. Of the thread that looks."""
+    """Final. Of one thread, which `scheduled` speaks of."""
 
-    def __init__(self, use_threads: Callable[[int | None], None], scheduled: Callable[[], tuple[float, float]] = scheduled_seconds) -> None:
+    def __init__(self, changed: Callable[[bool], None], scheduled: Callable[[], tuple[float, float]] = scheduled_seconds) -> None:
         """
         Args:
-            use_threads: limits the threads that the calling one spreads its work over; None: no limit.
+            changed: called by look() where others have come, with True, or gone.
         """
-        self._use_threads, self._scheduled = use_threads, scheduled
+        self._changed, self._scheduled = changed, scheduled
         self._before: tuple[float, float] | None = None
         self.crowded = False
 
     def look(self) -> None:
-        """Take half of the cores where others want them too, and all again when they are gone."""
         ran, waited = self._scheduled()
         if self._before is None:
             self._before = ran, waited
@@ -48,4 +49,4 @@ class Crowding:
         crowded = late > could * (OTHERS_GO if self.crowded else OTHERS_COME)
         if crowded != self.crowded:
             self.crowded = crowded
-            self._use_threads(max(1, (os.cpu_count() or 1) // 2) if crowded else None)
+            self._changed(crowded)
