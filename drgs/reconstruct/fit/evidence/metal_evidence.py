@@ -61,6 +61,9 @@ TOGETHER = 3.0
 """Weight of neighbours being of one kind, against a difference of logarithms of 1."""
 UNSEEN = 1e-4
 """Weight of a place of which views say nothing: it is what its surroundings are."""
+EDGES = 90_000
+"""Of the meshes (60 000 faces) for which NEIGHBOURHOOD and TOGETHER were chosen. Finer ones average oftener and hold neighbours together the more, so that a place
+hears as much of the surface: else errors of shape that are a few pixels wide are called paint on a mesh that has faces enough for them."""
 DECISIVE = 0.3
 """Agreement of a place and its surroundings, -1..1, at which evidence is 0.76."""
 
@@ -160,18 +163,20 @@ def _sums_of(targets: list[ViewTarget], tracer: AbstractTracer, light_of: LightO
 def metal_evidence(sums: ViewSums, edges: MeshEdges, turned: bool, scale: float = 1.0) -> Float[Tensor, "vertex"]:
     """What the sums of a mesh with these edges say under the light times `scale`. `turned`: the light turns with the camera."""
     views, noise = sums.views, sums.floor
-    plain = _averaged(sums.error_of_paint(scale) + noise, views, edges)
-    metal = _averaged(sums.error_of_metal(scale) + noise, views, edges)
-    floor = _averaged(noise, views, edges)
+    finer = max(1.0, len(edges.vertices) / EDGES)
+    averaged = partial(_averaged, views=views, edges=edges, rings=round(NEIGHBOURHOOD * finer))
+    plain = averaged(sums.error_of_paint(scale) + noise)
+    metal = averaged(sums.error_of_metal(scale) + noise)
+    floor = averaged(noise)
     unexplained = 1 - floor / metal.clamp(min=1e-12)
     relative_error = ((torch.minimum(plain, metal) - floor).clamp(min=0) / 3).sqrt()
     trust = 1 / (1 + (relative_error / LOST) ** 4)
-    brightest = _averaged(sums.reflectance(scale).amax(-1) / scale * views, views, edges)
+    brightest = averaged(sums.reflectance(scale).amax(-1) / scale * views)
     dark = ((DARKEST[1] - brightest) / (DARKEST[1] - DARKEST[0])).clamp(0, 1)
     doubt = (DOUBT_TURNED if turned else DOUBT) - TOO_DARK * dark * dark * (3 - 2 * dark)
     better = torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) + doubt * trust * unexplained
     strength = torch.where(views >= FEWEST_VIEWS, trust * better.abs().clamp(max=STRONGEST), torch.zeros_like(better))
-    kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER)
+    kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER * finer)
     return torch.tanh(kind / DECISIVE)
 
 
@@ -198,13 +203,14 @@ def light_scale(sums: ViewSums) -> float:
     return scale if abs(math.log(scale)) > math.log(RIGHT_SCALE) else 1.0
 
 
-def _averaged(error: Tensor, views: Tensor, edges: MeshEdges) -> Tensor:
-    """(vertex,) error a view, averaged over the neighbourhood by the number of views."""
+def _averaged(error: Tensor, views: Tensor, edges: MeshEdges, rings: int) -> Tensor:
+    """(vertex,) error a view, averaged `rings` times over the neighbours by the number of views."""
     start, end = edges.vertices.unbind(1)
-    total, weight = error.clone(), views.clone()
-    for _ in range(NEIGHBOURHOOD):
+    total, weight = error, views
+    for _ in range(rings):
+        # An eighth each time, which loses nothing, or many rings would leave float32's range.
         total, weight = (
-            values + torch.zeros_like(values).index_add_(0, start, values[end]).index_add_(0, end, values[start])
+            (values + torch.zeros_like(values).index_add_(0, start, values[end]).index_add_(0, end, values[start])) / 8
             for values in (total, weight)
         )
-    return total / weight.clamp(min=1)
+    return total / weight.clamp(min=1e-30)  # counts, or nothing at all

@@ -7,7 +7,9 @@ import torch
 
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.color import srgb_from_linear
-from drgs.reconstruct.fit.evidence.metal_evidence import light_scale, metal_evidence, view_sums
+from drgs.maths.constants import F0
+from drgs.reconstruct.fit.evidence import metal_evidence as module
+from drgs.reconstruct.fit.evidence.metal_evidence import ViewSums, light_scale, metal_evidence, view_sums
 from drgs.reconstruct.fit.light.mesh_light import LightOf, at_corners, corner_weights
 from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
@@ -90,6 +92,29 @@ def test_a_sphere_half_of_metal_is_divided_where_it_is():
     assert int(away.sum()) > 200
     right = (evidence > 0) == (mesh.vertices[:, 2] > 0)
     assert float(right[away].float().mean()) > 0.95
+
+
+def sums_of_metal_with_a_spot_of_paint(mesh: TriangleMesh) -> ViewSums:
+    """Of twelve views, in each of which metal has another light in its mirror: all is metal but what lies within 0.16 of the pole."""
+    count, random = len(mesh.vertices), torch.Generator().manual_seed(0)
+    paint = ((mesh.vertices - torch.tensor([0.0, 0.0, 1.0])).norm(dim=1) < 0.16)[:, None]
+    e, b = torch.ones(count, 3), torch.zeros(count, 3)
+    a = torch.rand(12, 1, 3, generator=random).expand(12, count, 3)
+    p = [torch.where(paint, 0.3 * e + F0 * mirrored, 0.7 * mirrored) for mirrored in a]
+    terms = [(photo, e, mirrored, b) for photo, mirrored in zip(p, a, strict=True)]
+    products = (sum(term[k] * term[m] for term in terms) for k in range(4) for m in range(k, 4))
+    return ViewSums(*products, torch.full((count,), 12.0))
+
+
+@pytest.mark.parametrize("subdivisions", [4, 5, 6])
+def test_finer_meshes_decide_alike(monkeypatch: pytest.MonkeyPatch, subdivisions: int):
+    """A spot that its surroundings outvote on one mesh is outvoted on meshes of four and sixteen times its faces, too."""
+    mesh, coarse = sphere_mesh(subdivisions=subdivisions), sphere_mesh(subdivisions=4)
+    monkeypatch.setattr(module, "EDGES", len(mesh_edges(coarse.faces).vertices))
+    told = metal_evidence(sums_of_metal_with_a_spot_of_paint(mesh), mesh_edges(mesh.faces), False)
+    assert (
+        float(told[mesh.vertices[:, 2].argmax()]) > 0.9
+    )  # it was -0.9 on the finest one, and on the next, when each mesh asked three rings
 
 
 def test_what_no_view_shows_is_left_open():
