@@ -1,6 +1,6 @@
 """A capture with everything known, drawn by us: the mesh and cameras of a scene of the benchmark, of other matter or shape, under other light.
 
-    python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn] --light FILE.exr --new-light FILE.exr [--spp 64]
+    python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn|mug|plant] --light FILE.exr --new-light FILE.exr [--spp 64]
                                     [--turned] [--every 2] [--side 200]
 
 With --turned the light of the photographs stands still with the camera, as on a turntable; the file holds it as the first photograph's camera
@@ -28,6 +28,7 @@ from benchmarks.measures.swap_parts import swapped_picture
 from benchmarks.render._mitsuba import mitsuba_picture
 from benchmarks.scenes.bench_scene import Array, BenchScene, open_scene, read_true_mesh, training_cameras
 from benchmarks.scenes.embossed_urn import embossed_urn
+from benchmarks.scenes.hollow_things import mug, plant
 from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
@@ -73,6 +74,9 @@ def urn() -> TriangleMesh:
         torch.ones(count),
         torch.zeros(count),
     )
+
+
+SHAPES: dict[str, Callable[[], TriangleMesh]] = {"urn": urn, "mug": mug, "plant": plant}
 
 
 def of_matter(mesh: TriangleMesh, matter: Matter | None) -> TriangleMesh:
@@ -214,7 +218,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--matter", choices=tuple(MATTERS), default="as_it_is")
-    parser.add_argument("--shape", choices=("urn", "as_it_is"), default="as_it_is")
+    parser.add_argument("--shape", choices=(*SHAPES, "as_it_is"), default="as_it_is")
     parser.add_argument("--light", type=Path, required=True)
     parser.add_argument("--new-light", type=Path, required=True)
     parser.add_argument("--spp", type=int, default=64, help="rays a pixel of a photograph; test pictures have twice as many")
@@ -223,5 +227,5 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--side", type=int, help="of a picture [pixels]; as the scene's without")
     given = parser.parse_args(arguments)
     drawing = Drawing(given.spp, given.turned, given.every, given.side)
-    shape = urn() if given.shape == "urn" else None
+    shape = SHAPES[given.shape]() if given.shape in SHAPES else None
     draw_scene(given.scene, given.out, MATTERS[given.matter], given.light, given.new_light, drawing, shape)

@@ -4,7 +4,8 @@ Silhouettes do not show hollows: the hull of things on a plate is a hill. Everyt
 So a coarse radiance field (radiance_grid) is fitted first; it finds the floor between the things, but mistakes mirrors and gloss, which it
 sees below their surfaces. Each ray therefore says whether what it sees behind the hull's surface deserves belief: the place looks alike from all
 sides, more so than the hull's surface before it, and the ray is stopped there rather than on its way. Rays vote for the place of the hull that they
-pass through; where enough do, depth is the field's, else the hull's, and all depths are fused to one surface.
+pass through; where enough do, depth is the field's, else the hull's, and all depths are fused to one surface. Where something was found all is done once
+more behind that: between leaves the first look reaches the next leaf, where it is coarse.
 
 In: Views with masks, their hull. Out: a closed surface inside the hull, or that hull where it is believed everywhere.
 """
@@ -60,8 +61,10 @@ class HollowSettings:
     """Of the surface of chosen depths."""
     least_depth: float = 0.03
     """Of the radius, behind the hull: what lies nearer, later steps find."""
-    alike: float = 0.03
-    """Mean difference between views (display values) over brightness, at most."""
+    alike: float = 0.06
+    """Mean difference between views (display values) over brightness, at most: 0.03 refuses paint with a pattern, whose place a coarse field does not find exactly."""
+    rounds: int = 2
+    """At most."""
     better: float = 0.8
     """Of the hull's difference, at most."""
     stopped: float = 0.7
@@ -86,6 +89,29 @@ def find_hollows(
     should_stop: Callable[[], bool] | None = None,
 ) -> VisualHull | None:
     """The hull without its hollows; the very hull where none are believed; None when should_stop() said so."""
+    for number in range(settings.rounds):
+
+        def told(share: float, number: int = number) -> None:
+            if report is not None:
+                report((number + share) / settings.rounds)
+
+        found = _look_behind(views, hull, settings, seed + number, device, told, should_stop)
+        if found is None or found is hull:
+            return found
+        hull = found
+    return hull
+
+
+def _look_behind(
+    views: Views,
+    hull: VisualHull,
+    settings: HollowSettings,
+    seed: int,
+    device: torch.device,
+    report: Callable[[float], None],
+    should_stop: Callable[[], bool] | None,
+) -> VisualHull | None:
+    """find_hollows, once."""
     solid = statistics.median_low(int((mask > 127).sum()) for mask in views.coverage)
     targets = view_targets(views, min(1.0, (settings.pixels / max(solid, 1)) ** 0.5), device)
     low, high = (torch.from_numpy(np.asarray(x, np.float32)).to(device) for x in (hull.vertices_world.min(0), hull.vertices_world.max(0)))

@@ -1,18 +1,23 @@
 """A drawn capture: what the build reads is there, and the maps are of the matter that was asked for."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
 from benchmarks.reconstruct import draw_scene
 from benchmarks.scenes.embossed_urn import BEAD, embossed_urn
+from benchmarks.scenes.hollow_things import MUG_HEIGHT, WALL, mug, plant
 from drgs.evaluate.metrics import score_renders
 from drgs.exchange.exr import encode_environment
 from drgs.reconstruct.capture.load_views import load_cameras, load_views
+from drgs.render.intersect.trace_rays import build_tracer, trace_rays
+from drgs.scene.mesh import TriangleMesh
 from tests.render.closed_form_scenes import sphere_mesh
 
 
@@ -101,6 +106,23 @@ def test_the_urn_is_closed_looks_outward_and_carries_its_relief():
     middle = urn.vertices[np.abs(urn.vertices[:, 2] + 0.15) < 0.005]  # a row of beads
     radii = np.linalg.norm(middle[:, :2], axis=1)
     assert 0.5 * BEAD < radii.max() - radii.min() < 1.5 * BEAD
+
+
+@pytest.mark.parametrize("shape", [mug, plant])
+def test_hollow_things_are_closed_look_outward_and_are_mostly_empty(shape: Callable[[int], TriangleMesh]):
+    mesh = shape(130)
+    solid = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy())
+    assert solid.is_watertight and np.linalg.norm(solid.vertices, axis=1).max() < 1.2
+    assert 0.01 < solid.volume < 0.4 * solid.convex_hull.volume
+    assert float(mesh.albedo.min()) > 0 and float(mesh.albedo.max()) < 1
+
+
+def test_one_looks_down_to_the_floor_of_the_mug():
+    mesh = mug(90)
+    tracer = build_tracer(mesh)
+    below = trace_rays(torch.tensor([[0.1, 0.05, 1.0]]), torch.tensor([[0.0, 0.0, -1.0]]), tracer)
+    assert 1 - float(below.distance) == pytest.approx(WALL - MUG_HEIGHT / 2, abs=0.01)
+    assert float(mesh.metallic[mesh.vertices[:, 2] > 0.51].min()) == 1 and float(mesh.metallic[mesh.vertices[:, 2] < 0.49].max()) == 0
 
 
 def test_a_shape_takes_the_place_of_the_scenes_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -9,6 +9,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from drgs.reconstruct.capture import find_hollows as module
 from drgs.reconstruct.capture.find_hollows import CHOSEN_MESH, FIELD_MESH, HollowSettings, find_hollows
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
@@ -27,6 +28,7 @@ SETTINGS = HollowSettings(
     pixels=3000,
     field_mesh=replace(FIELD_MESH, resolution=64),
     chosen_mesh=replace(CHOSEN_MESH, resolution=80),
+    rounds=1,
 )
 FEWER = replace(SETTINGS, grid=replace(SETTINGS.grid, levels=((20, 40), (32, 50)), rays_a_step=384), pixels=1500)
 """Enough for a mirror: the field lies far below its surface all the same, and would empty all of it were it believed."""
@@ -137,6 +139,30 @@ def test_a_search_that_is_stopped_finds_nothing(painted: Views, drum: VisualHull
 @pytest.mark.slow
 def test_photographs_in_which_nothing_is_solid_keep_the_hull(painted: Views, drum: VisualHull) -> None:
     assert find_hollows(replace(painted, coverage=tuple(mask // 2 for mask in painted.coverage)), drum, SETTINGS, 0, CPU) is drum
+
+
+@pytest.mark.parametrize(("founds", "looks", "last"), [("ab", 2, "b"), ("aa", 2, "a"), ("0", 1, "0"), ("abc", 3, "c"), ("aN", 2, None)])
+def test_behind_what_was_found_is_looked_again(
+    monkeypatch: pytest.MonkeyPatch, painted: Views, founds: str, looks: int, last: str | None
+) -> None:
+    hulls = {name: VisualHull(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64), 1.0) for name in "0abc"}
+    asked: list[tuple[VisualHull, int]] = []
+    told: list[float] = []
+
+    def look(
+        views: Views, hull: VisualHull, settings: HollowSettings, seed: int, device: torch.device, report: Callable, _: None
+    ) -> VisualHull | None:
+        asked.append((hull, seed))
+        report(0.5)
+        return hulls.get(founds[len(asked) - 1])
+
+    monkeypatch.setattr(module, "_look_behind", look)
+    rounds = max(2, len(founds))
+    found = find_hollows(painted, hulls["0"], replace(SETTINGS, rounds=rounds), 7, CPU, told.append)
+    assert found is (None if last is None else hulls[last])
+    assert [hull is hulls[name] for hull, name in zip((hull for hull, _ in asked), "0" + founds, strict=False)] == looks * [True]
+    assert [seed for _, seed in asked] == list(range(7, 7 + looks))
+    assert told == [(k + 0.5) / rounds for k in range(looks)]
 
 
 def constant_grid(density: float, inside: float = 1.0) -> RadianceGrid:
