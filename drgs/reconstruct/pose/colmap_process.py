@@ -4,6 +4,7 @@ It is stopped by ending the process: its database survives that, and what it had
 """
 
 import json
+import os
 import queue
 import signal
 import subprocess
@@ -21,6 +22,9 @@ LOG_TAIL = 300
 """Characters of the log in a sentence."""
 CRASHES = {getattr(signal, name) for name in ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGFPE") if hasattr(signal, name)}
 """By which a library ends for reasons of its own. Seen once: a SIGBUS while it looked for features, with memory and disk free."""
+ALONE = {"OMP_NUM_THREADS": "1"}
+"""Pictures and pairs are shared among threads of COLMAP's own. Its index of a picture's features asks for OpenMP's besides, and came out otherwise now and then on
+a busy machine (once in twenty tries): fewer matches, and other poses for the same seed."""
 PROGRAM = Path(__file__).with_name("run_colmap.py")
 
 
@@ -56,6 +60,7 @@ def _ended(job: Path, log: Path, told: Callable[[str, int, int], None], should_s
             stdout=subprocess.PIPE,
             stderr=output,
             text=True,
+            env=os.environ | ALONE,
             start_new_session=True,  # Ctrl-C is for us, who end it in order
         )
     assert process.stdout is not None

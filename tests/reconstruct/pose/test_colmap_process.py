@@ -29,6 +29,14 @@ def test_its_lines_are_passed_on_and_others_are_no_matter(program: Path, tmp_pat
     assert told == [("features", 1, 3)]
 
 
+def test_its_threads_start_none_of_their_own(program: Path, tmp_path: Path):
+    """Else what is found depends on what else the machine does."""
+    program.write_text("""import os; print('{"step": "features", "done": %s, "total": 1}' % os.environ["OMP_NUM_THREADS"])""")
+    told: list[tuple[str, int, int]] = []
+    colmap_process(tmp_path / "job.json", lambda *report: told.append(report), lambda: False)
+    assert told == [("features", 1, 1)]
+
+
 def test_one_that_does_not_listen_is_killed(program: Path, tmp_path: Path):
     program.write_text("import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('{}', flush=True); time.sleep(600)")
     started = time.monotonic()
