@@ -153,7 +153,7 @@ def build_stages(
 
     On `resume`, finished stages are skipped; only the capture is read again.
     """
-    _check(settings)
+    _check(settings, out)
     preset = PRESETS[settings.preset]
     device = device_from_name(settings.device)
     seconds: dict[str, float] = {}
@@ -191,7 +191,7 @@ def build_stages(
             # Hollows are found by paint that looks alike from all sides, which it does not under such light.
             views, place = with_light_of_camera(views), place.of(light="camera")
         else:
-            points = hollows_stage(place, masked, points, preset.points, preset.hollows, settings.seed, device, settings.box, preset.hull)
+            points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
     yield "read", None
 
     with timed("fit"):
@@ -409,7 +409,12 @@ def _detailed(built: _Built, fit: SurfaceFit) -> tuple[TriangleMesh, Certainty]:
     return replace(mesh, albedo=solved.albedo, detail=solved.detail), certainty
 
 
-def _check(settings: BuildSettings) -> None:
+def _check(settings: BuildSettings, out: Path) -> None:
+    checkpoints = Path(f"{out}.build")
+    if checkpoints.exists() and not checkpoints.is_dir():
+        raise ValueError(
+            f"{checkpoints}: is a file; expected a folder for the checkpoints of this build, or nothing: move it away, or choose another OUT"
+        )
     for name in (settings.preset, settings.materials or settings.preset):
         if name not in PRESETS:
             raise ValueError(f"preset {name!r} is unknown; expected one of {', '.join(PRESETS)}")

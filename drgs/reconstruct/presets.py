@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from drgs.reconstruct.capture.find_hollows import HollowSettings
+from drgs.reconstruct.capture.open_vessels import VesselSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
@@ -45,6 +46,8 @@ class Preset:
     """Of materials_on surfels. Bound to the mesh, that one has as many faces at most as surfels are allowed (fit.densify.budget)."""
     hull: VisualHullSettings = field(default_factory=VisualHullSettings)
     """Of the masks, on whose surface points begin."""
+    vessels: VesselSettings = field(default_factory=VesselSettings)
+    """Whose insides that surface is to have."""
 
 
 PRESETS = {

@@ -16,10 +16,11 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox
 from drgs.reconstruct.capture.cut_to_box import chosen_views
-from drgs.reconstruct.capture.find_hollows import HollowSettings, find_hollows
+from drgs.reconstruct.capture.find_hollows import find_hollows
 from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.on_ground.stands_on_ground import look_again, stands_on_ground
+from drgs.reconstruct.capture.open_vessels import open_vessels
 from drgs.reconstruct.capture.visual_hull import VisualHull, VisualHullSettings
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
@@ -36,6 +37,7 @@ from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.reconstruct.fit.surfels.render_stage_two import render_stage_two
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, drop_unseen, mesh_from_gaussians
+from drgs.reconstruct.presets import Preset
 from drgs.reconstruct.progress import BuildStopped
 from drgs.reconstruct.report_progress import BuildReporter, encode_preview
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
@@ -183,29 +185,26 @@ def points_of_found_masks(
 
 
 def hollows_stage(
-    place: Workplace,
-    views: Views,
-    points: InitialPoints,
-    count: int,
-    settings: HollowSettings,
-    seed: int,
-    device: torch.device,
-    box: BuildBox | None,
-    hull_settings: VisualHullSettings,
+    place: Workplace, views: Views, points: InitialPoints, preset: Preset, seed: int, device: torch.device, box: BuildBox | None
 ) -> InitialPoints:
-    """find_hollows: the points on the hull, moved to what the photographs show behind it. The bounds stay the hull's."""
-    if points.hull_vertices is None or points.hull_faces is None or points.normals_world is None or not settings.grid.levels:
+    """open_vessels and find_hollows: the points on the hull, moved to what the photographs show behind it. The bounds stay the hull's."""
+    looks_for_any = preset.vessels.walls or preset.hollows.grid.levels
+    if points.hull_vertices is None or points.hull_faces is None or points.normals_world is None or not looks_for_any:
         return points
-    hull = VisualHull(points.hull_vertices.numpy(), points.hull_faces.numpy(), 2 * points.bounds_radius / settings.chosen_mesh.resolution)
+    cell = 2 * points.bounds_radius / preset.hollows.chosen_mesh.resolution
+    hull = VisualHull(points.hull_vertices.numpy(), points.hull_faces.numpy(), cell)
 
     def report(share: float) -> None:
         place.reporter.report("read", share, "looking for hollows")
 
     def made() -> dict[str, Tensor]:
-        surface = find_hollows(views, hull, settings, seed, device, report, place.should_stop)
+        report(0.0)
+        opened = open_vessels(views, hull, preset.vessels, device)
+        looks_behind = bool(preset.hollows.grid.levels)
+        surface = find_hollows(views, opened, preset.hollows, seed, device, report, place.should_stop) if looks_behind else opened
         if surface is None:
             raise BuildStopped
-        found = points if surface is hull else initial_points(views, count, seed, surface, box, hull_settings)
+        found = points if surface is hull else initial_points(views, preset.points, seed, surface, box, preset.hull)
         assert found.normals_world is not None  # those of a surface
         return {"points": found.points_world, "normals": found.normals_world, "colors": found.colors_srgb}
 

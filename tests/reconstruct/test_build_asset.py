@@ -17,6 +17,7 @@ from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photo
 from drgs.reconstruct import report_progress
 from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, Progress, build_asset, calibrations, kept_photographs
 from drgs.reconstruct.capture.find_hollows import HollowSettings
+from drgs.reconstruct.capture.open_vessels import VesselSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
@@ -61,9 +62,15 @@ TINY = Preset(
     surfel_materials=MaterialSettings(iterations=6, points_a_step=64, samples=SampleCounts(4, 2, 2)),
     hull=VisualHullSettings(coarse_cells=32, cell_pixels=1.0),
 )
-WITHOUT_HOLLOWS = replace(TINY, image_side=72, hollows=HollowSettings(RadianceGridSettings(levels=())), hull=VisualHullSettings())
-"""For tests of other files that ask nothing about hollows, as the preset `draft` does; pictures as they are, for some of them compare those."""
-ON_SURFELS = replace(TINY, hollows=WITHOUT_HOLLOWS.hollows, materials_on="surfels")
+WITHOUT_HOLLOWS = replace(
+    TINY,
+    image_side=72,
+    hollows=HollowSettings(RadianceGridSettings(levels=())),
+    vessels=VesselSettings(walls=()),
+    hull=VisualHullSettings(),
+)
+"""For tests of other files that ask nothing about hollows; pictures as they are, for some of them compare those."""
+ON_SURFELS = replace(TINY, hollows=WITHOUT_HOLLOWS.hollows, vessels=WITHOUT_HOLLOWS.vessels, materials_on="surfels")
 SETTINGS = BuildSettings(preset="tiny", device="cpu")
 
 
@@ -319,6 +326,13 @@ def test_the_checkpoint_of_another_build_is_refused(capture: Path, stopped: Path
     with pytest.raises(ValueError, match=r"is of another build .* delete its folder or choose another OUT"):
         build_asset(capture, out, replace(SETTINGS, resume=True, **change))
     assert not out.exists()
+
+
+def test_a_file_where_checkpoints_belong_is_refused_before_anything_is_read(tmp_path: Path):
+    (tmp_path / "a.build").write_text("mine")
+    with pytest.raises(ValueError, match=r"a\.build: is a file; expected a folder for the checkpoints .* choose another OUT"):
+        build_asset(tmp_path / "no_capture", tmp_path / "a", SETTINGS)
+    assert (tmp_path / "a.build").read_text() == "mine"
 
 
 @pytest.mark.slow

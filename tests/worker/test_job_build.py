@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from drgs.reconstruct.capture.find_hollows import HollowSettings
+from drgs.reconstruct.capture.open_vessels import VesselSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
@@ -48,7 +49,7 @@ TINY = Preset(
     mesh_surfels=MeshFitSettings(iterations=3),
     hull=VisualHullSettings(coarse_cells=32, cell_pixels=1.0),
 )
-BOUND = replace(TINY, hollows=HollowSettings(RadianceGridSettings(levels=())))
+BOUND = replace(TINY, hollows=HollowSettings(RadianceGridSettings(levels=())), vessels=VesselSettings(walls=()))
 """Hollows are looked for before anything is bound to a mesh: the other build says whether what is found of them is kept."""
 MORE = replace(TINY, materials=MeshMaterialSettings(iterations=8, points_a_step=64, samples=SampleCounts(4, 2, 2)))
 

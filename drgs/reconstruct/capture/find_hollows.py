@@ -10,7 +10,6 @@ more behind that: between leaves the first look reaches the next leaf, where it 
 In: Views with masks, their hull. Out: a closed surface inside the hull, or that hull where it is believed everywhere.
 """
 
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -18,30 +17,29 @@ import igl
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from drgs.reconstruct.capture.hull_rays import (
+    SOLID,
+    bounds_of,
+    large_patches,
+    object_targets,
+    rays_into,
+    surface_of,
+    surface_of_hull,
+    unlikeness,
+)
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
 from drgs.reconstruct.capture.visual_hull import VisualHull
-from drgs.reconstruct.fit.evidence.carve_hollows import view_differences
-from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
+from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
-from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, clean_mesh, extract_mesh
+from drgs.reconstruct.geometry.extract_mesh import DepthMap, MeshSettings, extract_mesh
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
-from drgs.render.intersect.trace_rays import build_tracer, trace_rays
+from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
-from drgs.scene.camera import pixel_rays_world
-from drgs.scene.mesh import TriangleMesh, vertex_normals
 from drgs.scene.views import Views
 from drgs.warp_torch import by_pool
 
-SOLID = 0.99
-"""Least coverage of a pixel whose ray is fitted."""
-FEWEST_VIEWS = 3
-"""Of a place whose looks are compared."""
-HULL_MESH = MeshSettings(face_limit=40_000, keep_component_fraction=0.0)
-"""Every part of the hull: what its rays did not meet would count as seen through."""
 FIELD_MESH = MeshSettings(resolution=112, smoothing_passes=10, keep_component_fraction=0.02)
 """Without the field's clots of fog; where it has nothing the hull is believed."""
 CHOSEN_MESH = MeshSettings(resolution=160, keep_component_fraction=0.002)
@@ -112,11 +110,10 @@ def _look_behind(
     should_stop: Callable[[], bool] | None,
 ) -> VisualHull | None:
     """find_hollows, once."""
-    solid = statistics.median_low(int((mask > 127).sum()) for mask in views.coverage)
-    targets = view_targets(views, min(1.0, (settings.pixels / max(solid, 1)) ** 0.5), device)
-    low, high = (torch.from_numpy(np.asarray(x, np.float32)).to(device) for x in (hull.vertices_world.min(0), hull.vertices_world.max(0)))
-    radius, center = float((high - low).max()) / 2, (low + high) / 2
-    outer = _surface(*clean_mesh(*_tensors(hull, device), HULL_MESH, 1e-5 * radius))
+    targets = object_targets(views, settings.pixels, device)
+    low, high, radius = bounds_of(hull, device)
+    center = (low + high) / 2
+    outer = surface_of_hull(hull, device)
     rays, colors = _solid_rays(targets, outer)
     if len(colors) == 0:
         return hull
@@ -126,11 +123,11 @@ def _look_behind(
     seen = by_pool(lambda k, _: _Seen.of(targets[k], outer, grid), range(len(targets) + 1), device)
     deep = [DepthMap(view.target.camera, view.deep, view.target.mask) for view in seen]
     try:
-        inner = _surface(*extract_mesh(deep, center, 1.03 * radius, settings.field_mesh))
+        inner = surface_of(*extract_mesh(deep, center, 1.03 * radius, settings.field_mesh))
     except ValueError:  # fog everywhere: nothing that photographs agree about
         return hull
     believed = _believed(seen, targets, outer, inner, radius, settings)
-    empty = _large_patches(believed > settings.votes, outer.mesh.faces, settings.least_patch)
+    empty = large_patches(believed > settings.votes, outer.mesh.faces, settings.least_patch)
     if not bool(empty.any()):
         return hull
     maps = [view.chosen(inner, empty) for view in seen]
@@ -142,22 +139,11 @@ def _look_behind(
     return VisualHull(vertices.cpu().numpy(), faces.cpu().numpy().astype(np.int64), cell)
 
 
-def _tensors(hull: VisualHull, device: torch.device) -> tuple[Tensor, Tensor]:
-    return torch.from_numpy(hull.vertices_world).to(device), torch.from_numpy(hull.faces.astype(np.int32)).to(device)
-
-
-def _surface(vertices: Tensor, faces: Tensor) -> AbstractTracer:
-    """What rays meet; its materials are never looked at."""
-    plain = torch.zeros(len(vertices), device=vertices.device)
-    vertices = vertices.float().contiguous()
-    return build_tracer(TriangleMesh(vertices, faces, vertex_normals(vertices, faces), plain[:, None].repeat(1, 3), plain, plain))
-
-
 def _solid_rays(targets: list[ViewTarget], outer: AbstractTracer) -> tuple[Rays, Float[Tensor, "ray 3"]]:
     """Through all pixels that masks fill, and their SRGB."""
     parts, colors = [], []
     for target in targets:
-        rays, pixels, _ = _rays(target, outer, (target.mask.flatten() > SOLID).nonzero().squeeze(1))
+        rays, pixels, _ = rays_into(target, outer, (target.mask.flatten() > SOLID).nonzero().squeeze(1))
         parts.append(rays)
         colors.append(target.saturation.reshape(-1, 3)[pixels])
     together = (torch.cat([getattr(part, name) for part in parts]) for name in ("origin", "direction", "near", "far"))
@@ -172,18 +158,6 @@ def _inside_of(surface: AbstractTracer) -> Callable[[Float[Tensor, "place 3"]], 
         return torch.from_numpy(winding > 0.5).to(places.device)
 
     return is_inside
-
-
-def _rays(target: ViewTarget, outer: AbstractTracer, pixels: Int[Tensor, "pixel"]) -> tuple[Rays, Int[Tensor, "ray"], Int[Tensor, "ray"]]:
-    """Those through `pixels` (flat) that meet the hull, with their pixels and the hull's faces that they enter by."""
-    origin, directions = pixel_rays_world(target.camera)
-    direction = torch.nn.functional.normalize(directions.reshape(-1, 3)[pixels], dim=-1).contiguous()
-    start = origin.expand_as(direction).contiguous()
-    first = trace_rays(start, direction, outer)
-    beyond = 2 * float((outer.mesh.vertices - origin).norm(dim=1).max())
-    last = trace_rays(start + beyond * direction, -direction, outer)
-    met = first.hit & last.hit
-    return Rays(start, direction, first.distance, beyond - last.distance)[met], pixels[met], first.face[met].long()
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +179,7 @@ class _Seen:
 
     @classmethod
     def of(cls, target: ViewTarget, outer: AbstractTracer, grid: RadianceGrid) -> "_Seen":
-        rays, pixels, face = _rays(target, outer, (target.mask.flatten() > 0.5).nonzero().squeeze(1))
+        rays, pixels, face = rays_into(target, outer, (target.mask.flatten() > 0.5).nonzero().squeeze(1))
         corners = outer.mesh.faces[face].long()
         axial = rays.direction @ target.camera.camera_from_world[2, :3]
         parts = [grid.depths(rays[part]) for part in torch.arange(len(pixels), device=pixels.device).split(4096)]
@@ -237,7 +211,7 @@ def _believed(
     seen: list[_Seen], targets: list[ViewTarget], outer: AbstractTracer, inner: AbstractTracer, radius: float, settings: HollowSettings
 ) -> Float[Tensor, "vertex"]:
     """Of the hull's vertices, the share of rays through them that believe what they see behind, averaged around."""
-    outside, behind = (_unlikeness(surface, targets, radius, settings.cost_rings) for surface in (outer, inner))
+    outside, behind = (unlikeness(surface, targets, radius, settings.cost_rings) for surface in (outer, inner))
     votes = torch.zeros(len(outer.mesh.vertices), 2, device=outside.device)
     for view in seen:
         distance, face, hit = view.behind(inner)
@@ -252,25 +226,3 @@ def _believed(
     around = averaging_matrix(mesh_edges(outer.mesh.faces), len(votes))
     believing, counted = averaged(around, votes, settings.vote_rings).unbind(1)
     return believing / counted.clamp(min=1e-6)
-
-
-def _large_patches(chosen: Bool[Tensor, "vertex"], faces: Int[Tensor, "face 3"], least: float) -> Bool[Tensor, "vertex"]:
-    """Of the chosen vertices, those that hang together with at least the share `least` of all."""
-    marks = chosen.cpu().numpy()
-    start, end = mesh_edges(faces).vertices.cpu().numpy().T
-    joined = marks[start] & marks[end]
-    graph = coo_matrix((np.ones(joined.sum()), (start[joined], end[joined])), shape=(len(marks),) * 2)
-    _, patch = connected_components(graph, directed=False)
-    large = np.bincount(patch) >= least * len(marks)
-    return torch.from_numpy(marks & large[patch]).to(chosen.device)
-
-
-def _unlikeness(surface: AbstractTracer, targets: list[ViewTarget], radius: float, rings: int) -> Float[Tensor, "vertex"]:
-    """Mean difference (display values) between the views that see a vertex, averaged around; inf where hardly any does."""
-    mesh = surface.mesh
-    every = torch.arange(len(mesh.vertices), device=mesh.vertices.device)
-    difference, views = view_differences(surface, targets, every, -mesh.normals, 0.0, radius)
-    known = torch.where(views >= FEWEST_VIEWS, views, torch.zeros_like(views))
-    sums = torch.stack([difference.nan_to_num(0.0) * known, known], -1)
-    total, weight = averaged(averaging_matrix(mesh_edges(mesh.faces), len(every)), sums, rings).unbind(1)
-    return torch.where(weight > 0.1 * FEWEST_VIEWS, total / weight.clamp(min=1e-6), torch.full_like(total, torch.inf))

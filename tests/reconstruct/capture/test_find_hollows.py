@@ -64,20 +64,21 @@ def mirror(place: Tensor, normal: Tensor, direction: Tensor) -> Tensor:
     return 0.5 + 0.35 * torch.sin(7 * reflected + torch.tensor([0.0, 1.0, 2.0]))
 
 
-def photographed(object_: AbstractTracer, shade: Callable[[Tensor, Tensor, Tensor], Tensor], count: int = 48) -> Views:
+def photographed(object_: AbstractTracer, shade: Callable[[Tensor, Tensor, Tensor], Tensor], count: int = 48, side: int = SIDE) -> Views:
     cameras, images, masks = [], [], []
     for position in camera_positions(count):
         position = position * np.array([1, 1, 0.8])
         pose = torch.from_numpy(look_at(position)).float()
-        intrinsics = torch.tensor([[100.0, 0, SIDE / 2], [0, 100.0, SIDE / 2], [0, 0, 1]])
-        camera = Camera(pose, intrinsics, SIDE, SIDE, str(len(cameras)))
+        focal = 100 * side / SIDE
+        intrinsics = torch.tensor([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]])
+        camera = Camera(pose, intrinsics, side, side, str(len(cameras)))
         origin, directions = pixel_rays_world(camera)
         direction = torch.nn.functional.normalize(directions.reshape(-1, 3), dim=-1).contiguous()
         hits = trace_rays(origin.expand_as(direction).contiguous(), direction, object_)
         place = origin + hits.distance.nan_to_num(posinf=0.0)[:, None] * direction
         color = shade(place, object_.face_normals[hits.face.long().clamp(min=0)], direction)
-        images.append((255 * color.clamp(0, 1)).to(torch.uint8).reshape(SIDE, SIDE, 3))
-        masks.append((255 * hits.hit).to(torch.uint8).reshape(SIDE, SIDE))
+        images.append((255 * color.clamp(0, 1)).to(torch.uint8).reshape(side, side, 3))
+        masks.append((255 * hits.hit).to(torch.uint8).reshape(side, side))
         cameras.append(camera)
     return Views(tuple(cameras), tuple(images), tuple(masks), None, None, True, "nerf-synthetic")
 

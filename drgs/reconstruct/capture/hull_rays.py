@@ -1,0 +1,100 @@
+"""Photographs of an object and a first surface around it: rays that enter it, and how far views agree about what is on it.
+
+In: Views with masks, their hull. Out: reduced photographs, rays, what they meet, patches of the surface.
+"""
+
+import statistics
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from drgs.reconstruct.capture.radiance_grid import Rays
+from drgs.reconstruct.capture.visual_hull import VisualHull
+from drgs.reconstruct.fit.evidence.carve_hollows import view_differences
+from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
+from drgs.reconstruct.geometry.extract_mesh import MeshSettings, clean_mesh
+from drgs.reconstruct.geometry.mesh_edges import mesh_edges
+from drgs.render.intersect.trace_rays import build_tracer, trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.camera import pixel_rays_world
+from drgs.scene.mesh import TriangleMesh, vertex_normals
+from drgs.scene.views import Views
+
+SOLID = 0.99
+"""Least coverage of a pixel whose ray is fitted."""
+FEWEST_VIEWS = 3
+"""Of a place whose looks are compared."""
+HULL_MESH = MeshSettings(face_limit=40_000, keep_component_fraction=0.0)
+"""Every part of the hull: what its rays did not meet would count as seen through."""
+
+
+def object_targets(views: Views, pixels: int, device: torch.device) -> list[ViewTarget]:
+    """The photographs, reduced until the object fills so many pixels of the median one."""
+    solid = statistics.median_low(int((mask > 127).sum()) for mask in views.coverage)
+    return view_targets(views, min(1.0, (pixels / max(solid, 1)) ** 0.5), device)
+
+
+def bounds_of(hull: VisualHull, device: torch.device) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], float]:
+    """Its box, low and high, and half of the longest side."""
+    low, high = (torch.from_numpy(np.asarray(x, np.float32)).to(device) for x in (hull.vertices_world.min(0), hull.vertices_world.max(0)))
+    return low, high, float((high - low).max()) / 2
+
+
+def surface_of_hull(hull: VisualHull, device: torch.device) -> AbstractTracer:
+    """What rays into the hull meet, of fewer faces."""
+    vertices = torch.from_numpy(hull.vertices_world).to(device)
+    return surface_of(
+        *clean_mesh(vertices, torch.from_numpy(hull.faces.astype(np.int32)).to(device), HULL_MESH, 1e-5 * bounds_of(hull, device)[2])
+    )
+
+
+def surface_of(vertices: Tensor, faces: Tensor) -> AbstractTracer:
+    """What rays meet; its materials are never looked at."""
+    plain = torch.zeros(len(vertices), device=vertices.device)
+    vertices = vertices.float().contiguous()
+    return build_tracer(TriangleMesh(vertices, faces, vertex_normals(vertices, faces), plain[:, None].repeat(1, 3), plain, plain))
+
+
+def rays_into(
+    target: ViewTarget, outer: AbstractTracer, pixels: Int[Tensor, "pixel"]
+) -> tuple[Rays, Int[Tensor, "ray"], Int[Tensor, "ray"]]:
+    """Those through `pixels` (flat) that meet the hull, with their pixels and the hull's faces that they enter by."""
+    origin, directions = pixel_rays_world(target.camera)
+    direction = torch.nn.functional.normalize(directions.reshape(-1, 3)[pixels], dim=-1).contiguous()
+    start = origin.expand_as(direction).contiguous()
+    first = trace_rays(start, direction, outer)
+    beyond = 2 * float((outer.mesh.vertices - origin).norm(dim=1).max())
+    last = trace_rays(start + beyond * direction, -direction, outer)
+    met = first.hit & last.hit
+    return Rays(start, direction, first.distance, beyond - last.distance)[met], pixels[met], first.face[met].long()
+
+
+def patches(chosen: Bool[Tensor, "vertex"], faces: Int[Tensor, "face 3"]) -> Int[Tensor, "vertex"]:
+    """A number for each vertex: equal where chosen vertices hang together, one of its own for every other."""
+    marks = chosen.cpu().numpy()
+    start, end = mesh_edges(faces).vertices.cpu().numpy().T
+    joined = marks[start] & marks[end]
+    graph = coo_matrix((np.ones(joined.sum()), (start[joined], end[joined])), shape=(len(marks),) * 2)
+    return torch.from_numpy(connected_components(graph, directed=False)[1]).long().to(chosen.device)
+
+
+def large_patches(chosen: Bool[Tensor, "vertex"], faces: Int[Tensor, "face 3"], least: float) -> Bool[Tensor, "vertex"]:
+    """Of the chosen vertices, those that hang together with at least the share `least` of all."""
+    patch = patches(chosen, faces)
+    return chosen & (torch.bincount(patch) >= least * len(chosen))[patch]
+
+
+def unlikeness(surface: AbstractTracer, targets: list[ViewTarget], radius: float, rings: int) -> Float[Tensor, "vertex"]:
+    """Mean difference (display values) between the views that see a vertex, averaged around; inf where hardly any does."""
+    mesh = surface.mesh
+    every = torch.arange(len(mesh.vertices), device=mesh.vertices.device)
+    difference, views = view_differences(surface, targets, every, -mesh.normals, 0.0, radius)
+    known = torch.where(views >= FEWEST_VIEWS, views, torch.zeros_like(views))
+    sums = torch.stack([difference.nan_to_num(0.0) * known, known], -1)
+    total, weight = averaged(averaging_matrix(mesh_edges(mesh.faces), len(every)), sums, rings).unbind(1)
+    return torch.where(weight > 0.1 * FEWEST_VIEWS, total / weight.clamp(min=1e-6), torch.full_like(total, torch.inf))
