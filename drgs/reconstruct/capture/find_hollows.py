@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.reconstruct.capture.hull_rays import (
-    SOLID,
+    SolidRays,
     bounds_of,
     large_patches,
     object_targets,
@@ -114,10 +114,10 @@ def _look_behind(
     low, high, radius = bounds_of(hull, device)
     center = (low + high) / 2
     outer = surface_of_hull(hull, device)
-    rays, colors = _solid_rays(targets, outer)
-    if len(colors) == 0:
+    solid = SolidRays.of(targets, outer)
+    if len(solid) == 0:
         return hull
-    grid = fit_radiance_grid(rays, colors, (low, high), _inside_of(outer), settings.grid, seed, report, should_stop)
+    grid = fit_radiance_grid(solid.rays, solid.colors, (low, high), _inside_of(outer), settings.grid, seed, report, should_stop)
     if grid is None:
         return None
     seen = by_pool(lambda k, _: _Seen.of(targets[k], outer, grid), range(len(targets) + 1), device)
@@ -137,17 +137,6 @@ def _look_behind(
         return hull
     cell = 2 * radius / settings.chosen_mesh.resolution
     return VisualHull(vertices.cpu().numpy(), faces.cpu().numpy().astype(np.int64), cell)
-
-
-def _solid_rays(targets: list[ViewTarget], outer: AbstractTracer) -> tuple[Rays, Float[Tensor, "ray 3"]]:
-    """Through all pixels that masks fill, and their SRGB."""
-    parts, colors = [], []
-    for target in targets:
-        rays, pixels, _ = rays_into(target, outer, (target.mask.flatten() > SOLID).nonzero().squeeze(1))
-        parts.append(rays)
-        colors.append(target.saturation.reshape(-1, 3)[pixels])
-    together = (torch.cat([getattr(part, name) for part in parts]) for name in ("origin", "direction", "near", "far"))
-    return Rays(*together), torch.cat(colors)
 
 
 def _inside_of(surface: AbstractTracer) -> Callable[[Float[Tensor, "place 3"]], Bool[Tensor, "place"]]:

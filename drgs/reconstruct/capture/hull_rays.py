@@ -4,6 +4,7 @@ In: Views with masks, their hull. Out: reduced photographs, rays, what they meet
 """
 
 import statistics
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -72,6 +73,34 @@ def rays_into(
     last = trace_rays(start + beyond * direction, -direction, outer)
     met = first.hit & last.hit
     return Rays(start, direction, first.distance, beyond - last.distance)[met], pixels[met], first.face[met].long()
+
+
+@dataclass(frozen=True, eq=False)
+class SolidRays:
+    """Of all photographs: through the pixels that masks fill, where they meet the hull."""
+
+    rays: Rays
+    colors: Float[Tensor, "ray 3"]
+    """SRGB."""
+    view: Int[Tensor, "ray"]
+    face: Int[Tensor, "ray"]
+    """Of the hull, that the ray enters by."""
+
+    @classmethod
+    def of(cls, targets: list[ViewTarget], outer: AbstractTracer) -> "SolidRays":
+        parts = []
+        for number, target in enumerate(targets):
+            rays, pixels, face = rays_into(target, outer, (target.mask.flatten() > SOLID).nonzero().squeeze(1))
+            colors = target.saturation.reshape(-1, 3)[pixels]
+            parts.append((rays.origin, rays.direction, rays.near, rays.far, colors, torch.full_like(pixels, number), face))
+        origin, direction, near, far, colors, view, face = (torch.cat(part) for part in zip(*parts, strict=True))
+        return cls(Rays(origin, direction, near, far), colors, view, face)
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def __getitem__(self, chosen: Bool[Tensor, "ray"]) -> "SolidRays":
+        return SolidRays(self.rays[chosen], self.colors[chosen], self.view[chosen], self.face[chosen])
 
 
 def patches(chosen: Bool[Tensor, "vertex"], faces: Int[Tensor, "face 3"]) -> Int[Tensor, "vertex"]:

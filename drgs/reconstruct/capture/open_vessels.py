@@ -25,12 +25,11 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from drgs.reconstruct.capture.hull_rays import (
-    SOLID,
+    SolidRays,
     bounds_of,
     large_patches,
     object_targets,
     patches,
-    rays_into,
     surface_of,
     surface_of_hull,
     unlikeness,
@@ -44,7 +43,7 @@ from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.views import Views
 
-NARROW = 3.0
+EXACT_NODES = 3.0
 """Nodes from the hull up to which distances are exact; beyond, only their sign is asked."""
 SPARE = 3
 """Nodes around the hull's box."""
@@ -149,9 +148,9 @@ class _Search:
         self.field: Float[ndarray, "x y z"] | None = None
 
     @cached_property
-    def looks(self) -> "_Looks":
+    def looks(self) -> SolidRays:
         """Of all photographs."""
-        return _Looks.of(self.targets, self.outer)
+        return SolidRays.of(self.targets, self.outer)
 
     def opened(self) -> VisualHull | None:
         """None where nothing is a vessel."""
@@ -191,10 +190,11 @@ class _Search:
 
     def _best_vessel(self, lid: _Lid) -> _Vessel | None:
         """Behind that lid; None where none is believed."""
-        settings, looks, cell = self.settings, self.looks.through(lid, self.outer), self.settings.same_place * self.radius
-        if len(looks.colors) == 0:
+        settings, cell = self.settings, self.settings.same_place * self.radius
+        looks = self.looks[(lid.vertices[self.outer.mesh.faces.long()].sum(1) >= 2)[self.looks.face]]
+        if len(looks) == 0:
             return None
-        whole, brightness = looks.difference(self.outer, cell), float(looks.colors.mean())
+        whole, brightness = _difference(looks, self.outer, cell), float(looks.colors.mean())
         behind = _Behind.of(lid, self)
         tried: dict[tuple[float, float], _Vessel] = {}
 
@@ -205,7 +205,7 @@ class _Search:
                     empty = behind.empty(key[0] * self.radius, key[1] * self.radius)
                     vertices, faces = self._surface(np.maximum(self._hull_field(), empty))
                     surface = surface_of(*(torch.from_numpy(part).to(looks.colors.device) for part in (vertices, faces)))
-                    tried[key] = _Vessel(looks.difference(surface, cell), empty)
+                    tried[key] = _Vessel(_difference(looks, surface, cell), empty)
             return min(tried, key=lambda key: tried[key].left.trimmed)
 
         if not any(depth * self.radius < behind.deepest for depth in settings.first_depths):
@@ -238,8 +238,8 @@ class _Search:
         if self.field is None:
             faces = self.outer.mesh.faces.cpu().numpy().astype(np.int64)
             inside = igl.fast_winding_number(self.vertices, faces, self.places.reshape(-1, 3)).reshape(self.places.shape[:3]) > 0.5
-            near = np.maximum(*(ndimage.distance_transform_edt(part) for part in (inside, ~inside))) < NARROW
-            distance = np.full(inside.shape, NARROW * self.cell)
+            near = np.maximum(*(ndimage.distance_transform_edt(part) for part in (inside, ~inside))) < EXACT_NODES
+            distance = np.full(inside.shape, EXACT_NODES * self.cell)
             distance[near] = np.sqrt(igl.point_mesh_squared_distance(self.places[near], self.vertices, faces)[0])
             self.field = np.where(inside, -distance, distance)
         return self.field
@@ -282,51 +282,25 @@ class _Behind:
         return np.where(np.isin(places, entered[entered > 0]), empty, np.minimum(empty, 0.0))
 
 
-@dataclass(frozen=True, eq=False)
-class _Looks:
-    """Rays of all photographs into the hull."""
-
-    origin: Float[Tensor, "ray 3"]
-    direction: Float[Tensor, "ray 3"]
-    colors: Float[Tensor, "ray 3"]
-    """SRGB."""
-    view: Int[Tensor, "ray"]
-    face: Int[Tensor, "ray"]
-    """Of the hull, that the ray enters by."""
-
-    @classmethod
-    def of(cls, targets: list[ViewTarget], outer: AbstractTracer) -> "_Looks":
-        """Through all pixels that masks fill."""
-        parts = []
-        for number, target in enumerate(targets):
-            rays, pixels, face = rays_into(target, outer, (target.mask.flatten() > SOLID).nonzero().squeeze(1))
-            colors = target.saturation.reshape(-1, 3)[pixels]
-            parts.append((rays.origin, rays.direction, colors, torch.full_like(pixels, number), face))
-        return cls(*(torch.cat(part).contiguous() for part in zip(*parts, strict=True)))
-
-    def through(self, lid: _Lid, outer: AbstractTracer) -> "_Looks":
-        """Those that enter by it."""
-        there = (lid.vertices[outer.mesh.faces.long()].sum(1) >= 2)[self.face]
-        return _Looks(*(part[there] for part in (self.origin, self.direction, self.colors, self.view, self.face)))
-
-    def difference(self, surface: AbstractTracer, cell: float) -> _Difference:
-        """Of a ray's colour from the mean of what other views see where it meets the surface; cells of so many world units are one place."""
-        hits = trace_rays(self.origin, self.direction, surface)
-        place = self.origin + torch.where(hits.hit, hits.distance, torch.zeros_like(hits.distance))[:, None] * self.direction
-        corner = torch.floor(place / cell).long()
-        corner -= corner.amin(0)
-        _, place = torch.unique(
-            (corner[:, 0] * (corner[:, 1].max() + 1) + corner[:, 1]) * (corner[:, 2].max() + 1) + corner[:, 2], return_inverse=True
-        )
-        _, pair = torch.unique(place * (int(self.view.max()) + 1) + self.view, return_inverse=True)
-        counted = torch.cat([self.colors, torch.ones_like(self.colors[:, :1])], 1)
-        of_view = counted.new_zeros(int(pair.max()) + 1, 4).index_add_(0, pair, counted)
-        of_place = counted.new_zeros(int(place.max()) + 1, 4).index_add_(0, place, counted)
-        others = of_place[place] - of_view[pair]
-        seen = hits.hit & (others[:, 3] > 0.5)
-        mean = others[:, :3] / others[:, 3:].clamp(min=1)
-        difference = torch.where(hits.hit, (self.colors - mean).abs().mean(1), torch.ones_like(mean[:, 0]))
-        ordered = difference[seen | ~hits.hit].sort().values
-        if len(ordered) == 0:
-            return _Difference(1.0, 1.0)
-        return _Difference(float(ordered[: max(1, int(TRIMMED * len(ordered)))].mean()), float(ordered.mean()))
+def _difference(looks: SolidRays, surface: AbstractTracer, cell: float) -> _Difference:
+    """Of a ray's colour from the mean of what other views see where it meets the surface; cells of so many world units are one place."""
+    origin, direction = looks.rays.origin, looks.rays.direction
+    hits = trace_rays(origin, direction, surface)
+    place = origin + torch.where(hits.hit, hits.distance, torch.zeros_like(hits.distance))[:, None] * direction
+    corner = torch.floor(place / cell).long()
+    corner -= corner.amin(0)
+    _, place = torch.unique(
+        (corner[:, 0] * (corner[:, 1].max() + 1) + corner[:, 1]) * (corner[:, 2].max() + 1) + corner[:, 2], return_inverse=True
+    )
+    _, pair = torch.unique(place * (int(looks.view.max()) + 1) + looks.view, return_inverse=True)
+    counted = torch.cat([looks.colors, torch.ones_like(looks.colors[:, :1])], 1)
+    of_view = counted.new_zeros(int(pair.max()) + 1, 4).index_add_(0, pair, counted)
+    of_place = counted.new_zeros(int(place.max()) + 1, 4).index_add_(0, place, counted)
+    others = of_place[place] - of_view[pair]
+    seen = hits.hit & (others[:, 3] > 0.5)
+    mean = others[:, :3] / others[:, 3:].clamp(min=1)
+    difference = torch.where(hits.hit, (looks.colors - mean).abs().mean(1), torch.ones_like(mean[:, 0]))
+    ordered = difference[seen | ~hits.hit].sort().values
+    if len(ordered) == 0:
+        return _Difference(1.0, 1.0)
+    return _Difference(float(ordered[: max(1, int(TRIMMED * len(ordered)))].mean()), float(ordered.mean()))
