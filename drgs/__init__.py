@@ -2,7 +2,7 @@
 
 The names below are the public ones; each is imported when it is first used, so that `import drgs` costs nothing. Import it before torch: it chooses how
 torch's idle threads wait (GOMP_SPINCOUNT, unless it is set), which two programs on one machine would else stop each other by. Where torch was first, builds
-do what is left (brief_waits.py).
+still shorten that while others want the cores (brief_waits.py).
 See docs/roadmap.md for what works.
 
     asset = drgs.load_asset("out/teapot")

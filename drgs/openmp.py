@@ -9,15 +9,12 @@ few among torch's operations: they sleep at once. 50 small solves with pauses be
 """
 
 import os
-import sys
 
 SPINS = "3000"
 """Of GNU's OpenMP, which torch's packages for Linux bring: a fraction of a millisecond."""
 ASLEEP = "0"
 BLAS_ASLEEP = "4"
 """OPENBLAS_THREAD_TIMEOUT, in log2 of clock ticks: the least that it takes. Its own is 26."""
-CHOSEN_IN_TIME = "torch" not in sys.modules or not os.environ.keys().isdisjoint(("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"))
-"""Whether torch's threads wait as is chosen here, or as the user says. Else torch was loaded before drgs, and brief_waits.py does what is left."""
 
 
 def spin_briefly() -> None:
@@ -34,6 +31,12 @@ def spin_briefly_unless_told() -> None:
 def sleep_at_once() -> None:
     """For a server, whose threads must not be in each other's way. What the user has set holds."""
     _choose(ASLEEP)
+
+
+def spin_unless_told() -> bool:
+    """Whether idle threads look for work before they sleep, and not because the user wants it so: brief_waits.py may shorten that. Also where torch was
+    loaded before drgs, and does not know what was chosen."""
+    return "OMP_WAIT_POLICY" not in os.environ and os.environ.get("GOMP_SPINCOUNT", SPINS) == SPINS
 
 
 def _choose(spins: str) -> None:

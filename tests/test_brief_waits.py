@@ -1,4 +1,4 @@
-"""Idle threads of a program that had loaded torch before drgs."""
+"""Idle threads of a build while others want the cores."""
 
 import json
 import os
@@ -11,12 +11,12 @@ import pytest
 
 from drgs import brief_waits
 from drgs.brief_waits import IdleTeam, brief_waits_where_crowded
+from drgs.openmp import ASLEEP, SPINS
 
 CODE = """
 import json, time
 import torch
 from drgs.brief_waits import IdleTeam
-from drgs.openmp import CHOSEN_IN_TIME
 
 def burnt():
     before = time.process_time()
@@ -31,7 +31,7 @@ alone = burnt()
 team.hold()
 with_team = burnt()
 team.release()
-print(json.dumps([CHOSEN_IN_TIME, alone, with_team, burnt()]))
+print(json.dumps([alone, with_team, burnt()]))
 """
 CHOICES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS")
 
@@ -43,17 +43,8 @@ CHOICES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS")
 def test_with_an_idle_team_threads_that_wait_burn_little() -> None:
     environment = {name: value for name, value in os.environ.items() if name not in CHOICES}
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, env=environment, check=True)
-    in_time, alone, with_team, behind = json.loads(done.stdout)
-    assert not in_time
+    alone, with_team, behind = json.loads(done.stdout)
     assert with_team < 0.6 * min(alone, behind), (alone, with_team, behind)
-
-
-@pytest.mark.parametrize(("first", "told", "in_time"), [("torch", {}, False), ("torch", {"GOMP_SPINCOUNT": "9"}, True), ("drgs", {}, True)])
-def test_it_is_known_whether_the_choice_came_in_time(first: str, told: dict[str, str], in_time: bool) -> None:
-    code = f"import {first}; from drgs.openmp import CHOSEN_IN_TIME; print(CHOSEN_IN_TIME)"
-    environment = {name: value for name, value in os.environ.items() if name not in CHOICES} | told
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
-    assert done.stdout.strip() == str(in_time)
 
 
 class Waits:
@@ -74,7 +65,8 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Waits:
     told = Waits()
     monkeypatch.setattr(brief_waits, "scheduled_seconds", told)
     monkeypatch.setattr(brief_waits, "LOOK_SECONDS", 0.01)
-    monkeypatch.setattr(brief_waits, "CHOSEN_IN_TIME", False)
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+        monkeypatch.delenv(name, raising=False)
     return told
 
 
@@ -108,11 +100,24 @@ def test_a_team_does_not_outlast_work_that_fails(waits: Waits) -> None:
     assert teams() == 0
 
 
-def test_where_the_choice_came_in_time_nothing_is_done(waits: Waits, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(brief_waits, "CHOSEN_IN_TIME", True)
+@pytest.mark.parametrize("told", [("OMP_WAIT_POLICY", "passive"), ("GOMP_SPINCOUNT", "9"), ("GOMP_SPINCOUNT", ASLEEP)])
+def test_where_threads_sleep_or_wait_as_the_user_says_nothing_is_done(
+    waits: Waits, monkeypatch: pytest.MonkeyPatch, told: tuple[str, str]
+) -> None:
+    monkeypatch.setenv(*told)
     monkeypatch.setattr(brief_waits, "Crowding", None)  # would fail
     with brief_waits_where_crowded():
         pass
+
+
+@pytest.mark.parametrize("program", ["a build", "torch first"])
+def test_builds_that_spin_are_watched(waits: Waits, monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+    if program == "a build":
+        monkeypatch.setenv("GOMP_SPINCOUNT", SPINS)
+    with brief_waits_where_crowded():
+        waits.crowded = True
+        wait_for(1)
+    assert teams() == 0
 
 
 def test_a_team_that_was_never_held_is_released_at_once() -> None:

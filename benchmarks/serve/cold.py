@@ -4,7 +4,7 @@
 
 serve_ready_s: from starting `drgs serve` (no worker, a free port, a new data folder) until it answers /healthz. upload_s: of the asset into
 that server. open_to_traced_s: there, from opening a session of it to the first traced picture at 400x400, while kernels are compiled and kept,
-but this process has loaded neither the renderer nor the asset; first_picture_s: the three together. next_open_to_traced_s: of the same file
+but this process has not loaded the asset, and began to load the renderer with the upload; first_picture_s: the three together. next_open_to_traced_s: of the same file
 uploaded once more, as another asset, so that only the asset is loaded anew. fresh_serve_ready_s, fresh_upload_s, fresh_open_to_traced_s,
 fresh_first_picture_s: the same on a fresh installation, whose folder of compiled kernels is empty; fresh_modules: how many of Warp's
 modules are compiled until then. The server does not tell how long it compiles: what fresh_first_picture_s is more than first_picture_s.

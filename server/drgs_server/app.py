@@ -96,8 +96,7 @@ def create_app(settings: ServerSettings, renderer: AbstractRenderer | None = Non
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         thread.start()
-        if await asyncio.to_thread(context.sessions.any):
-            asyncio.get_running_loop().run_in_executor(None, renderer.prepare)
+        await context.sessions.prepare_if_any()
         work = (_requeue_dead_workers_jobs, _remove_unused, _forget_assets_deleted_elsewhere, _back_up_databases)
         chores = [asyncio.create_task(chore(context)) for chore in work] + [asyncio.create_task(_return_memory())]
         yield

@@ -217,14 +217,25 @@ def test_many_edits_undone_and_redone_end_as_their_replay_does(service: Service)
     service.client.portal.call(soak)
 
 
-def test_a_server_whose_sessions_wait_prepares_its_renderer(tmp_path: Path) -> None:
+def test_a_server_with_assets_prepares_its_renderer(tmp_path: Path) -> None:
     first = Service(tmp_path)
     with first.client:
-        first.open_session()
+        first.add_asset()
     again = Service(tmp_path)
     with again.client:
         pass
     assert (first.painter.prepared, again.painter.prepared) == (0, 1)
+
+
+def test_what_brings_an_asset_prepares_the_renderer_once(service: Service) -> None:
+    for _ in range(2):
+        service.client.post("/api/assets", files={"file": ("a.obj", b"v")})
+    assert service.painter.prepared == 1
+
+
+def test_a_build_that_waits_prepares_the_renderer(service: Service) -> None:
+    assert service.client.post("/api/jobs", json={"kind": "build", "dataset": "sample"}).status_code == 202
+    assert service.painter.prepared == 1
 
 
 @pytest.mark.slow

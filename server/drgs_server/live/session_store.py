@@ -104,10 +104,10 @@ class SessionStore:
             there = select(SessionRow.id).join(AssetRow, AssetRow.id == SessionRow.asset_id).where(AssetRow.deleted_at.is_(None))
             return list(database.scalars(there.order_by(SessionRow.created_at.desc()).limit(LISTED_SESSIONS)))
 
-    def any(self) -> bool:
-        """Whether there are sessions that somebody may come back to."""
+    def any_asset(self) -> bool:
+        """Whether there are assets that somebody may open, or come back to."""
         with DatabaseSession(self._engine) as database:
-            return database.scalars(select(SessionRow.id).limit(1)).first() is not None
+            return database.scalars(select(AssetRow.id).where(AssetRow.deleted_at.is_(None)).limit(1)).first() is not None
 
     def remove(self, session_id: str) -> None:
         """With its events and snapshots."""

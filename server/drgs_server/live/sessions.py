@@ -74,6 +74,7 @@ class SessionRegistry:
         self._posed: OrderedDict[str, LiveSession] = OrderedDict()
         """Sessions with a pose in memory, the one used last at the end."""
         self._loading = asyncio.Lock()
+        self._prepared = False
         self._threads = PoseThreads(limits, admission)
 
     def close(self) -> None:
@@ -113,9 +114,16 @@ class SessionRegistry:
                 logging.getLogger(__name__).warning("the session %s is not listed: %s", session_id, problem.detail)
         return found
 
-    def any(self) -> bool:
-        """Whether there are sessions that somebody may come back to."""
-        return self._store.any()
+    async def prepare_if_any(self) -> None:
+        """The renderer, where there are assets that somebody may open."""
+        if await asyncio.to_thread(self._store.any_asset):
+            self.prepare_soon()
+
+    def prepare_soon(self) -> None:
+        """The renderer, on a thread of its own, once: somebody is about to have an asset, and shall not wait two seconds more for its first picture."""
+        if not self._prepared:
+            self._prepared = True
+            asyncio.get_running_loop().run_in_executor(None, self._renderer.prepare)
 
     async def remove(self, session_id: str) -> None:
         """

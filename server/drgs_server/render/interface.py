@@ -200,7 +200,7 @@ class AbstractRenderer(ABC):
 
     @abstractmethod
     def prepare(self) -> None:
-        """What takes long the first time, so that whoever comes back to a session need not wait for it. Runs on a thread of its own."""
+        """What takes long the first time, so that whoever opens an asset need not wait for it. Runs on a thread of its own."""
 
 
 def view_of_bounds(bounds: Bounds) -> StartView:

@@ -32,10 +32,11 @@ def test_a_build_that_gives_way_is_the_command_itself(tmp_path: Path):
 
 
 def test_a_script_loads_torch_before_anything_is_chosen():
-    loading = SCRIPT.split("asset =")[0] + "from drgs.openmp import CHOSEN_IN_TIME; print(CHOSEN_IN_TIME, out)"
+    loading = SCRIPT.replace("import drgs\n", "print(sorted({'GOMP_SPINCOUNT', 'OMP_WAIT_POLICY'} & os.environ.keys()), end=' ')\n", 1)
+    loading = loading.split("asset =")[0] + "print('torch' in sys.modules, out)"
     arguments = ["capture", "out", "draft", "cpu", "0"]
     said = subprocess.run([sys.executable, "-c", loading, *arguments], capture_output=True, text=True, check=True).stdout
-    assert said == "False out\n"
+    assert said == "[] True out\n"
 
 
 @pytest.mark.slow

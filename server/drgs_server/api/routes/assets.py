@@ -66,6 +66,7 @@ def list_assets(
 @router.post("/assets", status_code=201)
 async def upload_asset(request: Request, context: Context) -> AssetInfo:
     """Multipart part `file`: a zipped asset, or a mesh (GLB, PLY, OBJ). Optional field `name`."""
+    context.sessions.prepare_soon()
     upload = await receive_upload(request, {".zip", ".glb", ".ply", ".obj"})
     asset_id = uuid.uuid4().hex
     try:

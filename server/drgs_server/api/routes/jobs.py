@@ -111,6 +111,8 @@ async def start_job(request: Request, context: Context, idempotency_key: Idempot
     else:
         row = await run_in_threadpool(_row_of, context, job_id, _parse_request(await request.body()))
     row.idempotency_key = idempotency_key
+    if row.kind == "build":
+        context.sessions.prepare_soon()
     try:
         await run_in_threadpool(context.queue.submit, row)
     except IntegrityError:  # the same key, a moment earlier
