@@ -1,8 +1,9 @@
-"""What builds make of captures that were taken otherwise: through a lens that bends, in several sizes, exposed differently, on a turntable.
+"""What builds make of captures that were taken otherwise: through a lens that bends, in several sizes, exposed differently, with grain, masks and cameras
+that are a little off, on a turntable.
 
-    python -m benchmarks captures OUT --scenes SCENE ... [--ways lens sizes exposures turned] [--preset draft] [--spp 32] [--every 1] [--side 256]
+    python -m benchmarks captures OUT --scenes SCENE ... [--ways lens sizes exposures grain masks poses turned] [--preset draft] [--spp 32] [--every 1] [--side 256]
 
-The first three change a scene's photographs (scenes/retake_photographs.py) and are held against a build of the scene as it is. For the last, both the
+All but the last change a scene's photographs (scenes/retake_photographs.py) and are held against a build of the scene as it is. For the last, both the
 plain and the turned capture are drawn by us, from the scene's mesh and materials under its light (draw_scene), for nobody photographed the scene so.
 A row stands in OUT/rows.jsonl as soon as it is finished and is not made again; a build that was killed goes on. OUT/table.md is the table, with how far
 each row is from its plain one; the wanted 0.3 dB of views and 0.5 dB of relit pictures are marked where they are missed.

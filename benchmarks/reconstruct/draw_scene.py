@@ -1,6 +1,6 @@
 """A capture with everything known, drawn by us: the mesh and cameras of a scene of the benchmark, of other matter or shape, under other light.
 
-    python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn|mug|plant] --light FILE.exr --new-light FILE.exr [--spp 64]
+    python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn|mug|plant|chair|bricks] --light FILE.exr --new-light FILE.exr [--spp 64]
                                     [--turned] [--every 2] [--side 200]
 
 With --turned the light of the photographs stands still with the camera, as on a turntable; the file holds it as the first photograph's camera
@@ -29,6 +29,7 @@ from benchmarks.render._mitsuba import mitsuba_picture
 from benchmarks.scenes.bench_scene import Array, BenchScene, open_scene, read_true_mesh, training_cameras
 from benchmarks.scenes.embossed_urn import embossed_urn
 from benchmarks.scenes.hollow_things import mug, plant
+from benchmarks.scenes.made_things import bricks, chair
 from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
@@ -76,7 +77,7 @@ def urn() -> TriangleMesh:
     )
 
 
-SHAPES: dict[str, Callable[[], TriangleMesh]] = {"urn": urn, "mug": mug, "plant": plant}
+SHAPES: dict[str, Callable[[], TriangleMesh]] = {"urn": urn, "mug": mug, "plant": plant, "chair": chair, "bricks": bricks}
 
 
 def of_matter(mesh: TriangleMesh, matter: Matter | None) -> TriangleMesh:

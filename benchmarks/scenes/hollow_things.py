@@ -3,38 +3,28 @@
 In: how finely they are cut. Out: triangle meshes in the unit ball, z up, with paint: bands of gold and glaze on the mug, stripes on thin leaves.
 """
 
-from collections.abc import Callable
-
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy import ndarray
-from skimage.measure import marching_cubes
 
-from drgs.scene.mesh import TriangleMesh, vertex_normals
+from benchmarks.scenes.fields import CELLS, Paint, blended, grid, painted, rounded_cylinder
+from drgs.scene.mesh import TriangleMesh
 
-HALF_SIDE = 1.05
-"""Of the cube of the grid, around the unit ball."""
-CELLS = 300
 MUG_HEIGHT, MUG_RADIUS, WALL = 1.24, 0.5, 0.06
 LEAVES = 9
 LEAF = 0.012
 """Half the thickness; a pixel of 400 is 0.006."""
 
-Field = Float[ndarray, "n n n"]
-Paint = tuple[Float[ndarray, "vertex 3"], Float[ndarray, "vertex"], Float[ndarray, "vertex"]]
-"""Albedo (linear), roughness, metallic."""
-
 
 def mug(cells: int = CELLS) -> TriangleMesh:
     """A glazed mug that is empty to its floor."""
-    x, y, z = _grid(cells)
+    x, y, z = grid(cells)
     radius, top = np.hypot(x, y), MUG_HEIGHT / 2
-    outside = _rounded_cylinder(radius, z, MUG_RADIUS, -top, top)
-    inside = _rounded_cylinder(radius, z, MUG_RADIUS - WALL, WALL - top, 2 * top)
+    outside = rounded_cylinder(radius, z, MUG_RADIUS, -top, top)
+    inside = rounded_cylinder(radius, z, MUG_RADIUS - WALL, WALL - top, 2 * top)
     ring = np.hypot(x - 0.52, 0.8 * z) - 0.3
     handle = np.maximum(np.hypot(ring, y) - 0.06, MUG_RADIUS - WALL / 2 - radius)
-    return _painted(_blended(np.maximum(outside, -inside), handle, 0.05), _paint_of_mug)
+    return painted(blended(np.maximum(outside, -inside), handle, 0.05), _paint_of_mug)
 
 
 def _paint_of_mug(places: Float[ndarray, "vertex 3"]) -> Paint:
@@ -55,7 +45,7 @@ def _paint_of_mug(places: Float[ndarray, "vertex 3"]) -> Paint:
 
 def plant(cells: int = CELLS) -> TriangleMesh:
     """Leaves two pixels thick in a pot of earth."""
-    x, y, z = _grid(cells)
+    x, y, z = grid(cells)
     radius = np.hypot(x, y)
     rim = 0.34 + 0.18 * (z + 0.85)
     pot = np.maximum(np.maximum(radius - rim, -(z + 0.9)), z + 0.35)
@@ -70,7 +60,7 @@ def plant(cells: int = CELLS) -> TriangleMesh:
         sheet = np.abs(outward - 0.05 - lean * height**2 / length - 0.1 * aside**2 / width) / steepness - LEAF
         half = width * np.sin(np.pi * (height / length) ** 0.7) + 0.015
         shape = np.minimum(shape, np.maximum(np.maximum(sheet, np.abs(aside) - half), np.maximum(z + 0.5 - length, -0.52 - z)))
-    return _painted(shape, _paint_of_plant)
+    return painted(shape, _paint_of_plant)
 
 
 def _paint_of_plant(places: Float[ndarray, "vertex 3"]) -> Paint:
@@ -82,32 +72,3 @@ def _paint_of_plant(places: Float[ndarray, "vertex 3"]) -> Paint:
     albedo[of_pot], roughness[of_pot] = (0.55, 0.22, 0.12), 0.75
     albedo[earth], roughness[earth] = (0.08, 0.05, 0.035), 0.95
     return albedo, roughness, np.zeros(len(x))
-
-
-def _grid(cells: int) -> tuple[Field, Field, Field]:
-    along = np.linspace(-HALF_SIDE, HALF_SIDE, cells, dtype=np.float32)
-    x, y, z = np.meshgrid(along, along, along, indexing="ij")
-    return x, y, z
-
-
-def _rounded_cylinder(radius: Field, z: Field, most: float, low: float, high: float, edge: float = 0.05) -> Field:
-    """Signed distance; `edge`: radius of the rounded edges."""
-    apart = np.stack([radius - most + edge, np.abs(z - (low + high) / 2) - (high - low) / 2 + edge])
-    return np.minimum(apart.max(0), 0) + np.linalg.norm(np.maximum(apart, 0), axis=0) - edge
-
-
-def _blended(first: Field, second: Field, width: float) -> Field:
-    """The union, with a fillet that is about `width` wide (a polynomial smooth minimum)."""
-    share = np.clip(0.5 + 0.5 * (second - first) / width, 0, 1)
-    return second * (1 - share) + first * share - width * share * (1 - share)
-
-
-def _painted(field: Field, paint: Callable[[Float[ndarray, "vertex 3"]], Paint]) -> TriangleMesh:
-    """Where the field, which is below 0 within, is 0."""
-    vertices, faces, _, _ = marching_cubes(
-        field, 0.0, spacing=(2 * HALF_SIDE / (len(field) - 1),) * 3, gradient_direction="descent", allow_degenerate=False
-    )
-    places = vertices - HALF_SIDE
-    at, corners = (torch.from_numpy(values) for values in (places.astype(np.float32), faces.astype(np.int32)))
-    albedo, roughness, metallic = (torch.from_numpy(values.astype(np.float32)) for values in paint(places))
-    return TriangleMesh(at, corners, vertex_normals(at, corners), albedo, roughness, metallic)

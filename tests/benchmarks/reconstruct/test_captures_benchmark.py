@@ -82,6 +82,26 @@ def test_all_ways_are_captures_of_the_same_cameras(scene: Path, tmp_path: Path) 
     for way in WAYS:
         cameras = load_views(taken(scene, way, tmp_path)).cameras
         assert [camera.name for camera in cameras] == [camera.name for camera in first]
+        off = max(
+            float((camera.camera_from_world - known.camera_from_world).abs().max()) for camera, known in zip(cameras, first, strict=True)
+        )
+        assert 1e-5 < off < 0.01 if way == "poses" else off < 1e-6
+
+
+def test_grain_is_of_the_light_and_leaves_the_mask(scene: Path, tmp_path: Path) -> None:
+    plain, noisy = (read_rgba(folder / "train" / "r_000.png") for folder in (scene, taken(scene, "grain", tmp_path)))
+    assert (plain[..., 3] == noisy[..., 3]).all()
+    inside = plain[..., 3] == 1
+    assert 0.003 < np.abs(plain - noisy)[inside][:, :3].mean() < 0.02 and abs((plain - noisy)[inside].mean()) < 0.002
+
+
+def test_rough_masks_are_wider_and_show_the_room_there(scene: Path, tmp_path: Path) -> None:
+    plain, rough = (read_rgba(folder / "train" / "r_000.png") for folder in (scene, taken(scene, "masks", tmp_path)))
+    before, after = plain[..., 3] > 0.5, rough[..., 3] > 0.5
+    outline = np.sqrt(4 * np.pi * before.sum())
+    assert 0.3 < (after.sum() - before.sum()) / outline < 1.1
+    assert rough[after & ~before][:, :3].min() > 0.25
+    assert np.abs(plain - rough)[plain[..., 3] == 1][rough[plain[..., 3] == 1][:, 3] == 1].max() < 0.005
 
 
 def figures_of(views: float, relit: float) -> dict:
