@@ -12,7 +12,7 @@ How deep a smooth inside is, few rays tell: of depths that explain about as much
 In: Views with masks, their hull. Out: a closed surface inside the hull, or that hull where nothing is a vessel.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import igl
@@ -24,6 +24,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from drgs.reconstruct.capture.find_pit import PitSettings, find_pit
 from drgs.reconstruct.capture.hull_rays import (
     SolidRays,
     bounds_of,
@@ -93,6 +94,8 @@ class VesselSettings:
     cost_rings: int = 4
     direction_rings: int = 10
     """Neighbourhoods over which differences and normals are averaged."""
+    pits: PitSettings = field(default_factory=PitSettings)
+    """Of lids that no edge runs around."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +165,7 @@ class _Search:
             if not bool(seeds.any()):
                 break
             lid, bounded = self._lid(seeds, unlike)
-            vessel = self._best_vessel(lid) if bounded else None
+            vessel = self._best_vessel(lid) if bounded else self._pit(lid)
             if vessel is not None:
                 self.field, found = np.maximum(self._hull_field(), vessel.empty), True
             seeds = seeds & ~lid.vertices
@@ -203,9 +206,7 @@ class _Search:
             for key in ((wall, depth) for wall in walls for depth in depths if depth * self.radius < behind.deepest):
                 if key not in tried:
                     empty = behind.empty(key[0] * self.radius, key[1] * self.radius)
-                    vertices, faces = self._surface(np.maximum(self._hull_field(), empty))
-                    surface = surface_of(*(torch.from_numpy(part).to(looks.colors.device) for part in (vertices, faces)))
-                    tried[key] = _Vessel(_difference(looks, surface, cell), empty)
+                    tried[key] = _Vessel(_difference(looks, self._tracer(np.maximum(self._hull_field(), empty)), cell), empty)
             return min(tried, key=lambda key: tried[key].left.trimmed)
 
         if not any(depth * self.radius < behind.deepest for depth in settings.first_depths):
@@ -216,12 +217,38 @@ class _Search:
         best = best_of(best[:1], settings.depths)
         wall = best_of(settings.walls, best[1:])[0]
         least = tried[best_of((wall,), settings.depths)].left
-        better = least.trimmed <= settings.better * whole.trimmed and least.mean <= settings.better * whole.mean
-        if not better or least.trimmed > settings.alike * (brightness + 0.05):
+        if not self._believed(least, whole, brightness, settings.better):
             return None
         most = (1 + settings.equal) * least.trimmed + settings.equal_level
         as_good = (key for key in tried if key[0] == wall and tried[key].left.trimmed <= most)
         return tried[max(as_good, key=lambda key: key[1])]
+
+    def _pit(self, lid: _Lid) -> _Vessel | None:
+        """Below a large lid, what find_pit finds there; None where it finds nothing, or where that is not believed."""
+        settings, cell = self.settings, self.settings.same_place * self.radius
+        if int(lid.vertices.sum()) < settings.pits.least_lid * len(lid.vertices):
+            return None
+        looks = self.looks[(lid.vertices[self.outer.mesh.faces.long()].sum(1) >= 2)[self.looks.face]]
+        if len(looks) == 0:
+            return None
+        pit = find_pit(lid.vertices, lid.direction, looks, self.outer, self.radius, settings.pits)
+        if pit is None:
+            return None
+        holds = pit.holds(self.places, 2 * self.cell)
+        empty = self.cell * np.clip(
+            ndimage.distance_transform_edt(holds) - ndimage.distance_transform_edt(~holds), -EXACT_NODES, EXACT_NODES
+        )
+        vessel = _Vessel(_difference(looks, self._tracer(np.maximum(self._hull_field(), empty)), cell), empty)
+        whole, brightness = _difference(looks, self.outer, cell), float(looks.colors.mean())
+        return vessel if self._believed(vessel.left, whole, brightness, settings.pits.better) else None
+
+    def _believed(self, left: _Difference, whole: _Difference, brightness: float, share: float) -> bool:
+        better = left.trimmed <= share * whole.trimmed and left.mean <= self.settings.better * whole.mean
+        return better and left.trimmed <= self.settings.alike * (brightness + 0.05)
+
+    def _tracer(self, field: Float[ndarray, "x y z"]) -> AbstractTracer:
+        """Of where the field is 0."""
+        return surface_of(*(torch.from_numpy(part).to(self.outer.mesh.vertices.device) for part in self._surface(field)))
 
     def distance_to(self, points: Float[ndarray, "point 3"]) -> Float[ndarray, "x y z"]:
         """Of the grid's places to the mean of the points around the node that is nearest of those which have any."""

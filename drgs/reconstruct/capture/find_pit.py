@@ -1,0 +1,321 @@
+"""What lies below a lid of the hull that is no plain vessel: the bed of a toy truck, with walls of several widths, blocks that stand in it and studs on its rim.
+
+Seen along the lid's direction the object is a height a column, at most the hull's. Whole floors with walls are tried first, then blocks of columns at other
+depths, large ones before small ones; what is kept leaves the least difference between the colour of a ray and what other views see where it ends, the mean
+over all rays through the lid. A convex mirror shows things behind itself, as pits do, and such heights explain it well. But a pit has a rim: all around, most
+of the lid is where the hull is. What mirrors show has none, it lies deep up to the lid's border, wherever that is.
+
+In: a lid of the hull and rays through it. Out: the depth of the object below it, a column.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy import ndimage
+from torch import Tensor
+
+from drgs.reconstruct.capture.hull_rays import SolidRays
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.warp_torch import as_in_thread_pool, launch, warp_array, warp_device
+
+BEYOND = 1e-3
+"""Of the radius: from where a ray enters or leaves the hull to where it is followed on."""
+FAR = 1e6
+"""Height of columns that are not below the lid: what comes there has met a wall."""
+MOST_DIFFERENCE = 0.3
+"""Display values; what leaves the object counts as much."""
+
+
+@dataclass(frozen=True)
+class PitSettings:
+    """Lengths are shares of half of the hull's longest side."""
+
+    least_lid: float = 1.0
+    """Share of the hull's vertices that a lid has, at least: 0.03 is good. 1: no pits are looked for."""
+    column: float = 0.025
+    """Width."""
+    walls: tuple[float, ...] = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
+    """Of floors that are tried at first: so far inside the lid's border."""
+    depths: tuple[float, ...] = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.7, 0.9)
+    blocks: tuple[float, ...] = (0.4, 0.2, 0.1)
+    """Widths. After the first ..."""
+    promising: float = 0.8
+    """... this share of the lid's difference may be left, at most."""
+    rays: int = 8_000
+    """Through the lid, at most: so few that one thread is as fast as all, and waits for no other."""
+    shallow: float = 0.04
+    """What is less deep is rim."""
+    rim: float = 0.25
+    """Share of the lid's border that is so, at least."""
+    border: int = 2
+    """Its width, in columns."""
+    better: float = 0.55
+    """Share of the lid's difference that may be left without the third that differ most: many heights explain more than one wall and one depth."""
+    least: int = 16
+    """Columns that hang together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pit:
+    """Depths of columns below a lid [world units]."""
+
+    axes: Float[ndarray, "3 3"]
+    """Unit: the two directions of columns' rows, and the lid's outward direction."""
+    low: Float[ndarray, "2"]
+    """Where the first column begins, along the first two."""
+    width: float
+    lid: Float[ndarray, "u v"]
+    """Height of the hull."""
+    depth: Float[ndarray, "u v"]
+    """0: nothing is empty there."""
+
+    def holds(self, places: Float[ndarray, "x y z 3"], above: float) -> Bool[ndarray, "x y z"]:
+        """What is empty, and up to `above` over the lid."""
+        across = places @ self.axes.T
+        column = np.floor((across[..., :2] - self.low) / self.width).astype(int)
+        known = ((column >= 0) & (column < self.depth.shape)).all(-1)
+        u, v = np.where(known[..., None], column, 0).transpose(3, 0, 1, 2)
+        height, lid, depth = across[..., 2], self.lid[u, v], self.depth[u, v]
+        return known & (depth > 0) & (height > lid - depth) & (height < lid + above)
+
+
+def find_pit(
+    lid: Bool[Tensor, "vertex"],
+    direction: Float[Tensor, "3"],
+    looks: SolidRays,
+    outer: AbstractTracer,
+    radius: float,
+    settings: PitSettings,
+) -> Pit | None:
+    """None where nothing explains more.
+
+    Args:
+        lid: of the hull's vertices.
+        direction: the lid's, outward.
+        looks: through the lid.
+        outer: the hull.
+    """
+    columns = _Columns.below(lid, direction, outer, radius, settings)
+    if int(columns.inside.sum()) < settings.least:
+        return None
+    search = _Search(columns, _Rays.of(looks, columns, outer, radius, settings), radius, settings)
+    with as_in_thread_pool():
+        depth = search.best()
+    if depth is None:
+        return None
+    depth = ndimage.median_filter(np.minimum(depth, columns.most), 3) * columns.inside
+    patch, count = ndimage.label(depth >= settings.shallow * radius)
+    large = np.flatnonzero(np.bincount(patch.ravel(), minlength=count + 1) >= settings.least)
+    depth = np.where(np.isin(patch, large[large > 0]), depth, 0.0)
+    return Pit(columns.axes, columns.low, columns.width, columns.lid, depth) if bool((depth > 0).any()) else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """The object's place below a lid, cut along the lid's direction."""
+
+    axes: Float[ndarray, "3 3"]
+    low: Float[ndarray, "2"]
+    width: float
+    lid: Float[ndarray, "u v"]
+    inside: Bool[ndarray, "u v"]
+    """Those that the lid covers."""
+    most: Float[ndarray, "u v"]
+    """Depth above a floor as thick as what counts as rim."""
+
+    @classmethod
+    def below(
+        cls, lid: Bool[Tensor, "vertex"], direction: Float[Tensor, "3"], outer: AbstractTracer, radius: float, settings: PitSettings
+    ) -> "_Columns":
+        out = direction.cpu().double().numpy()
+        first = np.cross(out, np.eye(3)[int(np.abs(out).argmin())])
+        first /= np.linalg.norm(first)
+        axes = np.stack([first, np.cross(out, first), out])
+        vertices = outer.mesh.vertices.cpu().double().numpy() @ axes.T
+        chosen, width = vertices[lid.cpu().numpy()], settings.column * radius
+        low = chosen[:, :2].min(0) - 2 * width
+        shape = np.ceil((chosen[:, :2].max(0) - low) / width).astype(int) + 2
+        top = chosen[:, 2].max() + 0.1 * radius
+        middles = [start + (np.arange(count) + 0.5) * width for start, count in zip(low, shape, strict=True)]
+        above = np.stack([*(along.ravel() for along in np.meshgrid(*middles, indexing="ij")), np.full(shape.prod(), top)], -1) @ axes
+        start = torch.from_numpy(above).to(direction)
+        down = trace_rays(start, (-direction).expand_as(start).contiguous(), outer)
+        of_lid = lid[outer.mesh.faces.long()].sum(1) >= 2
+        inside = down.hit & of_lid[torch.where(down.hit, down.face, torch.zeros_like(down.face)).long()]
+        height = top - torch.where(down.hit, down.distance, torch.zeros_like(down.distance)).cpu().double().numpy()
+        # Where the lid is bumpy its steep places are not of it, and would stand as pillars.
+        covered = ndimage.binary_fill_holes(ndimage.binary_closing(inside.cpu().numpy().reshape(shape)))
+        covered &= down.hit.cpu().numpy().reshape(shape)
+        entered = torch.where(down.hit, down.distance, torch.zeros_like(down.distance)) + BEYOND * radius
+        below = trace_rays((start - entered[:, None] * direction).contiguous(), (-direction).expand_as(start).contiguous(), outer)
+        thick = torch.where(below.hit, below.distance, torch.zeros_like(entered)).cpu().double().numpy().reshape(shape)
+        return cls(axes, low, width, height.reshape(shape), covered, np.maximum(thick - settings.shallow * radius, 0))
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def meet_columns(
+    first: int,
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    start: wp.array[float],
+    end: wp.array[float],
+    height: wp.array2d[float],
+    width: float,
+    step: float,
+    # outputs
+    distance: wp.array[float],
+):
+    """Along each ray, by the columns' axes, to the first place that is in a column or beside all of them; -1 where there is none before the end."""
+    i = first + wp.tid()
+    t = start[i]
+    found = float(-1.0)
+    while t < end[i] and found < 0.0:
+        place = origin[i] + t * direction[i]
+        u = int(wp.floor(place[0] / width))
+        v = int(wp.floor(place[1] / width))
+        if u < 0 or v < 0 or u >= height.shape[0] or v >= height.shape[1] or place[2] <= height[u, v]:
+            found = t
+        t += step
+    distance[i] = found
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Through the lid; by the columns' axes, from where the first column begins."""
+
+    origin: Float[Tensor, "ray 3"]
+    direction: Float[Tensor, "ray 3"]
+    enters: Float[Tensor, "ray"]
+    """The hull; a little later."""
+    leaves: Float[Tensor, "ray"]
+    returns: Float[Tensor, "ray"]
+    """Where it meets the hull once more; -1: nowhere."""
+    colors: Float[Tensor, "ray 3"]
+    view: Int[Tensor, "ray"]
+
+    @classmethod
+    def of(cls, looks: SolidRays, columns: _Columns, outer: AbstractTracer, radius: float, settings: PitSettings) -> "_Rays":
+        drawn = torch.randperm(len(looks), generator=torch.Generator().manual_seed(0))[: settings.rays].sort().values
+        kept = torch.zeros(len(looks), dtype=torch.bool)
+        kept[drawn] = True
+        looks = looks[kept.to(looks.view.device)]
+        origin, direction = looks.rays.origin, looks.rays.direction
+        axes = torch.from_numpy(columns.axes).to(origin)
+
+        def next_hit(start: Float[Tensor, "ray"]) -> tuple[Float[Tensor, "ray"], Bool[Tensor, "ray"]]:
+            hits = trace_rays((origin + start[:, None] * direction).contiguous(), direction, outer)
+            return start + torch.where(hits.hit, hits.distance, torch.zeros_like(start)), hits.hit
+
+        enters, _ = next_hit(torch.zeros_like(origin[:, 0]))
+        leaves, _ = next_hit(enters + 0.2 * BEYOND * radius)
+        again, returns = next_hit(leaves + BEYOND * radius)
+        low = torch.from_numpy(np.append(columns.low, 0.0)).to(origin)
+        return cls(
+            (origin @ axes.T - low).contiguous(), (direction @ axes.T).contiguous(), enters + BEYOND * radius, leaves,
+            torch.where(returns, again, torch.full_like(again, -1.0)), looks.colors, torch.unique(looks.view, return_inverse=True)[1],
+        )  # fmt: skip
+
+    def at(self, distance: Float[Tensor, "ray"]) -> Float[Tensor, "ray 3"]:
+        return self.origin + distance[:, None] * self.direction
+
+    def ends(self, heights: Float[Tensor, "u v"], width: float) -> Float[Tensor, "ray"]:
+        """Distances to where rays meet columns of these heights, or the hull once more; -1: they leave the object."""
+        found = torch.empty_like(self.enters)
+        inputs = [warp_array(self.origin, wp.vec3), warp_array(self.direction, wp.vec3), warp_array(self.enters), warp_array(self.leaves)]
+        launch(meet_columns, len(found), [*inputs, warp_array(heights), width, 0.5 * width], [warp_array(found)], warp_device(found))
+        return torch.where(found < 0, self.returns, found)
+
+
+@dataclass(eq=False)
+class _Search:
+    """Final. Of the depths that leave least."""
+
+    columns: _Columns
+    rays: _Rays
+    radius: float
+    settings: PitSettings
+    cells: float = field(init=False)
+    low: Float[Tensor, "3"] = field(init=False)
+    counts: Int[Tensor, "3"] = field(init=False)
+    of_view: Float[Tensor, "cell_and_view 4"] = field(init=False)
+    """Zeros between two looks: to make them anew takes longer than all the rest."""
+
+    def __post_init__(self) -> None:
+        self.cells = 0.03 * self.radius
+        ends = torch.cat([self.rays.at(self.rays.enters), self.rays.at(self.rays.leaves)])
+        self.low, high = ends.amin(0), ends.amax(0)
+        self.counts = ((high - self.low) / self.cells).long() + 1
+        self.of_view = ends.new_zeros(int(self.counts.prod()) * self.views, 4)
+
+    @cached_property
+    def views(self) -> int:
+        return int(self.rays.view.max()) + 1
+
+    def best(self) -> Float[ndarray, "u v"] | None:
+        """None where large blocks leave too much already, and where there is no rim."""
+        settings, inside = self.settings, self.columns.inside
+        depth = np.zeros(inside.shape)
+        whole = least = self.left(depth)
+        within = ndimage.distance_transform_edt(inside) * self.columns.width
+        for wall in settings.walls:
+            for deep in settings.depths:
+                trial = np.where(within > wall * self.radius, deep * self.radius, 0.0)
+                least, depth = min((least, depth), (self.left(trial), trial), key=lambda pair: pair[0])
+        for number, width in enumerate(settings.blocks):
+            for block in self._blocks(max(1, round(width / settings.column))):
+                for deep in self._depths_to_try(depth, block) if number else (0.0, *settings.depths):
+                    trial = depth.copy()
+                    trial[block] = deep * self.radius
+                    least, depth = min((least, depth), (self.left(trial), trial), key=lambda pair: pair[0])
+            if (number == 0 and least > settings.promising * whole) or not self._has_rim(depth):
+                return None
+        return depth
+
+    def _has_rim(self, depth: Float[ndarray, "u v"]) -> bool:
+        inside = self.columns.inside
+        border = inside & ~ndimage.binary_erosion(inside, iterations=self.settings.border)
+        return float((depth[border] < self.settings.shallow * self.radius).mean()) >= self.settings.rim
+
+    def _depths_to_try(self, depth: Float[ndarray, "u v"], block: tuple[slice, slice]) -> list[float]:
+        """In a block whose larger one was tried at all depths: those in it and around it, and the next ones to its own."""
+        steps = np.array([0.0, *self.settings.depths])
+        side = [part.stop - part.start for part in block]
+        around = tuple(slice(max(part.start - more, 0), part.stop + more) for part, more in zip(block, side, strict=True))
+        found = np.unique(np.abs(depth[around] / self.radius - steps[:, None, None]).argmin(0))
+        own = int(np.abs(np.median(depth[block]) / self.radius - steps).argmin())
+        return [float(steps[k]) for k in sorted({*found.tolist(), max(own - 1, 0), min(own + 1, len(steps) - 1)})]
+
+    def _blocks(self, side: int) -> Iterator[tuple[slice, slice]]:
+        """Of that many columns each way, then once more half a block aside."""
+        rows, across = self.columns.inside.shape
+        for aside in (0, side // 2):
+            for u in range(-aside, rows, side):
+                for v in range(-aside, across, side):
+                    block = slice(max(u, 0), u + side), slice(max(v, 0), v + side)
+                    if self.columns.inside[block].any():
+                        yield block
+
+    def left(self, depth: Float[ndarray, "u v"]) -> float:
+        """Mean difference of rays from what other views see where they end."""
+        rays = self.rays
+        heights = np.where(self.columns.inside, self.columns.lid - np.minimum(depth, self.columns.most), FAR)
+        distance = rays.ends(torch.from_numpy(heights).to(rays.origin), self.columns.width)
+        ended = distance >= 0
+        cell = ((rays.at(distance) - self.low) / self.cells).long().clamp(min=0).minimum(self.counts - 1)
+        cell = (cell[:, 0] * self.counts[1] + cell[:, 1]) * self.counts[2] + cell[:, 2]
+        counted = torch.cat([rays.colors, torch.ones_like(rays.colors[:, :1])], 1) * ended[:, None]
+        pair = cell * self.views + rays.view
+        of_cell = counted.new_zeros(int(self.counts.prod()), 4).index_add_(0, cell, counted)
+        others = of_cell[cell] - self.of_view.index_add_(0, pair, counted)[pair]
+        self.of_view.index_fill_(0, pair, 0.0)
+        difference = (rays.colors - others[:, :3] / others[:, 3:].clamp(min=1)).abs().mean(1).clamp(max=MOST_DIFFERENCE)
+        known = (others[:, 3] > 0.5) | ~ended
+        difference = torch.where(ended, difference, torch.full_like(difference, MOST_DIFFERENCE))
+        return float(difference[known].mean()) if bool(known.any()) else MOST_DIFFERENCE

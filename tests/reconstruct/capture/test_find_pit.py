@@ -1,0 +1,124 @@
+"""A tray with walls of two widths and a block in it is full to its silhouettes; what is seen through its rim tells where it is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+import warp as wp
+
+from drgs.reconstruct.capture import open_vessels as module
+from drgs.reconstruct.capture.find_pit import FAR, Pit, PitSettings, meet_columns
+from drgs.reconstruct.capture.open_vessels import VesselSettings, open_vessels
+from drgs.reconstruct.capture.visual_hull import VisualHull
+from drgs.render.intersect.trace_rays import trace_rays
+from drgs.scene.views import Views
+from drgs.warp_torch import launch, warp_array, warp_device
+from tests.reconstruct.capture.test_find_hollows import CPU, photographed, tracer_of
+from tests.reconstruct.capture.test_open_vessels import hull_of, plain, satin
+
+HALF = np.array([0.6, 0.45, 0.16])
+FLOOR_Z, RIM_Z = -0.1, 0.16
+ALONG, ACROSS = 0.42, 0.33
+"""Half of the room's sides."""
+SETTINGS = VesselSettings(nodes=72, bounded=2.0, pits=PitSettings(least_lid=0.03))
+"""Whatever runs around a lid, it is no vessel's."""
+
+
+def tray() -> trimesh.Trimesh:
+    def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
+        made = trimesh.creation.box(np.subtract(high, low))
+        made.apply_translation(np.add(low, high) / 2)
+        return made
+
+    x, y, z = HALF
+    walls = [block((-x, -y, -z), (-ALONG, y, z)), block((ALONG, -y, -z), (x, y, z))]
+    walls += [block((-x, -y, -z), (x, -ACROSS, z)), block((-x, ACROSS, -z), (x, y, z))]
+    return trimesh.util.concatenate([*walls, block((-x, -y, -z), (x, y, FLOOR_Z)), block((0.12, -0.12, -z), (0.32, 0.12, 0.1))])
+
+
+@pytest.fixture(scope="module")
+def white_tray() -> Views:
+    object_ = tracer_of(tray())
+    return photographed(object_, plain(object_), 32, 96)
+
+
+@pytest.fixture(scope="module")
+def solid(white_tray: Views) -> VisualHull:
+    return hull_of(white_tray)
+
+
+def height_at(hull: VisualHull, x: float, y: float) -> float:
+    """Median from above, of a small square around the place."""
+    surface = tracer_of(trimesh.Trimesh(hull.vertices_world, hull.faces, process=False))
+    aside = torch.linspace(-0.04, 0.04, 5)
+    above = torch.stack([*(along.flatten() for along in torch.meshgrid(x + aside, y + aside, indexing="ij")), torch.full((25,), 2.0)], -1)
+    down = torch.tensor([0.0, 0, -1]).expand_as(above).contiguous()
+    return float((2 - trace_rays(above.contiguous(), down, surface).distance).median())
+
+
+@pytest.mark.slow
+def test_a_tray_is_open_but_for_its_walls_and_the_block_in_it(white_tray: Views, solid: VisualHull) -> None:
+    opened = open_vessels(white_tray, solid, SETTINGS, CPU)
+    assert opened is not solid
+    mesh = trimesh.Trimesh(opened.vertices_world, opened.faces, process=False)
+    assert mesh.is_watertight and mesh.volume > 0
+    room = ((-0.25, 0.0), (-0.2, 0.2), (-0.2, -0.2))
+    before, after = ([height_at(hull, *place) for place in room] for hull in (solid, opened))
+    assert min(before) > 0.1 and max(np.abs(np.subtract(after, FLOOR_Z))) < 0.08
+    assert height_at(opened, 0.22, 0.0) > 0.02
+    walls = ((-0.52, 0.0), (0.52, 0.0), (0.0, 0.4), (0.0, -0.4))
+    assert min(height_at(opened, *place) for place in walls) > RIM_Z - 0.06
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", ["ball", "drum"])
+def test_what_satin_metal_mirrors_is_no_pit_for_it_has_no_rim(shape: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = trimesh.creation.icosphere(4, radius=0.6) if shape == "ball" else trimesh.creation.cylinder(radius=0.5, height=0.9)
+    views = photographed(tracer_of(mesh), satin, 32)
+    hull = hull_of(views)
+    asked = []
+    find = module.find_pit
+    monkeypatch.setattr(module, "find_pit", lambda *given: asked.append(find(*given)) or asked[-1])
+    assert open_vessels(views, hull, SETTINGS, CPU) is hull
+    assert asked
+
+
+@pytest.mark.slow
+def test_small_lids_are_not_asked(white_tray: Views, solid: VisualHull, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "find_pit", None)  # would fail
+    assert open_vessels(white_tray, solid, replace(SETTINGS, pits=PitSettings(least_lid=1.1)), CPU) is solid
+
+
+def test_rays_meet_columns_where_small_steps_find_them() -> None:
+    random = np.random.default_rng(0)
+    height = np.where(random.random((9, 7)) < 0.2, FAR, random.uniform(-1, 0, (9, 7)))
+    width, count = 0.2, 300
+    origin = np.concatenate([random.uniform(0, 1.3, (count, 2)), np.full((count, 1), 0.4)], 1)
+    direction = random.normal(size=(count, 3)) - [0, 0, 0.6]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    start, end = np.full(count, 0.05), random.uniform(0.3, 2.0, count)
+    tensors = [torch.from_numpy(part).float() for part in (origin, direction, start, end, height)]
+    found = torch.empty(count)
+    step = 0.002
+    inputs = [*(warp_array(part, kind) for part, kind in zip(tensors, (wp.vec3, wp.vec3, None, None, None), strict=True)), width, step]
+    launch(meet_columns, count, inputs, [warp_array(found)], warp_device(found))
+    for ray in range(count):
+        along = start[ray] + step * np.arange(int(np.ceil((end[ray] - start[ray]) / step)))
+        place = origin[ray] + along[:, None] * direction[ray]
+        column = np.floor(place[:, :2] / width).astype(int)
+        outside = ((column < 0) | (column >= height.shape)).any(1)
+        met = outside | (place[:, 2] <= height[tuple(np.where(outside[:, None], 0, column).T)])
+        expected = along[met.argmax()] if met.any() else -1.0
+        assert float(found[ray]) == pytest.approx(expected, abs=2 * step)
+
+
+def test_a_pit_holds_what_is_below_its_lid_and_above_its_floor() -> None:
+    depth = np.zeros((4, 3))
+    depth[1, 1], depth[2, 1] = 0.5, 0.2
+    pit = Pit(np.eye(3), np.array([-0.2, -0.15]), 0.1, np.full((4, 3), 1.0), depth)
+    places = np.array(
+        [[-0.05, 0, 0.6], [-0.05, 0, 0.4], [0.05, 0, 0.9], [0.05, 0, 0.7], [0.05, 0, 1.05], [0.05, 0, 1.3], [0.15, 0, 0.95], [9, 9, 0.9]]
+    )
+    assert pit.holds(places[:, None, None], 0.1).ravel().tolist() == [True, False, True, False, True, False, False, False]
