@@ -32,7 +32,7 @@ GRAIN, JPEG_QUALITY = 0.01, 88
 MASK_WIDE, MASK_OFF, MASK_WAVES = 0.7, 1.0, 12.0
 """By how many pixels masks are too wide in the mean, how much that differs along an outline, and over how many pixels."""
 TURNED_OFF, MOVED_OFF = 0.02, 2e-4
-"""Of cameras, standard deviations: degrees about each axis, and of their distance from the middle, along each. A quarter of a pixel of 400 each."""
+"""Of cameras, standard deviations: degrees about each axis, and of their distance from the middle, along each. A quarter and a seventh of a pixel of 400."""
 INVERSIONS = 30
 """Steps of a fixed point that falls by more than half in each."""
 
