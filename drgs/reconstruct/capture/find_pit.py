@@ -9,8 +9,7 @@ In: a lid of the hull and rays through it. Out: the depth of the object below it
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from numpy import ndarray
 from scipy import ndimage
 from torch import Tensor
 
-from drgs.reconstruct.capture.hull_rays import SolidRays
+from drgs.reconstruct.capture.hull_rays import SolidRays, seen_from_elsewhere
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.warp_torch import as_in_thread_pool, launch, warp_array, warp_device
@@ -37,17 +36,17 @@ MOST_DIFFERENCE = 0.3
 class PitSettings:
     """Lengths are shares of half of the hull's longest side."""
 
-    least_lid: float = 1.0
-    """Share of the hull's vertices that a lid has, at least: 0.03 is good. 1: no pits are looked for."""
+    least_lid: float = 0.03
+    """Share of the hull's vertices that a lid has, at least. 1: no pits are looked for."""
     column: float = 0.025
     """Width."""
     walls: tuple[float, ...] = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
     """Of floors that are tried at first: so far inside the lid's border."""
     depths: tuple[float, ...] = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.7, 0.9)
     blocks: tuple[float, ...] = (0.4, 0.2, 0.1)
-    """Widths. After the first ..."""
-    promising: float = 0.8
-    """... this share of the lid's difference may be left, at most."""
+    """Widths."""
+    promising: tuple[float, float] = (0.9, 0.7)
+    """Shares of the lid's difference that may be left, at most: by one floor and wall, and after the first blocks. Beds and pots leave 0.53 to 0.71 and 0.53 to 0.6."""
     rays: int = 8_000
     """Through the lid, at most: so few that one thread is as fast as all, and waits for no other."""
     shallow: float = 0.04
@@ -92,6 +91,7 @@ def find_pit(
     looks: SolidRays,
     outer: AbstractTracer,
     radius: float,
+    cell: float,
     settings: PitSettings,
 ) -> Pit | None:
     """None where nothing explains more.
@@ -101,11 +101,12 @@ def find_pit(
         direction: the lid's, outward.
         looks: through the lid.
         outer: the hull.
+        cell: side of what counts as one place [world units].
     """
     columns = _Columns.below(lid, direction, outer, radius, settings)
     if int(columns.inside.sum()) < settings.least:
         return None
-    search = _Search(columns, _Rays.of(looks, columns, outer, radius, settings), radius, settings)
+    search = _Search(columns, _Rays.of(looks, columns, outer, radius, settings), radius, cell, settings)
     with as_in_thread_pool():
         depth = search.best()
     if depth is None:
@@ -233,33 +234,18 @@ class _Rays:
         return torch.where(found < 0, self.returns, found)
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Search:
-    """Final. Of the depths that leave least."""
+    """Of the depths that leave least."""
 
     columns: _Columns
     rays: _Rays
     radius: float
+    cell: float
     settings: PitSettings
-    cells: float = field(init=False)
-    low: Float[Tensor, "3"] = field(init=False)
-    counts: Int[Tensor, "3"] = field(init=False)
-    of_view: Float[Tensor, "cell_and_view 4"] = field(init=False)
-    """Zeros between two looks: to make them anew takes longer than all the rest."""
-
-    def __post_init__(self) -> None:
-        self.cells = 0.03 * self.radius
-        ends = torch.cat([self.rays.at(self.rays.enters), self.rays.at(self.rays.leaves)])
-        self.low, high = ends.amin(0), ends.amax(0)
-        self.counts = ((high - self.low) / self.cells).long() + 1
-        self.of_view = ends.new_zeros(int(self.counts.prod()) * self.views, 4)
-
-    @cached_property
-    def views(self) -> int:
-        return int(self.rays.view.max()) + 1
 
     def best(self) -> Float[ndarray, "u v"] | None:
-        """None where large blocks leave too much already, and where there is no rim."""
+        """None where one floor or large blocks leave too much already, and where there is no rim."""
         settings, inside = self.settings, self.columns.inside
         depth = np.zeros(inside.shape)
         whole = least = self.left(depth)
@@ -268,13 +254,15 @@ class _Search:
             for deep in settings.depths:
                 trial = np.where(within > wall * self.radius, deep * self.radius, 0.0)
                 least, depth = min((least, depth), (self.left(trial), trial), key=lambda pair: pair[0])
+        if least > settings.promising[0] * whole:
+            return None
         for number, width in enumerate(settings.blocks):
             for block in self._blocks(max(1, round(width / settings.column))):
                 for deep in self._depths_to_try(depth, block) if number else (0.0, *settings.depths):
                     trial = depth.copy()
                     trial[block] = deep * self.radius
                     least, depth = min((least, depth), (self.left(trial), trial), key=lambda pair: pair[0])
-            if (number == 0 and least > settings.promising * whole) or not self._has_rim(depth):
+            if (number == 0 and least > settings.promising[1] * whole) or not self._has_rim(depth):
                 return None
         return depth
 
@@ -308,14 +296,8 @@ class _Search:
         heights = np.where(self.columns.inside, self.columns.lid - np.minimum(depth, self.columns.most), FAR)
         distance = rays.ends(torch.from_numpy(heights).to(rays.origin), self.columns.width)
         ended = distance >= 0
-        cell = ((rays.at(distance) - self.low) / self.cells).long().clamp(min=0).minimum(self.counts - 1)
-        cell = (cell[:, 0] * self.counts[1] + cell[:, 1]) * self.counts[2] + cell[:, 2]
-        counted = torch.cat([rays.colors, torch.ones_like(rays.colors[:, :1])], 1) * ended[:, None]
-        pair = cell * self.views + rays.view
-        of_cell = counted.new_zeros(int(self.counts.prod()), 4).index_add_(0, cell, counted)
-        others = of_cell[cell] - self.of_view.index_add_(0, pair, counted)[pair]
-        self.of_view.index_fill_(0, pair, 0.0)
-        difference = (rays.colors - others[:, :3] / others[:, 3:].clamp(min=1)).abs().mean(1).clamp(max=MOST_DIFFERENCE)
-        known = (others[:, 3] > 0.5) | ~ended
+        mean, seen = seen_from_elsewhere(rays.at(distance), ended, rays.colors, rays.view, self.cell)
+        difference = (rays.colors - mean).abs().mean(1).clamp(max=MOST_DIFFERENCE)
         difference = torch.where(ended, difference, torch.full_like(difference, MOST_DIFFERENCE))
+        known = seen | ~ended
         return float(difference[known].mean()) if bool(known.any()) else MOST_DIFFERENCE

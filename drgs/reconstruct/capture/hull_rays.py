@@ -103,6 +103,36 @@ class SolidRays:
         return SolidRays(self.rays[chosen], self.colors[chosen], self.view[chosen], self.face[chosen])
 
 
+def seen_from_elsewhere(
+    places: Float[Tensor, "ray 3"],
+    ended: Bool[Tensor, "ray"],
+    colors: Float[Tensor, "ray 3"],
+    view: Int[Tensor, "ray"],
+    cell: float,
+) -> tuple[Float[Tensor, "ray 3"], Bool[Tensor, "ray"]]:
+    """Mean colour of other views' rays that end in the same cell, and whether there are any.
+
+    Args:
+        places: where rays end.
+        ended: on something; what did not is no ray that others see.
+        cell: side of what counts as one place [world units].
+    """
+    corner = torch.floor(places / cell).long()
+    corner -= corner.amin(0)
+    place = (corner[:, 0] * (corner[:, 1].max() + 1) + corner[:, 1]) * (corner[:, 2].max() + 1) + corner[:, 2]
+    order = (place * (int(view.max()) + 1) + view).argsort(stable=True)
+    place, view = place[order], view[order]
+    new_place = torch.cat([place.new_zeros(1, dtype=torch.bool), place[1:] != place[:-1]])
+    new_pair = new_place | torch.cat([new_place[:1], view[1:] != view[:-1]])
+    place, pair = new_place.cumsum(0), new_pair.cumsum(0)
+    counted = (torch.cat([colors, torch.ones_like(colors[:, :1])], 1) * ended[:, None])[order]
+    of_view = counted.new_zeros(int(pair[-1]) + 1, 4).index_add_(0, pair, counted)
+    of_place = counted.new_zeros(int(place[-1]) + 1, 4).index_add_(0, place, counted)
+    others = torch.empty_like(counted)
+    others[order] = of_place[place] - of_view[pair]
+    return others[:, :3] / others[:, 3:].clamp(min=1), others[:, 3] > 0.5
+
+
 def patches(chosen: Bool[Tensor, "vertex"], faces: Int[Tensor, "face 3"]) -> Int[Tensor, "vertex"]:
     """A number for each vertex: equal where chosen vertices hang together, one of its own for every other."""
     marks = chosen.cpu().numpy()

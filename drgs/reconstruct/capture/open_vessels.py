@@ -31,6 +31,7 @@ from drgs.reconstruct.capture.hull_rays import (
     large_patches,
     object_targets,
     patches,
+    seen_from_elsewhere,
     surface_of,
     surface_of_hull,
     unlikeness,
@@ -231,7 +232,7 @@ class _Search:
         looks = self.looks[(lid.vertices[self.outer.mesh.faces.long()].sum(1) >= 2)[self.looks.face]]
         if len(looks) == 0:
             return None
-        pit = find_pit(lid.vertices, lid.direction, looks, self.outer, self.radius, settings.pits)
+        pit = find_pit(lid.vertices, lid.direction, looks, self.outer, self.radius, cell, settings.pits)
         if pit is None:
             return None
         holds = pit.holds(self.places, 2 * self.cell)
@@ -314,18 +315,7 @@ def _difference(looks: SolidRays, surface: AbstractTracer, cell: float) -> _Diff
     origin, direction = looks.rays.origin, looks.rays.direction
     hits = trace_rays(origin, direction, surface)
     place = origin + torch.where(hits.hit, hits.distance, torch.zeros_like(hits.distance))[:, None] * direction
-    corner = torch.floor(place / cell).long()
-    corner -= corner.amin(0)
-    _, place = torch.unique(
-        (corner[:, 0] * (corner[:, 1].max() + 1) + corner[:, 1]) * (corner[:, 2].max() + 1) + corner[:, 2], return_inverse=True
-    )
-    _, pair = torch.unique(place * (int(looks.view.max()) + 1) + looks.view, return_inverse=True)
-    counted = torch.cat([looks.colors, torch.ones_like(looks.colors[:, :1])], 1)
-    of_view = counted.new_zeros(int(pair.max()) + 1, 4).index_add_(0, pair, counted)
-    of_place = counted.new_zeros(int(place.max()) + 1, 4).index_add_(0, place, counted)
-    others = of_place[place] - of_view[pair]
-    seen = hits.hit & (others[:, 3] > 0.5)
-    mean = others[:, :3] / others[:, 3:].clamp(min=1)
+    mean, seen = seen_from_elsewhere(place, hits.hit, looks.colors, looks.view, cell)
     difference = torch.where(hits.hit, (looks.colors - mean).abs().mean(1), torch.ones_like(mean[:, 0]))
     ordered = difference[seen | ~hits.hit].sort().values
     if len(ordered) == 0:

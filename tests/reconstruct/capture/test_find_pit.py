@@ -22,7 +22,7 @@ HALF = np.array([0.6, 0.45, 0.16])
 FLOOR_Z, RIM_Z = -0.1, 0.16
 ALONG, ACROSS = 0.42, 0.33
 """Half of the room's sides."""
-SETTINGS = VesselSettings(nodes=72, bounded=2.0, pits=PitSettings(least_lid=0.03))
+SETTINGS = VesselSettings(nodes=72, bounded=2.0)
 """Whatever runs around a lid, it is no vessel's."""
 
 
@@ -73,15 +73,21 @@ def test_a_tray_is_open_but_for_its_walls_and_the_block_in_it(white_tray: Views,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", ["ball", "drum"])
-def test_what_satin_metal_mirrors_is_no_pit_for_it_has_no_rim(shape: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("shape", "promising"),
+    [("ball", PitSettings().promising), ("drum", PitSettings().promising), ("ball", (1.0, 1.0))],
+    ids=["ball", "drum", "ball, searched to the end"],
+)
+def test_what_satin_metal_mirrors_is_no_pit_for_it_has_no_rim(
+    shape: str, promising: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     mesh = trimesh.creation.icosphere(4, radius=0.6) if shape == "ball" else trimesh.creation.cylinder(radius=0.5, height=0.9)
     views = photographed(tracer_of(mesh), satin, 32)
     hull = hull_of(views)
     asked = []
     find = module.find_pit
     monkeypatch.setattr(module, "find_pit", lambda *given: asked.append(find(*given)) or asked[-1])
-    assert open_vessels(views, hull, SETTINGS, CPU) is hull
+    assert open_vessels(views, hull, replace(SETTINGS, pits=PitSettings(promising=promising)), CPU) is hull
     assert asked
 
 
