@@ -20,12 +20,16 @@ def environment_table(parameters: dict[str, Tensor]) -> Float[Tensor, "128 256 3
     """(128, 256, 3) linear radiance; exp keeps it positive and lets a lamp be a thousand times the sky."""
     log_radiance = parameters[f"environment_{ENVIRONMENT_PYRAMID[-1]}"]
     for rows in ENVIRONMENT_PYRAMID[:-1]:
-        coarse = parameters[f"environment_{rows}"]
-        wrapped = torch.cat([coarse[..., -1:], coarse, coarse[..., :1]], -1)
-        scale = ENVIRONMENT_PYRAMID[-1] // rows
-        fine = torch.nn.functional.interpolate(wrapped, scale_factor=scale, mode="bilinear", align_corners=False)
-        log_radiance = log_radiance + fine[..., scale:-scale]
+        log_radiance = log_radiance + upsampled(parameters[f"environment_{rows}"], ENVIRONMENT_PYRAMID[-1])
     return log_radiance[0].permute(1, 2, 0).clamp(-8, 8).exp()
+
+
+def upsampled(coarse: Float[Tensor, "1 3 rows columns"], rows: int) -> Float[Tensor, "1 3 {rows} 2*{rows}"]:
+    """A table of so many rows, a multiple of its own, linear between texels."""
+    scale = rows // coarse.shape[2]
+    wrapped = torch.cat([coarse[..., -1:], coarse, coarse[..., :1]], -1)
+    fine = torch.nn.functional.interpolate(wrapped, scale_factor=scale, mode="bilinear", align_corners=False)
+    return fine[..., scale:-scale]
 
 
 def background_image(background: Float[Tensor, "1 3 rows columns"], camera: Camera) -> Float[Tensor, "height width 3"]:

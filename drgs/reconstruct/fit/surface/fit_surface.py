@@ -76,6 +76,8 @@ class SurfaceSettings:
     fall_from: float = 0.5
     """Share of the steps after which rates fall, by a cosine to a twentieth; 1: they do not."""
     moves: MoveSettings = field(default_factory=MoveSettings)
+    looks_for_light: bool = False
+    """Before the first step, under which paint is alike on all sides (light_from_paint)."""
     still: bool = False
     """The surface stays where it is, and so do its metal and the light that arrives at it."""
     to_surface_end: float = 0.1
@@ -174,6 +176,8 @@ class _Steps:
         if iteration == 0 and not self.settings.still:
             self.surface.look_for_texture(self.settings.moves)
             self.move_surface()
+            if self.settings.looks_for_light:
+                self.surface.look_for_light(self.settings.moves)
         target = self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
         parameters = self.state.parameters
         environment = environment_table(parameters)

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
+from drgs.reconstruct.fit.evidence.light_from_paint import PaintLightSettings, light_from_paint
 from drgs.reconstruct.fit.evidence.matched_texture import matched_texture
 from drgs.reconstruct.fit.evidence.metal_evidence import light_scale, metal_evidence, view_sums
 from drgs.reconstruct.fit.fit_loop import FitState
-from drgs.reconstruct.fit.light.environment_pyramid import ENVIRONMENT_PYRAMID, environment_table
+from drgs.reconstruct.fit.light.environment_pyramid import ENVIRONMENT_PYRAMID, environment_table, upsampled
 from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, irradiance_share
-from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
 from drgs.reconstruct.fit.view_targets import ViewTarget
@@ -51,6 +52,8 @@ class MoveSettings:
     """A vertex, for the irradiance that arrives there."""
     texture_radius: float = 0.0
     """Of the object [world units], in shares of which texture is looked for before and behind the surface; 0: it is not looked for."""
+    paint_light: PaintLightSettings = field(default_factory=PaintLightSettings)
+    """By which paint is alike on all sides."""
     box: BuildBox | None = None
     """Of the build, which the surface does not leave."""
 
@@ -141,6 +144,37 @@ class MovingSurface:
         start, end = self.edges.vertices.unbind(1)
         alike = (normals[start] * normals[end]).sum(-1).clamp(min=0) ** ALIKE
         return averaged(averaging_matrix(self.edges, len(vertices), alike), share, SHARED_RINGS)
+
+    @torch.no_grad()
+    def look_for_light(self, settings: MoveSettings) -> None:
+        """The light under which paint is alike on all sides, and the paint's albedo under it. Light that turns with the camera shows paint from all sides already."""
+        if self._sky is not None:
+            return
+        parameters = self._state.parameters
+        radiance = environment_table(parameters)
+        light = MeshLight(filter_environment(radiance), parameters["open_share"])
+        self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
+        paint = parameters["metal"] <= 0
+        factor = light_from_paint(self.tracer, radiance, light, paint, settings.paint_light, self._state.generator)
+        if factor is None:
+            return
+        before = self.irradiance(light)
+        parameters[f"environment_{ENVIRONMENT_PYRAMID[1]}"] += upsampled(factor.log().permute(2, 0, 1)[None], ENVIRONMENT_PYRAMID[1])
+        self.relight(settings.share_rays)
+        after = self.irradiance(MeshLight(filter_environment(environment_table(parameters)), parameters["open_share"]))
+        albedo = torch.sigmoid(parameters["albedo_logits"])
+        changed = logits_of_shares(albedo * before / after.clamp(min=1e-6))
+        parameters["albedo_logits"].copy_(torch.where(paint[:, None], changed, parameters["albedo_logits"]))
+
+    def irradiance(self, light: MeshLight) -> Tensor:
+        """(vertex, 3), over pi, that arrives."""
+        normals = torch.nn.functional.normalize(self._state.parameters["normals"], dim=-1)
+        black, one = torch.zeros_like(normals), torch.ones_like(normals)
+        white, none = (
+            shade_split_sum(albedo, black, black, one[:, 0].contiguous(), normals, normals, light.tables, open_share=light.open_share)
+            for albedo in (one, black)
+        )
+        return white - none
 
     def light_of(self, tables: Tensor) -> LightOf:
         """What light arrives at the surface in each photograph.

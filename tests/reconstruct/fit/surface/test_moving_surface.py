@@ -73,3 +73,28 @@ def test_a_surface_that_moved_is_lit_anew_where_it_is_shaded_next_and_met_where_
     assert not torch.equal(state.parameters["vertices"], before)
     torch.testing.assert_close(surface.tracer.mesh.vertices, state.parameters["vertices"])
     assert bool((state.parameters["open_share"] != 1).any()) == relight
+
+
+@pytest.mark.slow
+def test_paint_that_light_is_taken_from_sends_what_it_sent(tmp_path: Path) -> None:
+    state, faces = two_spheres()
+    parameters = state.parameters
+    up = parameters["normals"][:, 2:]
+    with torch.no_grad():
+        parameters["albedo_logits"].copy_(logits_of_shares((0.4 + 0.2 * up).expand(-1, 3)))
+        parameters["metal"][0] = 1.0
+    surface = MovingSurface(painted_views(tmp_path), faces, state)
+    surface.relight(64)
+
+    @torch.no_grad()
+    def sent() -> torch.Tensor:
+        light = MeshLight(filter_environment(environment_table(parameters)), parameters["open_share"])
+        return torch.sigmoid(parameters["albedo_logits"]) * surface.irradiance(light)
+
+    before, metal = sent(), parameters["albedo_logits"][0].detach().clone()
+    surface.look_for_light(MoveSettings(share_rays=64))
+    change = (sent() / before).log()[1:]
+    assert float(change.abs().mean()) < 0.02
+    albedo = torch.sigmoid(parameters["albedo_logits"].detach()).mean(1)
+    assert float(albedo[up[:, 0] > 0.7].mean() / albedo[up[:, 0] < -0.7].mean()) < 0.5 * (0.57 / 0.23) + 0.5
+    torch.testing.assert_close(parameters["albedo_logits"][0].detach(), metal)

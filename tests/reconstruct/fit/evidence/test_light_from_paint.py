@@ -1,0 +1,118 @@
+"""Light that was taken for paint is found again, for paint is alike on all sides."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import nnls
+
+from drgs.reconstruct.fit.evidence.light_from_paint import PaintLightSettings, _non_negative, light_from_paint
+from drgs.reconstruct.fit.light.environment_pyramid import upsampled
+from drgs.reconstruct.fit.light.mesh_light import MeshLight
+from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
+from drgs.render.intersect.trace_rays import build_tracer
+from drgs.scene.environment import direction_from_uv
+from drgs.scene.mesh import TriangleMesh
+from tests.render.closed_form_scenes import sphere_mesh
+
+PAINTS = torch.tensor([[0.5, 0.2, 0.1], [0.1, 0.2, 0.4], [0.3, 0.35, 0.3]])
+
+
+def lamp_above(strength: float = 12.0) -> torch.Tensor:
+    """(128, 256, 3): an even room with a lamp somewhat aside of the pole."""
+    v, u = torch.meshgrid((torch.arange(128) + 0.5) / 128, (torch.arange(256) + 0.5) / 256, indexing="ij")
+    towards = torch.nn.functional.normalize(torch.tensor([0.5, 0.2, 1.0]), dim=0)
+    cosine = (direction_from_uv(torch.stack([u, v], -1)) * towards).sum(-1)
+    return 0.3 + strength * (cosine > 0.95).float()[..., None].expand(128, 256, 3)
+
+
+def irradiance(mesh: TriangleMesh, radiance: torch.Tensor) -> torch.Tensor:
+    """(vertex, 3), over pi, where nothing is in the way."""
+    black, one = torch.zeros_like(mesh.normals), torch.ones_like(mesh.normals)
+    tables, rough = filter_environment(radiance), one[:, 0].contiguous()
+    return shade_split_sum(one, black, black, rough, mesh.normals, mesh.normals, tables) - shade_split_sum(
+        black, black, black, rough, mesh.normals, mesh.normals, tables
+    )
+
+
+def misread_sphere(true_light: torch.Tensor) -> tuple[TriangleMesh, torch.Tensor, torch.Tensor]:
+    """A sphere in patches of three paints, what each vertex truly is, and an even light under which other paint looks the same."""
+    mesh = sphere_mesh(subdivisions=4, albedo=0.5, roughness=0.9)
+    place = (3 * mesh.vertices).floor().long()
+    paint = PAINTS[(place * torch.tensor([1, 2, 5])).sum(1) % 3]
+    even = torch.full((128, 256, 3), 1.2)
+    taken = paint * irradiance(mesh, true_light) / irradiance(mesh, even)
+    return replace(mesh, albedo=taken.clamp(max=0.99), metallic=torch.zeros(len(paint))), paint, even
+
+
+def found_under(mesh: TriangleMesh, light: torch.Tensor, settings: PaintLightSettings) -> torch.Tensor | None:
+    """The environment after light_from_paint."""
+    open_light = MeshLight(filter_environment(light), torch.ones_like(mesh.vertices))
+    paint = mesh.metallic < 0.5
+    factor = light_from_paint(build_tracer(mesh), light, open_light, paint, settings, torch.Generator().manual_seed(0))
+    return None if factor is None else light * upsampled(factor.log().permute(2, 0, 1)[None], 128)[0].permute(1, 2, 0).exp()
+
+
+def unlikeness(mesh: TriangleMesh, paint: torch.Tensor, before: torch.Tensor, after: torch.Tensor) -> float:
+    """Standard deviation of the logarithm of albedo over what is true, once the light has changed."""
+    albedo = mesh.albedo * irradiance(mesh, before) / irradiance(mesh, after)
+    return float((albedo / paint).log().std())
+
+
+@pytest.mark.slow
+def test_a_lamp_that_was_painted_on_is_light_again_after_a_few_calls():
+    true_light = lamp_above()
+    mesh, paint, light = misread_sphere(true_light)
+    first = light
+    for _ in range(4):
+        found = found_under(
+            replace(mesh, albedo=mesh.albedo * irradiance(mesh, first) / irradiance(mesh, light)), light, PaintLightSettings()
+        )
+        assert found is not None
+        light = found
+    assert unlikeness(mesh, paint, first, first) > 0.25
+    assert unlikeness(mesh, paint, first, light) < 0.08
+    lamp = true_light[..., 0] > 1
+    assert float(light[lamp].mean()) > 3 * float(light[~lamp].mean())
+
+
+@pytest.mark.slow
+def test_light_that_is_right_stays_about_as_it_is():
+    light = lamp_above(4.0)
+    mesh = misread_sphere(light)[0]
+    mesh = replace(mesh, albedo=misread_sphere(light)[1])
+    found = found_under(mesh, light, PaintLightSettings())
+    assert found is not None
+    change = (irradiance(mesh, found) / irradiance(mesh, light)).log()
+    assert float(change.std()) < 0.03 and abs(float(change.mean())) < 0.02
+
+
+@pytest.mark.slow
+def test_as_a_whole_it_is_as_bright_as_it_was_but_for_paint_that_would_be_white():
+    mesh, _, light = misread_sphere(lamp_above(4.0))
+    dim = replace(mesh, albedo=0.5 * mesh.albedo / mesh.albedo.max())
+    found = found_under(dim, light, PaintLightSettings())
+    assert found is not None
+    assert abs(float((irradiance(dim, found) / irradiance(dim, light)).log().mean())) < 0.03
+    bright = replace(mesh, albedo=0.99 * mesh.albedo / mesh.albedo.max())
+    found = found_under(bright, light, PaintLightSettings(brightest=0.3))
+    assert found is not None
+    assert float((bright.albedo * irradiance(bright, light) / irradiance(bright, found)).quantile(0.95)) < 0.33
+
+
+def test_nothing_follows_from_metal_with_little_paint():
+    mesh, _, light = misread_sphere(lamp_above())
+    metal = replace(mesh, metallic=(mesh.vertices[:, 2] < 0.98).float())
+    assert found_under(metal, light, PaintLightSettings()) is None
+
+
+@pytest.mark.parametrize("hold", [0.0, 0.1])
+def test_the_solve_is_that_of_active_sets(hold: float):
+    random = np.random.default_rng(0)
+    matrix, wanted = random.uniform(0, 1, (60, 12)), random.normal(0.4, 1, 60)
+    home, held = random.uniform(0, 1, 12), hold * random.uniform(0.5, 1, 12)
+    rows = np.concatenate([matrix / np.sqrt(60), np.diag(np.sqrt(held))])
+    right = nnls(rows, np.concatenate([wanted / np.sqrt(60), np.sqrt(held) * home]))[0]
+    found = _non_negative(*(torch.from_numpy(part) for part in (matrix, wanted, held, home, home)), 4000)
+    assert float(np.abs(found.numpy() - right).max()) < 1e-3 and (right == 0).any()
