@@ -56,8 +56,8 @@ class PassSettings:
     """Passes, counted from 1, after which narrow hollows are tried without what may fill them. No preset does so
     before whole builds say that it pays (docs/decisions/0003). Not those of try_after: stopped in the second of two trials, a
     build would repeat the first."""
-    light_from: int = 2
-    """The first pass, counted from 1, at whose start light is looked for that makes paint alike on all sides; of those after it, too."""
+    light_before: tuple[int, ...] = (2, 3, 4, 5)
+    """Passes, counted from 1, before which light is looked for that makes paint alike on all sides. Not before all of many: each time light gets rougher."""
     division: DivisionSettings = field(default_factory=DivisionSettings)
     """How fine faces are divided after the last pass."""
     relief_steps: int = 70
@@ -116,7 +116,7 @@ def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
         weight_smooth_end=between(given.weight_smooth, given.weight_smooth_end, index + 1),
         fall_from=given.fall_from if last else 1.0,
         light_at_end=last,
-        looks_for_light=index + 1 >= settings.light_from,
+        looks_for_light=index + 1 in settings.light_before,
         moves=replace(given.moves, to_surface=given.to_surface_end) if last else given.moves,
         seed=given.seed + index,
     )
