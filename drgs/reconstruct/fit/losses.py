@@ -46,15 +46,14 @@ def edge_aware_smoothness(
 
 
 def white_light(environment_radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, ""]:
-    """Scalar: mean over directions of how far the light's colour is from grey, each by its share of all light.
+    """Scalar: mean over directions of the light's distance from its own grey, relative to its brightness, each by its share of all light.
 
-    Light is whiter than paint: without this, colour wanders between the two (Liu et al. 2023; docs/sources.md: liu2023nero). Of logarithms, for a
-    distance in radiance is less where light is dimmer: brightness, which light and paint trade without a trace in photographs, then all goes to paint.
+    Light is whiter than paint: without this, colour wanders between the two (Liu et al. 2023; docs/sources.md: liu2023nero). Relative in its gradient, too:
+    else it is less where light is dimmer, and brightness, which light and paint trade without a trace in photographs, all goes to paint.
     """
-    log = torch.log(environment_radiance.clamp(min=1e-4))
-    distance = (log - log.mean(-1, keepdim=True)).abs().mean(-1, keepdim=True)
-    share = (environment_radiance.mean(-1, keepdim=True) * texel_areas(environment_radiance)).detach()
-    return (distance * share).sum() / share.sum().clamp(min=1e-6)
+    grey = environment_radiance.mean(-1, keepdim=True).clamp(min=1e-6)
+    share = (grey * texel_areas(environment_radiance)).detach()
+    return ((environment_radiance / grey - 1).abs().mean(-1, keepdim=True) * share).sum() / share.sum()
 
 
 def rough_light(environment_radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, ""]:
