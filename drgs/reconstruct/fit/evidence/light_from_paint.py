@@ -40,7 +40,7 @@ class PaintLightSettings:
 
     rows: int = 16
     """Of the table in which light is solved."""
-    places: int = 3000
+    places: int = 2000
     """Drawn by area."""
     fewest: int = 200
     """Of them that are paint; with fewer the light stays."""
@@ -52,7 +52,7 @@ class PaintLightSettings:
     """Relative error up to which places count by its square; beyond by its amount."""
     hold: float = 0.2
     """Of the light so far, against the places' mean squared relative error."""
-    rounds: int = 12
+    rounds: int = 8
     """Albedo and light in turns."""
     steps: int = 100
     """Of each solve."""
