@@ -54,6 +54,12 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     return torch.nn.functional.normalize(normals, dim=-1, eps=1e-30)  # areas of a small object's faces are tiny numbers
 
 
+def face_areas(vertices: Tensor, faces: Tensor) -> Tensor:
+    """(face,), in squared units of the vertices."""
+    corners = vertices[faces.long()]
+    return torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1) / 2
+
+
 def refuse_unusable(mesh: TriangleMesh, name: str) -> None:
     """The door for meshes of strangers.
 

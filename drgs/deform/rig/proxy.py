@@ -21,6 +21,7 @@ from torch import Tensor
 from drgs.deform.carry.drive_mesh import DEGENERATE
 from drgs.deform.carry.gmls import GmlsSettings, Weights, build_weights, interpolate
 from drgs.maths.unique_rows import unique_rows
+from drgs.scene.mesh import face_areas
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -165,8 +166,7 @@ def bind_to_proxy(
         ValueError: the proxy has no faces with area.
     """
     vertices, faces = vertices.double().to(points.device), faces.long().to(points.device)
-    corners = vertices[faces]
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)
+    area = face_areas(vertices, faces)
     faces = faces[area > DEGENERATE * area.median().clamp(min=1e-300)] if len(area) else faces
     if not len(faces):
         raise ValueError("the rig's mesh has no faces with area")
@@ -272,7 +272,7 @@ def _samples(
     """Face (sample,), barycentrics (sample, 3) and area (sample,): middles of the n * n small triangles that each face is cut into."""
     corners = vertices[faces]
     longest = torch.stack([(corners[:, k] - corners[:, k - 1]).norm(dim=-1) for k in range(3)], -1).amax(-1)
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1) / 2
+    area = face_areas(vertices, faces)
     cuts = torch.ceil(longest / spacing).clamp(min=1).long()
     while int((cuts**2).sum()) > MOST_SAMPLES and int(cuts.max()) > 1:
         cuts = torch.ceil(cuts / 2).long()

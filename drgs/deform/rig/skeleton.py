@@ -17,6 +17,7 @@ from torch import Tensor
 from drgs.deform.carry.drive_mesh import vertex_gradients
 from drgs.exchange.rig import Rig, RigAnimation, RigChannel, RigMesh, RigNode
 from drgs.maths.unique_rows import unique_rows
+from drgs.scene.mesh import face_areas
 
 NEARLY_ALIKE = 1 - 1e-9
 """Cosine of half the angle between rotations above which they are blended straight: the sphere's formula divides by its sine."""
@@ -66,8 +67,7 @@ def pose_rig(rig: Rig, animation: RigAnimation | None = None, seconds: float = 0
 def rig_gradients(rest: RigPose, moved: RigPose) -> Float[Tensor, "vertex 3 3"]:
     """(vertex, 3, 3) float64 deformation gradients; a part's vertices in one place at rest (seams of texture) share theirs."""
     gradient = vertex_gradients(rest.vertices, moved.vertices, rest.faces)
-    a, b, c = rest.vertices[rest.faces.long()].unbind(1)
-    area = torch.linalg.cross(b - a, c - a).norm(dim=-1)
+    area = face_areas(rest.vertices, rest.faces)
     weight = torch.zeros(len(rest.vertices), dtype=torch.float64).index_add_(0, rest.faces.reshape(-1).long(), area.repeat_interleave(3))
     _, place = unique_rows(torch.cat([rest.vertices, rest.parts[:, None].double()], 1))
     total = torch.zeros(int(place.max()) + 1, dtype=torch.float64).index_add_(0, place, weight)

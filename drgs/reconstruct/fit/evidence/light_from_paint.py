@@ -27,6 +27,7 @@ from drgs.reconstruct.fit.light.mesh_light import SHARE_LIFT, MeshLight, radianc
 from drgs.reconstruct.fit.light.split_sum import texel_solid_angles
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.environment import direction_from_uv
+from drgs.scene.mesh import face_areas
 
 DARKEST = 1e-3
 """Radiance below which errors count as absolute rather than relative."""
@@ -93,18 +94,15 @@ def light_from_paint(
     solved = solved * (before / after).log().mean(0).exp()
     # ... but for as much as leaves albedo room below white.
     area = _solid_angles(settings.rows).to(known)[:, None]
-    albedos = torch.cat([
-        sent / (shares @ solved + from_object).clamp(min=DARKEST), mesh.albedo[metal] * (known * area).sum(0) / (solved * area).sum(0)
-    ])  # fmt: skip
+    whole = (known * area).sum(0) / (solved * area).sum(0).clamp(min=DARKEST)
+    albedos = torch.cat([sent / (shares @ solved + from_object).clamp(min=DARKEST), mesh.albedo[metal] * whole])
     solved = solved * max(1.0, float(albedos.amax(1).quantile(settings.share_below)) / settings.brightest)
     return (solved / known.clamp(min=1e-6)).clamp(1 / settings.most, settings.most).view(settings.rows, 2 * settings.rows, 3)
 
 
 def _drawn(tracer: AbstractTracer, count: int, generator: torch.Generator) -> Int[Tensor, "place"]:
     """Vertices, by the area of a face around them."""
-    faces, vertices = tracer.mesh.faces.long(), tracer.mesh.vertices
-    first, second, third = vertices[faces].unbind(1)
-    area = torch.linalg.cross(second - first, third - first).norm(dim=1)
+    faces, area = tracer.mesh.faces.long(), face_areas(tracer.mesh.vertices, tracer.mesh.faces)
     return faces[torch.multinomial(area.cpu(), count, replacement=True, generator=generator).to(faces.device), 0].unique()
 
 

@@ -107,6 +107,22 @@ def test_nothing_follows_from_metal_with_little_paint():
     assert found_under(metal, light, PaintLightSettings()) is None
 
 
+@pytest.mark.parametrize("dark", ["paint", "light", "all but a lamp's red"])
+def test_factors_are_finite_in_the_dark(dark: str):
+    mesh, _, light = misread_sphere(lamp_above())
+    mesh = replace(mesh, metallic=(mesh.vertices[:, 0] > 0.5).float())
+    if dark == "paint":
+        mesh = replace(mesh, albedo=torch.full_like(mesh.albedo, 0.005))
+    elif dark == "light":
+        light = torch.full_like(light, 3e-4)
+    else:
+        light = lamp_above() * torch.tensor([1.0, 1e-4, 1e-4])
+    found = found_under(mesh, light, PaintLightSettings())
+    assert found is not None and bool(found.isfinite().all())
+    most = PaintLightSettings().most
+    assert float((found / light).max()) <= 1.001 * most and float((found / light).min()) >= 0.999 / most
+
+
 @pytest.mark.parametrize("hold", [0.0, 0.1])
 def test_the_solve_is_that_of_active_sets(hold: float):
     random = np.random.default_rng(0)
