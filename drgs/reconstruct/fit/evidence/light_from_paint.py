@@ -1,14 +1,15 @@
 """The light under which paint of one colour is alike on all sides of the object.
 
 Gradients leave light and paint where they began: a lamp above that stage 1 missed has become brighter paint on all that faces up and darker paint on
-all that faces down, every photograph is explained, and nothing calls it back. But objects wear few paints, and wear them on several sides. With the
+all that faces down, every photograph is explained, and nothing calls it back. But objects wear few paints, and wear them around bends. With the
 radiance R_i that paint sends at places i, the share T_ij of direction j's radiance that arrives there, and what the object itself sends to it, I_i,
 
     R_i = a_i (sum_j T_ij L_j + I_i)
 
-so albedo follows from light. Which light: that under which places of alike chroma and brightness have alike albedo, most of them, in relative terms.
+so albedo follows from light. Which light: that under which places of alike chroma and brightness, near each other, have alike albedo, most of them, in
+relative terms. Near each other, for else an object whose upper half is white and whose lower half is grey would be told to be of one paint.
 Each place's albedo is held against the mean of places like it, light is solved for these means by non-negative least squares with what the fit had as a
-faint prior, and albedo is taken anew from it; again until they agree. The brightness of places alike may differ by half, so that this finds what
+faint prior, and albedo is taken anew from it; again until they agree. The brightness of places alike may differ by a third, so that this finds what
 gradients do not.
 
 Source: places of alike chroma have one reflectance (docs/sources.md: garces2012), here on a surface and with light by direction; steps of beck2009.
@@ -47,13 +48,17 @@ class PaintLightSettings:
     """Of them that are paint; with fewer the light stays."""
     alike_chroma: float = 0.09
     """Of logarithms, less their mean: standard deviation of the kernel by which albedos are alike ..."""
-    alike_brightness: float = 0.5
-    """... and that of their mean."""
+    alike_brightness: float = 0.35
+    """... that of their mean ..."""
+    alike_place: float = 0.4
+    """... and that of where they are, over the root mean squared distance of places from their middle."""
     noise: float = 0.1
     """Relative error up to which places count by its square; beyond by its amount."""
     hold: float = 0.2
     """Of the light so far, against the places' mean squared relative error."""
-    rounds: int = 8
+    stride: float = 1.6
+    """Albedo goes towards the mean of places like it by this much of the way: beyond, for from round to round means of the near change but slowly."""
+    rounds: int = 12
     """Albedo and light in turns."""
     steps: int = 100
     """Of each solve."""
@@ -88,7 +93,7 @@ def light_from_paint(
     shares, from_object = _arriving(tracer, chosen, light, settings.rows, generator)
     albedo = mesh.albedo[chosen] * (1 - mesh.metallic[chosen])[:, None]
     sent = (albedo * (shares @ known + from_object)).clamp(min=DARKEST)
-    solved = _solved(shares, from_object, sent, known, settings)
+    solved = _solved(mesh.vertices[chosen], shares, from_object, sent, known, settings)
     # How bright and of what colour light is as a whole it trades with albedo, and places that are alike say nothing of it: so it stays, ...
     before, after = ((shares @ radiance_of + from_object).clamp(min=DARKEST) for radiance_of in (known, solved))
     solved = solved * (before / after).log().mean(0).exp()
@@ -141,6 +146,7 @@ def _arriving(
 
 
 def _solved(
+    positions: Float[Tensor, "place 3"],
     shares: Float[Tensor, "place texel"],
     from_object: Float[Tensor, "place 3"],
     sent: Float[Tensor, "place 3"],
@@ -153,11 +159,14 @@ def _solved(
         sent: radiance, above 0. known: the light so far.
     """
     light = known
+    middle = positions - positions.mean(0)
+    where = middle / (settings.alike_place * middle.square().sum(1).mean().sqrt())
     solid_angle = (_solid_angles(settings.rows) / (4 * math.pi)).to(known)[:, None]
     unit = known + (known * solid_angle).sum(0)  # a texel's steps are relative, for those that are dark to their mean
     for _ in range(settings.rounds):
         arriving = (shares @ light + from_object).clamp(min=1e-4)
-        alike = _mean_of_alike((sent / arriving).clamp(DARKEST, BRIGHTEST).log(), settings).exp()
+        log_albedo = (sent / arriving).clamp(DARKEST, BRIGHTEST).log()
+        alike = (log_albedo + settings.stride * (_mean_of_alike(log_albedo, where, settings) - log_albedo)).exp()
         error = ((sent - alike * arriving) / sent).abs().mean(1)
         weight = error.clamp(min=settings.noise).rsqrt()
         weight = weight / weight.mean()
@@ -180,10 +189,16 @@ def _solved(
     return light
 
 
-def _mean_of_alike(log_albedo: Float[Tensor, "place 3"], settings: PaintLightSettings) -> Float[Tensor, "place 3"]:
-    """Of places with alike chroma and brightness."""
+def _mean_of_alike(
+    log_albedo: Float[Tensor, "place 3"], where: Float[Tensor, "place 3"], settings: PaintLightSettings
+) -> Float[Tensor, "place 3"]:
+    """Of places with alike chroma and brightness near each other.
+
+    Args:
+        where: in standard deviations of the kernel.
+    """
     brightness = log_albedo.mean(1, keepdim=True)
-    scaled = torch.cat([(log_albedo - brightness) / settings.alike_chroma, brightness / settings.alike_brightness], 1)
+    scaled = torch.cat([(log_albedo - brightness) / settings.alike_chroma, brightness / settings.alike_brightness, where], 1)
     near = torch.exp(-0.5 * torch.cdist(scaled, scaled).square())
     return (near @ log_albedo) / near.sum(1, keepdim=True)
 

@@ -89,6 +89,30 @@ def test_light_that_is_right_stays_about_as_it_is():
 
 
 @pytest.mark.slow
+def test_a_white_ball_on_a_grey_one_keeps_its_light():
+    light = lamp_above(4.0)
+    ball = sphere_mesh(subdivisions=4, albedo=0.75, roughness=0.9)
+    count = len(ball.vertices)
+    mesh = TriangleMesh(
+        torch.cat([ball.vertices, ball.vertices - torch.tensor([0.0, 0.0, 2.1])]),
+        torch.cat([ball.faces, ball.faces + count]),
+        ball.normals.repeat(2, 1),
+        torch.cat([ball.albedo, 0.5 * ball.albedo]),
+        ball.roughness.repeat(2),
+        torch.zeros(2 * count),
+    )
+
+    def change(alike_place: float) -> float:
+        """Standard deviation of the logarithm of what irradiance has become."""
+        found = found_under(mesh, light, PaintLightSettings(alike_place=alike_place))
+        assert found is not None
+        return float((irradiance(mesh, found) / irradiance(mesh, light)).log().std())
+
+    assert change(PaintLightSettings().alike_place) < 0.05
+    assert change(1e3) > 0.12
+
+
+@pytest.mark.slow
 def test_as_a_whole_it_is_as_bright_as_it_was_but_for_paint_that_would_be_white():
     mesh, _, light = misread_sphere(lamp_above(4.0))
     dim = replace(mesh, albedo=0.5 * mesh.albedo / mesh.albedo.max())
