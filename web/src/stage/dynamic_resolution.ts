@@ -1,4 +1,4 @@
-/** Dynamic resolution of the local picture while it moves: fewer pixels where pictures come too slowly, more where there is room. */
+/** Dynamic resolution of the local picture while it moves: fewer faces, then fewer pixels, where pictures come too slowly, more pixels where there is room. */
 
 /** Device pixels to draw for each CSS pixel, one way. More than two nobody sees, and each costs. */
 export const screenPixelRatio = () => Math.min(window.devicePixelRatio || 1, 2);
@@ -45,5 +45,32 @@ export class DynamicResolution {
     const wanted = this.scale * Math.sqrt(AIMED_FRAME_MS / this.frameMs);
     const step = this.scales.findIndex((scale) => scale <= wanted * 1.05);
     return step < 0 ? this.scales.length - 1 : step;
+  }
+}
+
+/** The time between pictures in motion [ms] beyond which a machine is slow. */
+const SLOW_MOTION_MS = 50;
+/** What one picture says of that, so that no hitch alone makes a machine slow ... */
+const SHARE_OF_PICTURE = 0.15;
+/** ... however long it lasted [ms]. */
+const LONGEST_MS = 3 * SLOW_MOTION_MS;
+
+/**
+ * Finds machines that are too slow for all of a mesh's faces. By the mean, not by each picture: browsers draw behind the page's back and may
+ * hold up every second picture for both.
+ */
+export class SlowMotion {
+  private frameMs = 1000 / 60;
+  private found = false;
+
+  /** Once found, a machine stays slow. */
+  get slow(): boolean {
+    return this.found;
+  }
+
+  /** Take in the time since the last moving picture. */
+  measure(elapsedMs: number): void {
+    this.frameMs += SHARE_OF_PICTURE * (Math.min(elapsedMs, LONGEST_MS) - this.frameMs);
+    this.found ||= this.frameMs > SLOW_MOTION_MS;
   }
 }

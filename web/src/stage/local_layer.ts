@@ -16,7 +16,7 @@ import { pinWeights } from '../edit/shape/pins';
 import { shapeTool } from '../edit/shape/shape_tools';
 import { notify } from '../session/notices';
 import { lightCamera, openedAsset, session, settings } from '../session/session';
-import { DynamicResolution, screenPixelRatio } from './dynamic_resolution';
+import { DynamicResolution, screenPixelRatio, SlowMotion } from './dynamic_resolution';
 import { LocalPicture } from './local_picture';
 import { shapeIsKnown, shapeNow } from './shape_now';
 import { before, localPicture, wireframe } from './switches';
@@ -28,9 +28,6 @@ const SKY_PIXELS = 160;
 /** How long a selection shows, in two pulses. */
 const FLASH_MS = 1400;
 const PINS_STRENGTH = 0.7;
-/** Time between pictures in motion [ms] beyond which so many in a row make a machine slow: it draws fewer faces in motion from then on. */
-const SLOW_MS = 50;
-const SLOW_PICTURES = 3;
 
 export class LocalLayer {
   /** Null where the browser has no WebGL 2. */
@@ -38,7 +35,8 @@ export class LocalLayer {
   private dirty = true;
   private sharp = true;
   private readonly resolution = new DynamicResolution();
-  private slowPictures = 0;
+  /** Where it is slow, fewer faces are drawn in motion from then on. */
+  private readonly motion = new SlowMotion();
   private meshOf = '';
   private environmentUrl = '';
   /** Its light is there, or will not come. */
@@ -93,14 +91,9 @@ export class LocalLayer {
   /** Take in the time since the last of two pictures in motion, so that motion stays fluent. */
   measure(elapsedMs: number): void {
     // The mesh gets coarser before the picture gets blurred.
-    if (this.slow || !this.picture?.canBeCoarse) {
+    if (this.motion.slow || !this.picture?.canBeCoarse) {
       if (this.resolution.measure(elapsedMs)) this.resize();
-    } else this.slowPictures = elapsedMs > SLOW_MS ? this.slowPictures + 1 : 0;
-  }
-
-  /** On a machine that is too slow for all of the mesh's faces. */
-  private get slow(): boolean {
-    return this.slowPictures >= SLOW_PICTURES;
+    } else this.motion.measure(elapsedMs);
   }
 
   /** Once each animation frame. `resting`: the camera has been still for a while; `covered`: a fresh traced picture is over it. */
@@ -140,9 +133,9 @@ export class LocalLayer {
       onlyHighlight: overlay,
       edges,
       splitAt,
-      coarse: !this.sharp && this.slow && picture.canBeCoarse,
+      coarse: !this.sharp && this.motion.slow && picture.canBeCoarse,
     });
-    this.stage.dataset.coarse = String(!this.sharp && this.slow && picture.canBeCoarse);
+    this.stage.dataset.coarse = String(!this.sharp && this.motion.slow && picture.canBeCoarse);
     this.stage.dataset.localFrames = String(Number(this.stage.dataset.localFrames ?? 0) + 1);
   }
 

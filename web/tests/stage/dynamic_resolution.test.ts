@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { DynamicResolution } from '../../src/stage/dynamic_resolution';
+import { DynamicResolution, SlowMotion } from '../../src/stage/dynamic_resolution';
 
 /** Milliseconds between pictures of a machine that needs `fullMs` for a sharp one, after it has drawn for a while. */
 function settledMs(fullMs: number): number {
@@ -18,4 +18,24 @@ test('a quick machine draws sharp pictures, and comes back to them after a hitch
   expect(pace.scale).toBeLessThan(1);
   for (let frame = 0; frame < 200; frame++) pace.measure(1000 / 60);
   expect(pace.scale).toBe(1);
+});
+
+/** After so many pictures that come in turns after these times [ms]. */
+function slowAfter(pictures: number, ...turnsMs: number[]): boolean {
+  const motion = new SlowMotion();
+  for (let picture = 0; picture < pictures; picture++) motion.measure(turnsMs[picture % turnsMs.length]!);
+  return motion.slow;
+}
+
+test('a machine is slow where pictures take long, whether each waits or every second one for two', () => {
+  expect(slowAfter(5, 200)).toBe(true);
+  expect(slowAfter(8, 20, 380)).toBe(true);
+  expect(slowAfter(15, 60)).toBe(true);
+  expect(slowAfter(1000, 40)).toBe(false);
+});
+
+test('a hitch makes no machine slow', () => {
+  const motion = new SlowMotion();
+  for (const elapsed of [17, 17, 2000, 17, 17, 17, 17, 17, 17, 17, 17, 17, 400, 17]) motion.measure(elapsed);
+  expect(motion.slow).toBe(false);
 });
