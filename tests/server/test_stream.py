@@ -306,6 +306,7 @@ def test_a_client_without_png_gets_jpeg_only(service: Service) -> None:
         assert {header.codec for header, _ in client.frames} == {0}
 
 
+@pytest.mark.alone  # other work makes the painter's 0.15 s longer, and pictures smaller at once
 def test_a_slow_machine_sends_smaller_pictures_while_moving_and_full_ones_when_still(tmp_path) -> None:
     service = Service(tmp_path, Painter(pass_seconds=0.15))
     with service.client, talk(service, service.open_session()) as client:
