@@ -50,10 +50,10 @@ export class DynamicResolution {
 
 /** The time between pictures in motion [ms] beyond which a machine is slow. */
 const SLOW_MOTION_MS = 50;
-/** What one picture says of that, so that no hitch alone makes a machine slow ... */
+/** What one picture says of that, so that no hitch makes a machine slow ... */
 const SHARE_OF_PICTURE = 0.15;
-/** ... however long it lasted [ms]. */
-const LONGEST_MS = 3 * SLOW_MOTION_MS;
+/** ... nor three in a row, however long they lasted [ms]. */
+const LONGEST_MS = 2 * SLOW_MOTION_MS;
 
 /**
  * Finds machines that are too slow for all of a mesh's faces. By the mean, not by each picture: browsers draw behind the page's back and may

@@ -34,8 +34,8 @@ test('a machine is slow where pictures take long, whether each waits or every se
   expect(slowAfter(1000, 40)).toBe(false);
 });
 
-test('a hitch makes no machine slow', () => {
+test('hitches make no machine slow, though a first turn has three', () => {
   const motion = new SlowMotion();
-  for (const elapsed of [17, 17, 2000, 17, 17, 17, 17, 17, 17, 17, 17, 17, 400, 17]) motion.measure(elapsed);
+  for (const elapsed of [17, 17, 2000, 400, 300, 17, 17, 17, 17, 17, 17, 17, 400, 17]) motion.measure(elapsed);
   expect(motion.slow).toBe(false);
 });

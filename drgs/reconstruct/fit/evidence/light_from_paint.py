@@ -156,7 +156,7 @@ def _solved(
     """The light that makes paint alike.
 
     Args:
-        sent: radiance, above 0. known: the light so far.
+        positions: of the places, in the world. sent: radiance, above 0. known: the light so far.
     """
     light = known
     middle = positions - positions.mean(0)
