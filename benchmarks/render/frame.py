@@ -84,7 +84,7 @@ def orbit(asset: Asset, size: int) -> Iterator[Camera]:
     radius = float((vertices - middle).norm(dim=-1).max())
     distance, field = 4 * radius, 0.55  # of an imported mesh, which has none
     if asset.cameras:
-        distance = statistics.median(float((camera.center_world.double() - middle).norm()) for camera in asset.cameras)
+        distance = statistics.median(float((camera.center_world.cpu().double() - middle).norm()) for camera in asset.cameras)
         field = statistics.median(2 * math.atan(0.5 * camera.width / float(camera.intrinsics[0, 0])) for camera in asset.cameras)
     focal = size / (2 * math.tan(field / 2))
     intrinsics = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])

@@ -43,6 +43,7 @@ from drgs.scene.camera import Camera, camera_from_opengl
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.posed_scene import PosedScene
+from drgs.warp_torch import device_from_name
 
 
 def read_exr(path: Path) -> np.ndarray:
@@ -52,7 +53,7 @@ def read_exr(path: Path) -> np.ndarray:
     return np.asarray(pixels, np.float32)
 
 
-def read_mesh(path: Path) -> TriangleMesh:
+def read_mesh(path: Path, device: torch.device | str = "cpu") -> TriangleMesh:
     """A binary PLY of float vertices x y z nx ny nz albedo_r/g/b roughness metallic and triangles."""
     raw = path.read_bytes()
     end = raw.index(b"end_header\n") + len(b"end_header\n")
@@ -63,11 +64,11 @@ def read_mesh(path: Path) -> TriangleMesh:
     faces = np.frombuffer(raw, np.dtype([("n", "u1"), ("v", "<i4", 3)]), counts["face"], end + vertex.nbytes)["v"]
 
     def columns(*wanted: str) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(vertex[:, [names.index(name) for name in wanted]]))
+        return torch.from_numpy(np.ascontiguousarray(vertex[:, [names.index(name) for name in wanted]])).to(device)
 
     return TriangleMesh(
         columns("x", "y", "z"),
-        torch.from_numpy(np.ascontiguousarray(faces)),
+        torch.from_numpy(np.ascontiguousarray(faces)).to(device),
         torch.nn.functional.normalize(columns("nx", "ny", "nz"), dim=-1),
         columns("albedo_r", "albedo_g", "albedo_b"),
         columns("roughness")[:, 0],
@@ -148,13 +149,23 @@ class Shot:
 
 def shot(variant: str, state: FrameState, seconds: float, cpu_seconds: float, denoise: str = "none") -> Shot:
     """The sums so far, shown; what showing takes is added to the time where it denoises."""
-    clock, cpu_clock = time.perf_counter(), time.process_time()
+    device = state.sums.weight.device
+    clock, cpu_clock = wall_clock(device), time.process_time()
     frame = resolve_frame(with_settings(state, denoise=denoise))
     if denoise != "none":
-        seconds, cpu_seconds = seconds + time.perf_counter() - clock, cpu_seconds + time.process_time() - cpu_clock
+        seconds, cpu_seconds = seconds + wall_clock(device) - clock, cpu_seconds + time.process_time() - cpu_clock
     coverage = frame.gbuffer.coverage
-    variance = (frame.radiance.variance * coverage**2).numpy() * (denoise == "none")
-    return Shot(variant, frame.radiance.samples, (frame.radiance_linear * coverage[..., None]).numpy(), variance, seconds, cpu_seconds)
+    variance = (frame.radiance.variance * coverage**2).cpu().numpy() * (denoise == "none")
+    return Shot(
+        variant, frame.radiance.samples, (frame.radiance_linear * coverage[..., None]).cpu().numpy(), variance, seconds, cpu_seconds
+    )
+
+
+def wall_clock(device: torch.device) -> float:
+    """[s], when all is done that was asked of the device."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
 
 
 def ours(
@@ -170,15 +181,15 @@ def ours(
         for name in shown:
             shot(name, warm, 0.0, 0.0, name if name in ("svgf", "oidn") else "none")
         tracer.horizons = None
-        state, seconds, cpu_seconds = None, 0.0, 0.0
+        state, seconds, cpu_seconds, device = None, 0.0, 0.0, scene.mesh.vertices.device
         for spp in sorted(samples):
-            clock, cpu_clock = time.perf_counter(), time.process_time()
+            clock, cpu_clock = wall_clock(device), time.process_time()
             if state is None:
                 state = start_frame(scene, camera, settings, tracer)
                 table_seconds = state.seconds["environment_table"]
                 clock, cpu_clock = clock + table_seconds, cpu_clock + table_seconds
             state = refine_frame(state, max(0, -(-spp // samples_per_pass(state.inputs).total) - state.passes), consume=True)
-            seconds, cpu_seconds = seconds + time.perf_counter() - clock, cpu_seconds + time.process_time() - cpu_clock
+            seconds, cpu_seconds = seconds + wall_clock(device) - clock, cpu_seconds + time.process_time() - cpu_clock
             for name in shown:
                 if name == "paper":
                     yield shot(
@@ -212,7 +223,7 @@ def mitsubas(scene: PosedScene, camera: Camera, bounces: int, seed: int, samples
     """As `ours`; each picture is made from nothing, its own variance is not told."""
     from benchmarks.render._mitsuba import MitsubaScene
 
-    renderer = MitsubaScene(scene.mesh, scene.environment.radiance.numpy(), camera, bounces)
+    renderer = MitsubaScene(scene.mesh, scene.environment.radiance.numpy(), camera.to("cpu"), bounces)
     renderer.render(4, seed + 1)  # compile
     for spp in sorted(samples):
         mean, seconds, cpu_seconds = renderer.render(spp, seed)
@@ -253,24 +264,26 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--mitsuba-rows", action="store_true", help="look the environment up as Mitsuba does (mitsuba_rows)")
     parser.add_argument("--mitsuba", action="store_true", help="also render with Mitsuba, in the same run")
     parser.add_argument("--mitsuba-spp", type=int, nargs="+", default=[16, 64, 256], help="its samples a pixel")
+    parser.add_argument("--device", default="cpu", choices=["auto", "cpu", "cuda"], help="of ours")
     arguments = parser.parse_args(argv)
 
     folder: Path = arguments.reference
     variants = ["sobol"] if arguments.no_skip else arguments.variants
     if "oidn" in variants:
         oidn_filter()  # complain before measuring
-    mesh = read_mesh(folder / "mesh.ply")
+    device = device_from_name(arguments.device)
+    mesh = read_mesh(folder / "mesh.ply", device)
     tracer = build_tracer(mesh)
     rows, times, means = [], [], []
     for env in arguments.env:
         table = read_exr(folder / f"env_{env}.exr")[..., :3]
-        environment = Environment(torch.from_numpy(mitsuba_rows(table) if arguments.mitsuba_rows else table.copy()))
+        environment = Environment(torch.from_numpy(mitsuba_rows(table) if arguments.mitsuba_rows else table.copy()).to(device))
         scene = PosedScene(None, mesh, environment)
-        as_given = PosedScene(None, mesh, Environment(torch.from_numpy(table.copy())))
+        as_given = PosedScene(None, read_mesh(folder / "mesh.ply"), Environment(torch.from_numpy(table.copy())))
         for light, number in product(arguments.light, arguments.cameras):
             reference = read_exr(folder / f"{env}_{light}_{number}.exr")
             standard_error = np.load(folder / f"{env}_{light}_{number}_se.npy")
-            camera = read_cameras(folder / "cameras.json", len(reference))[number]
+            camera = read_cameras(folder / "cameras.json", len(reference))[number].to(device)
             counts = SampleCounts(*arguments.counts) if arguments.counts else None
             bounces = int(light == "bounce1")
             settings = RenderSettings(bounces=bounces, primary="mesh", seed=arguments.seed, counts=counts)

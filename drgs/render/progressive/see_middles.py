@@ -3,8 +3,8 @@
 In: the mesh (through its tracer), the camera, tiles to look at. Out: Middles. Frames at rest add up what their
 passes see (frame_sums.py) and take the mean. A moving picture has one pass, which is its own mean.
 
-One kernel finds what blocks of four by four pixels see (all rays of one at once, where a tracer has a way: KernelQuery.block_fn), another
-writes both the points and the maps.
+One kernel finds what blocks of four by four pixels see, all rays of one at once, where a tracer has a way (KernelQuery.block_fn), and what single
+pixels see elsewhere; another writes both the points and the maps.
 """
 
 from dataclasses import dataclass
@@ -45,15 +45,15 @@ class Middles:
     """int32; of each pixel of the window its point's number and one; means nothing where nothing is covered."""
 
 
-BLOCK = wp.constant(4)
-"""Side [pixels]; tiles hold whole ones."""
+BLOCK = 4
+"""Side [pixels] of what KernelQuery.block_fn sees at once."""
 
 
-def _block_by_rays(closest_fn: Any, handle_type: Any) -> Any:
-    """KernelQuery.block_fn of a tracer that has none, ray by ray."""
+def _block_of_one_ray(closest_fn: Any, handle_type: Any) -> Any:
+    """KernelQuery.block_fn, of one pixel, of a tracer that has none."""
 
     @wp.func
-    def block_by_rays(
+    def block_of_one_ray(
         tracer: handle_type,  # type: ignore[valid-type]  # known when the kernel is made
         view: MiddleView,
         x: int,
@@ -61,25 +61,30 @@ def _block_by_rays(closest_fn: Any, handle_type: Any) -> Any:
         face: wp.array[int],
         barycentric: wp.array[wp.vec2],
     ) -> int:
-        seen = wp.int32(0)
-        for row in range(y, wp.min(y + BLOCK, view.image_height)):
-            for column in range(x, wp.min(x + BLOCK, view.image_width)):
-                hit = closest_fn(tracer, view.center, middle_direction(view, column, row), wp.inf)
-                if hit.face >= 0:
-                    pixel = row * view.image_width + column
-                    face[pixel] = hit.face
-                    barycentric[pixel] = hit.barycentric
-                    seen += 1
-        return seen
+        if x >= view.image_width or y >= view.image_height:
+            return 0
+        hit = closest_fn(tracer, view.center, middle_direction(view, x, y), wp.inf)
+        if hit.face < 0:
+            return 0
+        pixel = y * view.image_width + x
+        face[pixel] = hit.face
+        barycentric[pixel] = hit.barycentric
+        return 1
 
-    return block_by_rays
+    return block_of_one_ray
+
+
+def block_side(query: KernelQuery) -> int:
+    """Of what one index of see_blocks looks at [pixels]: tiles hold whole ones."""
+    return 1 if query.block_fn is None else BLOCK
 
 
 @cache
 def see_blocks_kernel(query: KernelQuery) -> Any:
     """The kernel that finds what a kind of tracer sees."""
     handle_type = query.handle_type
-    block_fn = _block_by_rays(query.closest_fn, handle_type) if query.block_fn is None else query.block_fn
+    block_fn = _block_of_one_ray(query.closest_fn, handle_type) if query.block_fn is None else query.block_fn
+    side = block_side(query)
 
     @wp.kernel(enable_backward=False, module="unique")
     def see_blocks(
@@ -94,11 +99,11 @@ def see_blocks_kernel(query: KernelQuery) -> Any:
         shows: wp.array[wp.bool],
     ):
         i = first + wp.tid()
-        across = TILE / BLOCK
+        across = wp.static(TILE // side)
         tile = tiles[i / (across * across)]
         block = i % (across * across)
-        x = tile % tiles_across * TILE + block % across * BLOCK
-        y = tile / tiles_across * TILE + block / across * BLOCK
+        x = tile % tiles_across * TILE + block % across * wp.static(side)
+        y = tile / tiles_across * TILE + block / across * wp.static(side)
         if block_fn(tracer, view, x, y, face, barycentric) > 0:
             shows[tile] = True  # blocks of one tile write the same
 
@@ -180,7 +185,8 @@ def see_middles(tracer: AbstractTracer, camera: Camera, tiles: Tensor) -> Middle
     face_array, barycentric_array = warp_array(face), warp_array(barycentric, wp.vec2)
     inputs = [tracer.handle, view, warp_array(chosen), tile_grid(camera.width, camera.height)[0]]
     outputs = [face_array, barycentric_array, warp_array(shows)]
-    launch(see_blocks_kernel(tracer.kernel_query), len(chosen) * (TILE // BLOCK) ** 2, inputs, outputs, warp_device(face))
+    query = tracer.kernel_query
+    launch(see_blocks_kernel(query), len(chosen) * (TILE // block_side(query)) ** 2, inputs, outputs, warp_device(face))
     window = _window_of(shows, camera)
     place = torch.cumsum(face >= 0, 0, dtype=torch.int32)
     primary, maps = _empty_points(int(place[-1]), device), _empty_maps(window.shape, device)
