@@ -69,7 +69,7 @@ WAITING = ("tests/benchmarks/", "tests/worker/", "tests/server/", "tests/test_wh
 """Tests that wait for processes that they start about as long as they compute."""
 
 
-LONG = ("tests/reconstruct/", "tests/reference/", "tests/stress/", "tests/test_public_names.py")
+LONG = ("tests/reconstruct/", "tests/reference/", "tests/stress/", "tests/test_public_names.py", "tests/test_pretended_cuda.py")
 """Single files take up to most of a minute of a core: of those that compute they come first, lest one begun late keep the others waiting."""
 
 

@@ -230,7 +230,7 @@ def rasterize(
     """
     settings = settings or RasterSettings()
     with torch.no_grad():
-        axis, offset = camera.camera_from_world[2, :3], camera.camera_from_world[2, 3]
+        axis, offset = (part.to(centers) for part in (camera.camera_from_world[2, :3], camera.camera_from_world[2, 3]))
         depth_origin = float(centers.mean(0) @ axis + offset) if len(centers) else 0.0
         depth_origin = depth_origin if math.isfinite(depth_origin) else 0.0
     maps = _Rasterize.apply(centers, tangents, opacities, features, camera, settings, depth_origin, per_pixel, band)
