@@ -1,11 +1,13 @@
 """Meshing anew: the surface stays, its triangles get even, folds go, and what vertices carry arrives."""
 
+import igl
+import numpy as np
 import pytest
 import torch
 
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.extract_mesh.clean_mesh import is_watertight
-from drgs.reconstruct.geometry.remesh import remesh
+from drgs.reconstruct.geometry.remesh import INSIDE, _inside, remesh
 from tests.render.closed_form_scenes import sphere_mesh
 
 SETTINGS = MeshSettings(resolution=48, face_limit=4000, smoothing_passes=0)
@@ -39,6 +41,19 @@ def test_faces_that_were_pushed_through_the_surface_are_gone():
     assert float(new.vertices.norm(dim=1).max()) < 1.005
     whole = (new.vertices @ old.vertices[one]).abs() < 0.9  # but for where it begins and came out
     assert float((new.vertices[whole].norm(dim=1) - 1).abs().median()) < 2e-3
+
+
+def test_nodes_of_which_one_in_a_part_is_asked_are_where_winding_numbers_say():
+    old = sphere_mesh(subdivisions=3)
+    wild = old.vertices * (1 + 0.3 * torch.sin(7 * old.vertices[:, [1, 2, 0]]))  # folds, and passes through itself
+    points, faces = wild.double().numpy(), old.faces.numpy().astype(np.int64)
+    cell, origin = 0.05, points.min(0) - 0.3
+    near = np.ones([int(n) for n in (points.max(0) - origin + 0.3) / cell], bool)
+    at = origin + cell * np.argwhere(near)
+    far = np.sqrt(igl.point_mesh_squared_distance(at, points, faces)[0]).reshape(near.shape) > cell
+    inside = _inside(points, faces, near, at, far)
+    assert 0 < inside.sum() < len(inside) and far.mean() > 0.5
+    np.testing.assert_array_equal(inside, igl.fast_winding_number(points, faces, at) > INSIDE)
 
 
 def test_a_surface_that_encloses_nothing_is_refused():
