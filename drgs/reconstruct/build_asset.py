@@ -48,6 +48,7 @@ from drgs.reconstruct.geometry.face_surfels import radiating_surfels, surfels_on
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, reduced_mesh, seen_surfels
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
+from drgs.reconstruct.geometry.order_in_space import order_in_space
 from drgs.reconstruct.outline_agreement import complaint, outline_agreement
 from drgs.reconstruct.pose.pose_photographs import PoseSettings
 from drgs.reconstruct.pose.posed_dataset import needs_poses, pose_source, provenance_of
@@ -353,6 +354,10 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         for times in range(decoupled.divided):
             binding = divided_binding(binding, len(under.faces) * 4**times)
         surfels = replace(surfels, centers=points_from_binding(binding, mesh.vertices, mesh.faces))
+        order = order_in_space(mesh)
+        mesh, certainty, binding = order.of_mesh(mesh), order.of_certainty(certainty), order.of_binding(binding)
+        along = torch.argsort(binding.face)
+        surfels, binding = chosen_surfels(surfels, along), chosen_surfels(binding, along)
         surfels = radiating_surfels(surfels, binding, mesh, environment)
         asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh", certainty=certainty)
     return asset, surface_preview(decoupled, views.cameras)

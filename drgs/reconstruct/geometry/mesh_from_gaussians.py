@@ -48,8 +48,8 @@ def seen_surfels(gaussians: Gaussians, cameras: tuple[Camera, ...], radius: floa
     return weight[:, 0] > least_weight
 
 
-def chosen_surfels(record: Surfels, kept: Bool[Tensor, "surfel"]) -> Surfels:
-    """The entries of a record whose every field is by surfel, where `kept` (surfel,) is True."""
+def chosen_surfels(record: Surfels, kept: Bool[Tensor, "surfel"] | Int[Tensor, "kept"]) -> Surfels:
+    """The entries of a record whose every field is by surfel, where `kept` (surfel,) is True, or those that it names, in its order."""
     return type(record)(*(getattr(record, entry.name)[kept] for entry in fields(record)))
 
 

@@ -18,6 +18,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from drgs.maths.z_order import z_order
 from drgs.render.intersect.horizon_kernels import GROUP, SECTORS, STEEPEST, SUPER, raise_horizons, raise_horizons_simd
 from drgs.scene.mesh import TriangleMesh
 from drgs.warp_torch import launch, warp_array, warp_device
@@ -40,16 +41,6 @@ TRIAL = 0.05
 """Share of the faces after which the search may be given up."""
 WORTHWHILE = 0.1
 """Share of rays spared below which it is."""
-
-
-def _curve_order(points: Tensor) -> Tensor:
-    """The order of points (n, 3) along a Z-order curve of 1024 steps a side."""
-    low, high = points.amin(0), points.amax(0)
-    cell = ((points - low) / (high - low).clamp(min=1e-30) * 1023).long()
-    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):  # two empty bits behind each
-        cell = (cell | (cell << shift)) & mask
-    code = cell[:, 0] | (cell[:, 1] << 1) | (cell[:, 2] << 2)
-    return torch.argsort(code)
 
 
 def _boxes(corners: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -106,7 +97,7 @@ class Horizons:
     @cached_property
     def _order(self) -> Tensor:
         """(face,) faces along the curve; a face's rank is its position in it."""
-        return _curve_order(self._corners_by_face.mean(1))
+        return z_order(self._corners_by_face.mean(1))
 
     @cached_property
     def _corners(self) -> Tensor:
