@@ -183,7 +183,7 @@ class Horizons:
         """Find the horizons of the faces of these ranks (face,)."""
         if len(ranks) == 0 or self._is_hopeless():
             return
-        ranks = ranks.int()
+        ranks = ranks.sort().values.int()  # neighbours read the same of the mesh
         tangent = torch.empty(self.faces, SECTORS, device=self.sine.device)
         boxes = [warp_array(box, wp.vec3) for box in self._boxes]
         corners, device = [warp_array(ranks), warp_array(self._corners.view(-1, 3), wp.vec3)], warp_device(tangent)
@@ -191,7 +191,15 @@ class Horizons:
             launch(raise_horizons, len(ranks), [*corners, self.faces, *boxes, self._lift], [warp_array(tangent.view(-1))], device)
         else:
             lanes = [warp_array(values.view(-1)) for values in self._lanes]
-            launch(raise_horizons_simd, len(ranks), [*corners, *lanes, self._lift], [warp_array(tangent.view(-1))], device)
+            # Hollows take far longer than what lies open, and lie together.
+            launch(
+                raise_horizons_simd,
+                len(ranks),
+                [*corners, *lanes, self._lift],
+                [warp_array(tangent.view(-1))],
+                device,
+                slices_per_thread=32,
+            )
         tangent = tangent[ranks.long()]
         sine = tangent / torch.sqrt(1 + tangent.square().clamp(max=1e12)) + MARGIN
         sine = torch.where(tangent < float(STEEPEST), sine, BLOCKED)
