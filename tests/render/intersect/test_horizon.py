@@ -121,7 +121,7 @@ def test_sixteen_triangles_at_once_are_the_triangles_one_by_one(name: str, monke
     together = find_horizons(mesh, 1e-5)
     launch, plain = horizon_module.launch, horizon_module.raise_horizons
 
-    def launch_plain(kernel, count, inputs, outputs, device):
+    def launch_plain(kernel, count, inputs, outputs, device, slices_per_thread):
         which, corners, *_, lift = inputs
         in_order = wp.to_torch(corners).view(-1, 3, 3)
         boxes = [warp_array(box, wp.vec3) for size in (16, 256) for box in horizon_module._boxes(in_order, size)]
