@@ -59,7 +59,7 @@ LIMITS = """
   particles would do.
 - **Matter that parts**: a particle that lost 15 % of its bonds is loose: longer than at rest by 1.5 cells (by 0.4 in sand and snow). Faces over it are cut, and grains shown, at
   most 50 000; a fluid never parts. Rigid motion cuts nothing, to the bit ([why](decisions/0009-matter-that-parts.md)).
-- **CUDA**: measured on the CPU only.
+- **CUDA**: these figures are the CPU's.
 """
 
 

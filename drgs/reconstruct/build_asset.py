@@ -323,6 +323,7 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         moves = replace(passes.surface.moves, texture_radius=built.radius, box=built.settings.box)
         passes = replace(passes, surface=replace(passes.surface, seed=seed, moves=moves))
         surface = surface_stage(place, views, built.gaussians, built.mesh, built.fit.parameters, built.radius, passes)
+        order = order_in_space(surface.mesh)  # before materials move it a little: whoever fits them anew gets the same faces
     yield "surface", None
 
     bound = None
@@ -354,7 +355,6 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         for times in range(decoupled.divided):
             binding = divided_binding(binding, len(under.faces) * 4**times)
         surfels = replace(surfels, centers=points_from_binding(binding, mesh.vertices, mesh.faces))
-        order = order_in_space(mesh)
         mesh, certainty, binding = order.of_mesh(mesh), order.of_certainty(certainty), order.of_binding(binding)
         along = torch.argsort(binding.face)
         surfels, binding = chosen_surfels(surfels, along), chosen_surfels(binding, along)

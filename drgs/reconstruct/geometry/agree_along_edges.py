@@ -11,9 +11,9 @@ from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 
 
 def agree_along_edges(
-    edges: MeshEdges, weight: Float[Tensor, "vertex"], wish: Float[Tensor, "vertex"], together: float
+    edges: MeshEdges, weight: Float[Tensor, "vertex"], wish: Float[Tensor, "vertex"], together: float | Float[Tensor, "edge"]
 ) -> Float[Tensor, "vertex"]:
-    """The values s that minimise sum weight (s - wish)^2 + together sum_edges (s_i - s_j)^2.
+    """The values s that minimise sum weight (s - wish)^2 + sum_edges together (s_i - s_j)^2.
 
     Args:
         weight: at least one above 0 in each part of the mesh that hangs together, else the solve is singular.
@@ -26,5 +26,6 @@ def agree_along_edges(
         shape=(len(start), count),
     )
     strength, wanted = (values.cpu().double().numpy() for values in (weight, wish))
-    matrix = (diags(strength) + together * difference.T @ difference).tocsc()
+    held = together.cpu().double().numpy() if isinstance(together, Tensor) else np.full(len(start), together)
+    matrix = (diags(strength) + difference.T @ diags(held) @ difference).tocsc()
     return torch.from_numpy(factored(matrix).solve(strength * wanted)).to(wish)

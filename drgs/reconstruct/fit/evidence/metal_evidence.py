@@ -9,7 +9,8 @@ Matter that is no metal has f = 0.04 and a free d, metal has d = 0 and a free f:
 Gradients never decide this: a darker light and a diffuse part trade places without a trace in the loss.
 
 Errors of shape and light spoil the predicted mirror S_v, not the constant E, so they count against metal alone: real paint hardly ever says
-"metal", real metal says "paint" wherever its normals are off. So the benefit of the doubt is metal's, and each place hears its surroundings.
+"metal", real metal says "paint" wherever its normals are off. So the benefit of the doubt is metal's, and each place hears its surroundings, as far as they are
+of its colour: matter of one kind seldom changes colour at once, and often does where another kind begins.
 Where light turns with the camera, what arrives at paint changes from view to view as well, and is predicted nearly as badly: then there is less of it.
 And no metal is dark: what reflects less than a twelfth in its brightest channel is lacquer, however well a dark mirror explains it.
 
@@ -64,6 +65,11 @@ UNSEEN = 1e-4
 EDGES = 90_000
 """Of the meshes (60 000 faces) for which NEIGHBOURHOOD and TOGETHER were chosen. Finer ones average oftener and hold neighbours together the more, so that a place
 hears as much of the surface: else errors of shape that are a few pixels wide are called paint on a mesh that has faces enough for them."""
+SAME_COLOUR = 0.6
+"""Difference of the logarithms of colours, over three channels, across an edge whose ends hear each other a third as much as if there were none. On finished surfaces (decisions/0003,
+"Metal by its colour") 0.4 takes a few of the teapot's wrong normals for paint, 0.8 gains half as much on a small gold spot."""
+STRANGERS = 1e-3
+"""At least."""
 DECISIVE = 0.3
 """Agreement of a place and its surroundings, -1..1, at which evidence is 0.76."""
 
@@ -94,6 +100,11 @@ class ViewSums:
     bb: Tensor
     views: Float[Tensor, "vertex"]
     """Number of them."""
+
+    @property
+    def color(self) -> Float[Tensor, "vertex 3"]:
+        """Of paint without gloss that is as bright: what the photographs say before anybody asks what it is made of."""
+        return self.pe / self.ee.clamp(min=1e-12)
 
     @property
     def floor(self) -> Float[Tensor, "vertex"]:
@@ -165,7 +176,8 @@ def metal_evidence(sums: ViewSums, edges: MeshEdges, turned: bool, scale: float 
     """What the sums of a mesh with these edges say under the light times `scale`. `turned`: the light turns with the camera."""
     views, noise = sums.views, sums.floor
     finer = max(1.0, len(edges.vertices) / EDGES)
-    averaged = partial(_averaged, views=views, edges=edges, rings=round(NEIGHBOURHOOD * finer))
+    alike = _alike(sums, edges)
+    averaged = partial(_averaged, views=views, edges=edges, alike=alike, rings=round(NEIGHBOURHOOD * finer))
     plain = averaged(sums.error_of_paint(scale) + noise)
     metal = averaged(sums.error_of_metal(scale) + noise)
     floor = averaged(noise)
@@ -177,7 +189,7 @@ def metal_evidence(sums: ViewSums, edges: MeshEdges, turned: bool, scale: float 
     doubt = (DOUBT_TURNED if turned else DOUBT) - TOO_DARK * dark * dark * (3 - 2 * dark)
     better = torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) + doubt * trust * unexplained
     strength = torch.where(views >= FEWEST_VIEWS, trust * better.abs().clamp(max=STRONGEST), torch.zeros_like(better))
-    kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER * finer)
+    kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER * finer * alike)
     return torch.tanh(kind / DECISIVE)
 
 
@@ -204,14 +216,22 @@ def light_scale(sums: ViewSums) -> float:
     return scale if abs(math.log(scale)) > math.log(RIGHT_SCALE) else 1.0
 
 
-def _averaged(error: Tensor, views: Tensor, edges: MeshEdges, rings: int) -> Tensor:
-    """(vertex,) error a view, averaged `rings` times over the neighbours by the number of views."""
+def _alike(sums: ViewSums, edges: MeshEdges) -> Float[Tensor, "edge"]:
+    """How much the ends of an edge hear each other, 1 where their colours are the same or not known."""
+    start, end = edges.vertices.unbind(1)
+    color, known = sums.color.clamp(min=1e-3).log(), sums.views >= FEWEST_VIEWS
+    step = (color[start] - color[end]).square().sum(-1) * (known[start] & known[end])
+    return torch.exp(-step / SAME_COLOUR**2).clamp(min=STRANGERS)
+
+
+def _averaged(error: Tensor, views: Tensor, edges: MeshEdges, alike: Tensor, rings: int) -> Tensor:
+    """(vertex,) error a view, averaged `rings` times over the neighbours by the number of views, and by how much these are `alike` (edge,)."""
     start, end = edges.vertices.unbind(1)
     total, weight = error, views
     for _ in range(rings):
         # An eighth each time, which loses nothing, or many rings would leave float32's range.
         total, weight = (
-            (values + torch.zeros_like(values).index_add_(0, start, values[end]).index_add_(0, end, values[start])) / 8
+            (values + torch.zeros_like(values).index_add_(0, start, alike * values[end]).index_add_(0, end, alike * values[start])) / 8
             for values in (total, weight)
         )
     return total / weight.clamp(min=1e-30)  # counts, or nothing at all

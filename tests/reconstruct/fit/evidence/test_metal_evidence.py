@@ -94,13 +94,13 @@ def test_a_sphere_half_of_metal_is_divided_where_it_is():
     assert float(right[away].float().mean()) > 0.95
 
 
-def sums_of_metal_with_a_spot_of_paint(mesh: TriangleMesh) -> ViewSums:
+def sums_of_metal_with_a_spot_of_paint(mesh: TriangleMesh, paint_albedo: tuple[float, float, float] = (0.3, 0.3, 0.3)) -> ViewSums:
     """Of twelve views, in each of which metal has another light in its mirror: all is metal but what lies within 0.16 of the pole."""
     count, random = len(mesh.vertices), torch.Generator().manual_seed(0)
     paint = ((mesh.vertices - torch.tensor([0.0, 0.0, 1.0])).norm(dim=1) < 0.16)[:, None]
     e, b = torch.ones(count, 3), torch.zeros(count, 3)
     a = torch.rand(12, 1, 3, generator=random).expand(12, count, 3)
-    p = [torch.where(paint, 0.3 * e + F0 * mirrored, 0.7 * mirrored) for mirrored in a]
+    p = [torch.where(paint, torch.tensor(paint_albedo) * e + F0 * mirrored, 0.7 * mirrored) for mirrored in a]
     terms = [(photo, e, mirrored, b) for photo, mirrored in zip(p, a, strict=True)]
     products = (sum(term[k] * term[m] for term in terms) for k in range(4) for m in range(k, 4))
     return ViewSums(*products, torch.full((count,), 12.0))
@@ -115,6 +115,15 @@ def test_finer_meshes_decide_alike(monkeypatch: pytest.MonkeyPatch, subdivisions
     assert (
         float(told[mesh.vertices[:, 2].argmax()]) > 0.9
     )  # it was -0.9 on the finest one, and on the next, when each mesh asked three rings
+
+
+def test_a_spot_of_another_colour_is_not_outvoted(monkeypatch: pytest.MonkeyPatch):
+    mesh = sphere_mesh(subdivisions=4)
+    edges = mesh_edges(mesh.faces)
+    monkeypatch.setattr(module, "EDGES", len(edges.vertices))
+    spot = (mesh.vertices - torch.tensor([0.0, 0.0, 1.0])).norm(dim=1) < 0.16
+    told = metal_evidence(sums_of_metal_with_a_spot_of_paint(mesh, (0.4, 0.05, 0.03)), edges, False)
+    assert float(told[spot].max()) < -0.9 and float(told[~spot].min()) > 0.9
 
 
 def test_what_no_view_shows_is_left_open():
