@@ -9,8 +9,11 @@ import struct
 import zlib
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int, UInt32
 from numpy import ndarray
+
+from drgs.maths.z_order import z_order
 
 RGBE_OFFSET = 128
 """Of exponents, as in Radiance's files (docs/sources.md: ward1991)."""
@@ -52,8 +55,8 @@ def in_order_of_use(faces: Int[ndarray, "face 3"], vertices: Float[ndarray, "ver
     Returns:
         (face, 3) int64 into the new order, and (vertex,) which vertex stands at each place of it.
     """
-    centers = vertices[faces].mean(1)
-    along = faces[np.argsort(_morton(centers), kind="stable")].reshape(-1)
+    centers = torch.from_numpy(vertices[faces].mean(1))
+    along = faces[z_order(centers).numpy()].reshape(-1)
     used, first = np.unique(along, return_index=True)
     order = used[np.argsort(first)]
     place = np.zeros(len(vertices), np.int64)
@@ -66,17 +69,6 @@ def steps_from_newest(faces: Int[ndarray, "face 3"]) -> UInt32[ndarray, "corner"
     corners = faces.reshape(-1)
     newest = np.concatenate([[0], np.maximum.accumulate(corners)[:-1] + 1])
     return (newest - corners).astype(np.uint32)
-
-
-def _morton(points: Float[ndarray, "point 3"]) -> ndarray:
-    """Places along the Z-order curve through a grid of 1024 cells a side."""
-    low = points.min(0)
-    cell = ((points - low) * (1023 / max(float(np.ptp(points, axis=0).max()), 1e-12))).astype(np.uint64)
-    place = np.zeros(len(points), np.uint64)
-    for bit in range(10):
-        for axis in range(3):
-            place |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return place
 
 
 def rgbe(radiance: Float[ndarray, "rows columns 3"]) -> ndarray:
