@@ -462,10 +462,10 @@ def surface_preview(fit: SurfaceFit, cameras: tuple[Camera, ...]) -> bytes:
         direction = directions.reshape(-1, 3)
         hits = trace_rays(origin.expand_as(direction), direction, build_tracer(mesh))
         met = hits.hit.nonzero().squeeze(1)
-        corners, weights = mesh.faces[hits.face[met].long()].long(), corner_weights(hits.barycentric[met])
+        face, weights = hits.face[met].long(), corner_weights(hits.barycentric[met])
         light = MeshLight(filter_environment(environment_table(parameters)), parameters["open_share"])
         radiance = torch.zeros_like(direction)
-        radiance[met] = hit_radiance(mesh, corners, weights, -direction[met], light)
+        radiance[met] = hit_radiance(mesh, face, weights, -direction[met], light)
         return encode_preview(radiance.reshape(directions.shape), hits.hit.float().reshape(directions.shape[:2]))
 
 

@@ -74,6 +74,9 @@ def shade_split_sum(
     wo: Tensor,
     tables: Tensor,
     factor_table: Tensor,
+    transmittance: Tensor | None = None,
+    hit_radiance: Tensor | None = None,
+    open_share: Tensor | None = None,
 ) -> Tensor:
     """As drgs.reconstruct.fit.light.split_sum.shade_split_sum, with the table of F1 and F2, (2, roughness, n.v), as brdf_table returns it."""
     n_dot_v = (normal * wo).sum(-1)
@@ -87,8 +90,14 @@ def shade_split_sum(
     levels = torch.stack(reflected, 1)
     index = torch.arange(len(r))
     lookup = levels[index, below] * (1 - fraction) + levels[index, below + 1] * fraction
+    if transmittance is not None:
+        lookup = lookup * transmittance[:, None]
+    if hit_radiance is not None:
+        lookup = lookup + hit_radiance
     f1, f2 = _bilinear(factor_table.to(roughness.dtype), roughness, n_dot_v)
     diffuse = diffuse_albedo * environment_radiance(Environment(irradiance), normal)
+    if open_share is not None:
+        diffuse = diffuse * open_share
     return diffuse + lookup * (f0 * f1[:, None] + f2[:, None]) + residual
 
 

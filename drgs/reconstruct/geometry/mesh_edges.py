@@ -1,6 +1,6 @@
 """The edges of a triangle mesh that two faces share."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Int
@@ -13,6 +13,21 @@ class MeshEdges:
 
     vertices: Int[Tensor, "edge 2"]
     faces: Int[Tensor, "edge 2"]
+    _around: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
+
+    def around(self, count: int) -> tuple[Tensor, Tensor]:
+        """(vertex + 1,) where each vertex' neighbours begin in a list of all, and that list, (2 edge,). Made once.
+
+        Args:
+            count: of vertices.
+        """
+        if count not in self._around:
+            here, there = torch.cat([self.vertices, self.vertices.flip(1)]).unbind(1)
+            order = torch.argsort(here, stable=True)
+            before = torch.zeros(count + 1, dtype=torch.long, device=here.device)
+            torch.cumsum(torch.bincount(here, minlength=count), 0, out=before[1:])
+            self._around[count] = before, there[order].contiguous()
+        return self._around[count]
 
 
 def mesh_edges(faces: Tensor) -> MeshEdges:
@@ -20,7 +35,7 @@ def mesh_edges(faces: Tensor) -> MeshEdges:
     corners = faces.long()
     ends = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     face = torch.arange(len(corners), device=faces.device).repeat(3)
-    low, high = ends.amin(1), ends.amax(1)
+    low, high = torch.minimum(*ends.unbind(1)), torch.maximum(*ends.unbind(1))
     key = low * (int(corners.max()) + 1 if len(corners) else 1) + high
     order = torch.argsort(key, stable=True)
     low, high, face, key = low[order], high[order], face[order], key[order]

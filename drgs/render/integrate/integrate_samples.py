@@ -4,7 +4,7 @@
 
 Same BRDF, lookup and weights as the integrators (integrator.py); here the gradient reaches normal, albedo, roughness, metallic and the environment's texels.
 Directions, weights, visibility and hit radiance are constants (a detached estimator, unbiased in value and in gradient but for the
-visibility's own). Differentiated by Warp, so nothing is assigned under a condition (the adjoint would not undo it).
+visibility's own). The gradient is written out: Warp's own adjoint takes four times as long, and is half of stage 2.
 """
 
 from collections.abc import Sequence
@@ -14,17 +14,28 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from drgs.maths.angles_warp import azimuth
 from drgs.maths.constants import F0, MIN_ROUGHNESS
-from drgs.render.integrate.brdf_warp import PI, ggx_d, smith_v
+from drgs.render.integrate.brdf_warp import PI
 from drgs.render.records import Rays, ShadingPoints
-from drgs.warp_torch import gradient_slices, in_gradient_slices, load_kernel, warp_argument, warp_device
+from drgs.warp_torch import gradient_slices, in_gradient_slices, launch, load_kernel, warp_argument, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class _Texels:
+    """Four texels around a direction, and their weights."""
+
+    corner: wp.vec4i
+    weight: wp.vec4
 
 
 @wp.func
-def table_radiance(table: wp.array[wp.vec3], height: int, direction: wp.vec3) -> wp.vec3:
+def _texels(height: int, direction: wp.vec3) -> _Texels:
     width = 2 * height
-    u = 0.5 - wp.atan2(direction[1], direction[0]) / (2.0 * PI)
-    v = wp.atan2(wp.sqrt(direction[0] * direction[0] + direction[1] * direction[1]), direction[2]) / PI
+    u = 0.5 - azimuth(direction[0], direction[1]) / (2.0 * PI)
+    v = azimuth(direction[2], wp.sqrt(direction[0] * direction[0] + direction[1] * direction[1])) / PI
     x = u * float(width) - 0.5
     y = wp.clamp(v * float(height) - 0.5, 0.0, float(height) - 1.0)
     x_floor = wp.floor(x)
@@ -34,13 +45,64 @@ def table_radiance(table: wp.array[wp.vec3], height: int, direction: wp.vec3) ->
     column0 = (int(x_floor) + width) % width
     column1 = (column0 + 1) % width
     row = int(y_floor) * width
-    top = table[row + column0] * (1.0 - fx) + table[row + column1] * fx
-    bottom = table[row + width + column0] * (1.0 - fx) + table[row + width + column1] * fx
-    return top * (1.0 - fy) + bottom * fy
+    around = _Texels()
+    around.corner = wp.vec4i(row + column0, row + column1, row + width + column0, row + width + column1)
+    around.weight = wp.vec4((1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy)
+    return around
+
+
+@wp.func
+def _radiance(table: wp.array[wp.vec3], around: _Texels) -> wp.vec3:
+    above = table[around.corner[0]] * around.weight[0] + table[around.corner[1]] * around.weight[1]
+    return above + table[around.corner[2]] * around.weight[2] + table[around.corner[3]] * around.weight[3]
+
+
+@wp.struct
+class _Lobe:
+    """The BRDF of one pair of directions, and what its gradient is made of."""
+
+    h: wp.vec3
+    n_dot_h: float
+    n_dot_l: float
+    n_dot_v: float
+    a2: float
+    denominator: float
+    d: float
+    root_v: float
+    root_l: float
+    v: float
+    fresnel: float
+    """(1 - h.v)^5"""
+    reflectance: wp.vec3
+    """Of all light, diffuse and mirrored."""
+
+
+@wp.func
+def _lobe(n: wp.vec3, v: wp.vec3, wi: wp.vec3, a: wp.vec3, roughness: float, m: float) -> _Lobe:
+    # brdf_warp's formulas, for the gradient wants what is between.
+    r = wp.max(roughness, MIN_ROUGHNESS)
+    lobe = _Lobe()
+    lobe.a2 = r * r * r * r
+    lobe.h = wp.normalize(wi + v)
+    lobe.n_dot_h = wp.clamp(wp.dot(n, lobe.h), 0.0, 1.0)
+    lobe.n_dot_l = wp.max(wp.dot(n, wi), 1.0e-6)
+    lobe.n_dot_v = wp.max(wp.dot(n, v), 1.0e-6)
+    lobe.denominator = wp.length_sq(wp.cross(n, lobe.h)) + lobe.n_dot_h * lobe.n_dot_h * lobe.a2
+    lobe.d = lobe.a2 / wp.max(PI * lobe.denominator * lobe.denominator, 1.0e-30)
+    lobe.root_v = wp.sqrt(lobe.n_dot_v * lobe.n_dot_v * (1.0 - lobe.a2) + lobe.a2)
+    lobe.root_l = wp.sqrt(lobe.n_dot_l * lobe.n_dot_l * (1.0 - lobe.a2) + lobe.a2)
+    lobe.v = 0.5 / wp.max(lobe.n_dot_l * lobe.root_v + lobe.n_dot_v * lobe.root_l, 1.0e-12)
+    c = 1.0 - wp.clamp(wp.dot(lobe.h, v), 0.0, 1.0)
+    lobe.fresnel = c * c * c * c * c
+    white = wp.vec3(1.0, 1.0, 1.0)
+    f0 = white * (F0 * (1.0 - m)) + a * m
+    mirrored = (f0 * (1.0 - lobe.fresnel) + white * lobe.fresnel) * (lobe.d * lobe.v)
+    lobe.reflectance = a * ((1.0 - m) / PI) + mirrored
+    return lobe
 
 
 @wp.kernel
-def ray_contributions(
+def radiance_of_rays(
     first: int,
     samples: int,
     height: int,
@@ -55,80 +117,139 @@ def ray_contributions(
     metallic: wp.array[float],
     table: wp.array[wp.vec3],
     # outputs
-    contribution: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
 ):
-    """Many arguments because Warp differentiates arrays, not structs of them."""
-    i = first + wp.tid()
-    point = i / samples
+    """Many arguments because a struct of them would be filled anew, array by array, for each launch."""
+    point = first + wp.tid()
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(samples):
+        i = point * samples + k
+        if weight[i] != 0.0:
+            wi = direction[i]
+            lobe = _lobe(normal[point], wo[point], wi, albedo[point], roughness[point], metallic[point])
+            incoming = _radiance(table, _texels(height, wi)) * transmittance[i] + hit_radiance[i]
+            total += wp.cw_mul(lobe.reflectance, incoming) * (lobe.n_dot_l * weight[i])
+    radiance[point] = total
+
+
+@wp.kernel
+def rays_adjoint(
+    first: int,
+    samples: int,
+    height: int,
+    wo: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    weight: wp.array[float],
+    transmittance: wp.array[float],
+    hit_radiance: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    metallic: wp.array[float],
+    table: wp.array[wp.vec3],
+    radiance_gradient: wp.array[wp.vec3],
+    # outputs
+    normal_gradient: wp.array[wp.vec3],
+    albedo_gradient: wp.array[wp.vec3],
+    roughness_gradient: wp.array[float],
+    metallic_gradient: wp.array[float],
+    table_gradients: wp.array[wp.vec3],
+):
+    """Many arguments because a struct of them would be filled anew, array by array, for each launch."""
+    point = first + wp.tid()
     n = normal[point]
     v = wo[point]
-    wi = direction[i]
-    m = metallic[point]
     a = albedo[point]
-    r = wp.max(roughness[point], MIN_ROUGHNESS)
-    alpha = r * r
-    h = wp.normalize(wi + v)
-    n_dot_l = wp.max(wp.dot(n, wi), 1.0e-6)
-    n_dot_v = wp.max(wp.dot(n, v), 1.0e-6)
-    dv = ggx_d(wp.clamp(wp.dot(n, h), 0.0, 1.0), wp.length_sq(wp.cross(n, h)), alpha) * smith_v(n_dot_l, n_dot_v, alpha)
-    c = 1.0 - wp.clamp(wp.dot(h, v), 0.0, 1.0)
-    c5 = c * c * c * c * c
-    white = wp.vec3(1.0, 1.0, 1.0)
-    f0 = white * (F0 * (1.0 - m)) + a * m
-    reflectance = a * ((1.0 - m) / PI) + (f0 * (1.0 - c5) + white * c5) * dv
-    incoming = table_radiance(table, height, wi) * transmittance[i] + hit_radiance[i]
-    contribution[i] = wp.cw_mul(reflectance, incoming) * (n_dot_l * weight[i])
+    m = metallic[point]
+    g_normal = wp.vec3(0.0, 0.0, 0.0)
+    g_albedo = wp.vec3(0.0, 0.0, 0.0)
+    g_a2 = float(0.0)
+    g_metallic = float(0.0)
+    for k in range(samples):
+        i = point * samples + k
+        if weight[i] != 0.0:
+            wi = direction[i]
+            lobe = _lobe(n, v, wi, a, roughness[point], m)
+            around = _texels(height, wi)
+            g = radiance_gradient[point] * weight[i]
+            g_incoming = wp.cw_mul(g, lobe.reflectance) * (lobe.n_dot_l * transmittance[i])
+            for corner in range(4):
+                wp.atomic_add(table_gradients, around.corner[corner], g_incoming * around.weight[corner])
+
+            g_lit = wp.cw_mul(g, _radiance(table, around) * transmittance[i] + hit_radiance[i])
+            g_reflectance = g_lit * lobe.n_dot_l
+            g_l = wp.dot(g_lit, lobe.reflectance)
+            dv = lobe.d * lobe.v
+            g_albedo += g_reflectance * ((1.0 - m) / PI + m * (1.0 - lobe.fresnel) * dv)
+            dielectric = wp.vec3(F0, F0, F0)
+            g_metallic += wp.dot(g_reflectance, (a - dielectric) * ((1.0 - lobe.fresnel) * dv) - a / PI)
+            white = wp.vec3(1.0, 1.0, 1.0)
+            f0 = white * (F0 * (1.0 - m)) + a * m
+            g_dv = wp.dot(g_reflectance, f0 * (1.0 - lobe.fresnel) + white * lobe.fresnel)
+
+            # Of V = 1 / (2 (n.l root_v + n.v root_l))
+            g_sum = -2.0 * lobe.v * lobe.v * g_dv * lobe.d
+            by_v = g_sum * lobe.n_dot_l / lobe.root_v
+            by_l = g_sum * lobe.n_dot_v / lobe.root_l
+            g_l += g_sum * lobe.root_v + by_l * lobe.n_dot_l * (1.0 - lobe.a2)
+            g_v = g_sum * lobe.root_l + by_v * lobe.n_dot_v * (1.0 - lobe.a2)
+            g_a2 += 0.5 * (by_v * (1.0 - lobe.n_dot_v * lobe.n_dot_v) + by_l * (1.0 - lobe.n_dot_l * lobe.n_dot_l))
+
+            # Of D = a2 / (pi denominator^2), its denominator |n x h|^2 + (n.h)^2 a2
+            g_d = g_dv * lobe.v
+            g_denominator = -2.0 * g_d * lobe.d / lobe.denominator
+            g_a2 += g_d * lobe.d / lobe.a2 + g_denominator * lobe.n_dot_h * lobe.n_dot_h
+            n_dot_h = wp.dot(n, lobe.h)
+            within = wp.where(n_dot_h == lobe.n_dot_h, 1.0, 0.0)
+            g_normal += (2.0 * g_denominator) * (n - n_dot_h * lobe.h + (within * lobe.n_dot_h * lobe.a2) * lobe.h)
+            g_normal += wp.where(wp.dot(n, wi) > 1.0e-6, g_l, 0.0) * wi + wp.where(wp.dot(n, v) > 1.0e-6, g_v, 0.0) * v
+    r = roughness[point]
+    normal_gradient[point] = g_normal
+    albedo_gradient[point] = g_albedo
+    roughness_gradient[point] = wp.where(r > MIN_ROUGHNESS, 4.0 * r * r * r * g_a2, 0.0)
+    metallic_gradient[point] = g_metallic
 
 
 _DTYPES = (wp.vec3, wp.vec3, wp.float32, wp.float32, wp.vec3, wp.vec3, wp.vec3, wp.float32, wp.float32, wp.vec3)
-_DIFFERENTIABLE = 5
-"""The last five inputs: normal, albedo, roughness, metallic, table."""
+_POINT_TYPES = (wp.vec3, wp.vec3, wp.float32, wp.float32)
+"""Of normal, albedo, roughness and metallic, which come last but for the table."""
 
 
-class _Contributions(torch.autograd.Function):
+class _Radiance(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, height: int, *given: Tensor) -> Tensor:
+    def forward(ctx: Any, height: int, samples: int, *given: Tensor) -> Tensor:
         inputs = [x.detach().contiguous() for x in given]
-        ctx.height = height
+        ctx.height, ctx.samples = height, samples
         ctx.save_for_backward(*inputs)
-        contribution = torch.empty_like(inputs[1])
-        _launch(height, inputs, contribution, None)
-        return contribution
+        radiance = torch.empty_like(inputs[0])
+        launch(radiance_of_rays, len(radiance), _arguments(ctx, inputs), [warp_argument(radiance, wp.vec3)], warp_device(radiance))
+        return radiance
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        inputs = ctx.saved_tensors
-        point_gradients = [torch.zeros_like(x) for x in inputs[-_DIFFERENTIABLE:-1]]
-        table_gradients = torch.zeros(gradient_slices(), *inputs[-1].shape, device=gradient.device)
-        _launch(ctx.height, inputs, gradient.contiguous(), (point_gradients, table_gradients))
-        return None, *[None] * (len(inputs) - _DIFFERENTIABLE), *point_gradients, table_gradients.sum(0)
+        inputs, device, count = ctx.saved_tensors, warp_device(gradient), len(gradient)
+        of_points = [torch.empty_like(x) for x in inputs[5:-1]]
+        of_table = torch.zeros(gradient_slices(), *inputs[-1].shape, device=gradient.device)
+        if count:
+            load_kernel(rays_adjoint, device)
+            values = [*_arguments(ctx, inputs), warp_argument(gradient, wp.vec3)]
+            outputs = [warp_argument(x, dtype) for x, dtype in zip(of_points, _POINT_TYPES, strict=True)]
+            in_gradient_slices(
+                lambda k, slices: _add_slice(k, slices, count, values, [*outputs, warp_argument(of_table[k], wp.vec3)], device),
+                device,
+                count,
+            )
+        return None, None, *[None] * 5, *of_points, of_table[0] if len(of_table) == 1 else of_table.sum(0)
 
 
-def _launch(height: int, inputs: Sequence[Tensor], contribution: Tensor, gradients: tuple[list[Tensor], Tensor] | None) -> None:
-    """Forward; or, with `gradients` of the points and slices of the table's to be added to, backward: then `contribution` is its gradient."""
-    device, points = warp_device(contribution), len(inputs[0])
-    if points == 0:
-        return
-    samples = len(contribution) // points
-    arrays = [warp_argument(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True)]
-    out = warp_argument(contribution, wp.vec3)
-    load_kernel(ray_contributions, device)
+def _arguments(ctx: Any, inputs: Sequence[Tensor]) -> list:
+    return [ctx.samples, ctx.height, *(warp_argument(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True))]
 
-    def run(k: int, slices: int) -> None:
-        # Slices end between points, so no two threads add to one point's gradient.
-        first, last = points * k // slices * samples, points * (k + 1) // slices * samples
-        values = [first, samples, height, *arrays]
-        if gradients is None:
-            wp.launch(ray_contributions, dim=last - first, inputs=values, outputs=[out], device=device)
-            return
-        point_gradients, table_gradients = gradients
-        adjoints = [warp_argument(x, dtype) for x, dtype in zip(point_gradients, _DTYPES[-_DIFFERENTIABLE:-1], strict=True)]
-        wp.launch(
-            ray_contributions, dim=last - first, inputs=values, outputs=[out], device=device, adjoint=True,
-            adj_inputs=[0, 0, 0, *[None] * (len(arrays) - _DIFFERENTIABLE), *adjoints, warp_argument(table_gradients[k], wp.vec3)], adj_outputs=[out],
-        )  # fmt: skip
 
-    in_gradient_slices(run, device, points * samples)
+def _add_slice(k: int, slices: int, count: int, values: list, outputs: list, device: Any) -> None:
+    """The gradients of one of so many parts of the points."""
+    first, last = count * k // slices, count * (k + 1) // slices
+    wp.launch(rays_adjoint, dim=last - first, inputs=[first, *values], outputs=outputs, device=device)
 
 
 def integrate_samples(
@@ -140,10 +261,8 @@ def integrate_samples(
         transmittance: (point, sample) transmittance of each ray, 0..1. hit_radiance: (point, sample, 3) radiance of what it met, already times
             1 - transmittance. environment_radiance: (height, 2 height, 3).
     """
-    count, samples = rays.weight.shape
-    contribution = _Contributions.apply(
-        environment_radiance.shape[0], points.wo_world, rays.direction_world.reshape(-1, 3), rays.weight.reshape(-1),
+    return _Radiance.apply(
+        environment_radiance.shape[0], rays.weight.shape[1], points.wo_world, rays.direction_world.reshape(-1, 3), rays.weight.reshape(-1),
         transmittance.reshape(-1), hit_radiance.reshape(-1, 3), points.normal_world, points.albedo, points.roughness, points.metallic,
         environment_radiance.reshape(-1, 3),
     )  # fmt: skip
-    return contribution.view(count, samples, 3).sum(1)

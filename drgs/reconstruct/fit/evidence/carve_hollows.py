@@ -25,6 +25,7 @@ from drgs.reconstruct.geometry.thickness import thickness
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.mesh import vertex_normals
+from drgs.warp_torch import by_pool
 
 FACING = 0.2
 """Least cosine between the outward normal and the direction to the eye."""
@@ -102,16 +103,17 @@ def carved_depths(
     matt = matt.nonzero().squeeze(1)
     if len(matt) == 0:
         return inward, torch.zeros_like(mesh.roughness)
-    costs = []
-    for step in range(settings.steps + 1):
+
+    def cost_at(step: int) -> Tensor:
         behind = step * settings.step * radius
         difference, views = view_differences(tracer, targets, matt, inward[matt], behind, radius, settings.steepest, settings.fewest_steep)
         known = views >= settings.fewest_views
         sums = torch.zeros(len(mesh.vertices), 2, device=matt.device)
         sums[matt[known]] = torch.stack([difference * views, views], -1)[known]
         total, weight = averaged(around, sums, settings.cost_rings)[matt].unbind(-1)
-        costs.append(torch.where(weight > 1e-3 * settings.fewest_views, total / weight.clamp(min=1e-9), torch.full_like(total, torch.inf)))
-    cost = torch.stack(costs)
+        return torch.where(weight > 1e-3 * settings.fewest_views, total / weight.clamp(min=1e-9), torch.full_like(total, torch.inf))
+
+    cost = torch.stack(by_pool(lambda step, _: cost_at(step), range(settings.steps + 2), matt.device))
     least = cost.min(0).values
     # Plain paint agrees nearly as well in front of where it is as there, and behind as well: the nearest of equals is chosen.
     near = cost <= least + settings.equal * (cost[0] - least).clamp(min=0)

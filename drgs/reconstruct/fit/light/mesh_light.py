@@ -5,17 +5,16 @@ what it meets; of each vertex, the share of the irradiance of an open sky that a
 passes a gradient on: what was reflected twice is taken as known. One ray a point, drawn from its lobe: steps average over them.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+import warp as wp
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from drgs.maths.brdf import f0_from_base
-from drgs.maths.frames import tangents_from_normal
-from drgs.reconstruct.fit.light.split_sum import shade_split_sum
+from drgs.reconstruct.fit.light.mesh_light_kernels import hit_kernel, mirrored_kernel, rotation_of
+from drgs.reconstruct.fit.light.split_sum import factor_table
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.integrate.environment_table import build_environment_table
 from drgs.render.integrate.sample_rays import sample_rays
@@ -24,7 +23,7 @@ from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import SampleCounts, ShadingPoints
 from drgs.scene.environment import Environment, environment_radiance
 from drgs.scene.mesh import TriangleMesh
-from drgs.warp_torch import by_pool
+from drgs.warp_torch import by_pool, launch, warp_argument, warp_device
 
 SHARE_LIFT = 4.0
 """Of the tracer's lift: rays from vertices must clear all faces around them."""
@@ -69,33 +68,29 @@ def corner_weights(barycentric: Tensor) -> Tensor:
 
 def hit_radiance(
     mesh: TriangleMesh,
-    corners: Tensor,
-    weights: Tensor,
-    towards: Tensor,
+    face: Int[Tensor, "place"],
+    weights: Float[Tensor, "place 3"],
+    towards: Float[Tensor, "place 3"],
     light: MeshLight,
     mirrored: tuple[Tensor, Tensor] | None = None,
-) -> Tensor:
-    """(point, 3) radiance that places on the mesh send in the directions `towards` (point, 3), by split sum.
+) -> Float[Tensor, "place 3"]:
+    """Radiance that places on the mesh send in the directions `towards`, by split sum.
 
     Args:
-        mirrored: of mirrored_light; None: all that is mirrored there is the sky.
+        face, weights: where, int64 and by corner_weights. mirrored: of mirrored_light; None: all that is mirrored there is the sky.
     """
-    normal = torch.nn.functional.normalize(at_corners(mesh.normals, corners, weights), dim=-1)
-    albedo, metallic = at_corners(mesh.albedo, corners, weights), at_corners(mesh.metallic, corners, weights)
-    transmittance, met = (None, None) if mirrored is None else mirrored
-    return shade_split_sum(
-        albedo * (1 - metallic)[:, None],
-        torch.zeros_like(albedo),
-        f0_from_base(albedo, metallic),
-        at_corners(mesh.roughness, corners, weights),
-        normal,
-        towards,
-        light.tables,
-        transmittance,
-        met,
-        open_share=at_corners(light.open_share, corners, weights),
-        light_from_world=light.light_from_world,
-    ).clamp(min=0)
+    radiance = torch.empty_like(towards)
+    # Never read where nothing is mirrored again.
+    transmittance, met = (light.open_share[:, 0], light.open_share) if mirrored is None else mirrored
+    vectors = (warp_argument(x, wp.vec3) for x in (mesh.normals, mesh.albedo))
+    inputs = [
+        warp_argument(face), warp_argument(weights, wp.vec3), warp_argument(towards, wp.vec3), warp_argument(mesh.faces), *vectors,
+        warp_argument(mesh.roughness), warp_argument(mesh.metallic), warp_argument(light.open_share, wp.vec3), warp_argument(transmittance),
+        warp_argument(met, wp.vec3), int(mirrored is not None), rotation_of(light.light_from_world), warp_argument(light.tables, wp.vec3),
+        warp_argument(factor_table(towards.device), wp.vec2),
+    ]  # fmt: skip
+    launch(hit_kernel, len(face), inputs, [warp_argument(radiance, wp.vec3)], warp_device(radiance))
+    return radiance
 
 
 def radiance_along(
@@ -115,47 +110,41 @@ def radiance_along(
     radiance = torch.zeros_like(directions)
     met = hits.hit.nonzero().squeeze(1)
     if len(met):
-        mesh, towards = tracer.mesh, -directions[met]
-        face = hits.face[met].long()
-        corners, weights = mesh.faces[face].long(), corner_weights(hits.barycentric[met])
+        towards = -directions.index_select(0, met)
+        face, weights = hits.face.index_select(0, met).long(), corner_weights(hits.barycentric.index_select(0, met))
         again = None
         if mirrors:
             assert generator is not None
-            position, roughness = (at_corners(values, corners, weights) for values in (mesh.vertices, mesh.roughness))
-            normal = torch.nn.functional.normalize(at_corners(mesh.normals, corners, weights), dim=-1)
-            again = mirrored_light(tracer, position, tracer.face_normals[face], normal, roughness, towards, light, generator, mirrors - 1)
-        radiance[met] = hit_radiance(mesh, corners, weights, towards, light, again)
+            again = mirrored_light(tracer, face, weights, towards, light, generator, mirrors - 1)
+        radiance.index_copy_(0, met, hit_radiance(tracer.mesh, face, weights, towards, light, again))
     return (~hits.hit).float(), radiance
 
 
 def mirrored_light(
     tracer: AbstractTracer,
-    position: Tensor,
-    face_normal: Tensor,
-    normal: Tensor,
-    roughness: Tensor,
-    wo: Tensor,
+    face: Int[Tensor, "place"],
+    weights: Float[Tensor, "place 3"],
+    wo: Float[Tensor, "place 3"],
     light: MeshLight,
     generator: torch.Generator,
     mirrors: int = MIRRORS,
-) -> tuple[Tensor, Tensor]:
-    """Of each point (point, 3): whether a ray mirrored at a half vector drawn from its lobe escapes (point,), and what it meets (point, 3).
+) -> tuple[Float[Tensor, "place"], Float[Tensor, "place 3"]]:
+    """Of each place on the mesh: whether a ray mirrored at a half vector drawn from its lobe escapes, and what it meets.
 
     Args:
-        mirrors: of radiance_along.
+        face, weights: where, int64 and by corner_weights. mirrors: of radiance_along.
     """
-    alpha = roughness * roughness
-    u = torch.rand(2, len(normal), generator=generator).to(normal.device)
-    cosine2 = (1 - u[0]) / (1 + (alpha * alpha - 1) * u[0])
-    sine, azimuth = (1 - cosine2).clamp(min=0).sqrt(), 2 * math.pi * u[1]
-    t_u, t_v = tangents_from_normal(normal)
-    half = t_u * (sine * azimuth.cos())[:, None] + t_v * (sine * azimuth.sin())[:, None] + normal * cosine2.sqrt()[:, None]
-    mirrored = 2 * (half * wo).sum(-1, keepdim=True) * half - wo
-    transmittance, met = torch.ones_like(roughness), torch.zeros_like(normal)
-    above = ((mirrored * face_normal).sum(-1) > CLEAR_OF_FACE).nonzero().squeeze(1)
-    origin = position[above] + tracer.lift * face_normal[above]
-    transmittance[above], met[above] = radiance_along(tracer, origin, mirrored[above], light, mirrors, generator)
-    return transmittance, met
+    mesh, drawn = tracer.mesh, torch.rand(2, len(face), generator=generator).to(wo.device)
+    origin, direction, above = torch.empty_like(wo), torch.empty_like(wo), torch.empty(len(face), dtype=torch.bool, device=wo.device)
+    inputs = [
+        warp_argument(face), warp_argument(weights, wp.vec3), warp_argument(wo, wp.vec3), warp_argument(drawn), warp_argument(mesh.faces),
+        warp_argument(mesh.vertices, wp.vec3), warp_argument(mesh.normals, wp.vec3), warp_argument(mesh.roughness),
+        warp_argument(tracer.face_normals, wp.vec3), tracer.lift, CLEAR_OF_FACE,
+    ]  # fmt: skip
+    outputs = [warp_argument(origin, wp.vec3), warp_argument(direction, wp.vec3), warp_argument(above, wp.bool)]
+    launch(mirrored_kernel, len(face), inputs, outputs, warp_device(wo))
+    transmittance, met = radiance_along(tracer, origin, direction, light, mirrors, generator)
+    return torch.where(above, transmittance, 1.0), torch.where(above[:, None], met, 0.0)
 
 
 def irradiance_share(tracer: AbstractTracer, environment: Environment, light: MeshLight, rays: int, generator: torch.Generator) -> Tensor:

@@ -28,8 +28,9 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, radiance_along
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, display_image
-from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, prior_terms
+from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.prior_terms import prior_terms
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_twice
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
@@ -128,16 +129,13 @@ class _Steps:
         view = drawn_view(iteration, len(self.targets), settings.seed)
         target = self.targets[view]
         environment = environment_table(parameters)
-        normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
-        materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
+        surface = packed_surface(parameters)
         terms: dict[str, Tensor] = {}
-        traced, squared_error = self._traced(
-            target, self._drawn(self.solid[view]), environment, packed_surface(normals, materials), iteration
-        )
+        traced, squared_error = self._traced(target, self._drawn(self.solid[view]), environment, surface, iteration)
         if squared_error is not None:
             terms["traced"] = traced
         terms |= prior_terms(
-            self.surface.edges, environment, normals, materials, parameters["metal"], settings.weight_bend, settings.weight_smooth,
+            self.surface.edges, environment, surface, parameters["metal"], settings.weight_bend, settings.weight_smooth,
             settings.weight_metal, settings.weight_white_light, settings.weight_rough_light,
         )  # fmt: skip
         return StepLoss(terms, target.camera, squared_error)

@@ -25,13 +25,13 @@ from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
-from drgs.reconstruct.fit.losses import crossed_halves, rough_light, white_light
+from drgs.reconstruct.fit.losses import crossed_halves
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.prior_terms import prior_terms
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places, steep_enough
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
-from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
@@ -181,24 +181,21 @@ class _Steps:
         target = self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
         parameters = self.state.parameters
         environment = environment_table(parameters)
-        normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
-        materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
+        surface = packed_surface(parameters)
         terms: dict[str, Tensor] = {}
-        shaded, squared_error = self._shaded(target, environment, normals, materials)
+        shaded, squared_error = self._shaded(target, environment, surface)
         if squared_error is not None:
             terms["shaded"] = shaded
         settings, progress = self.settings, iteration / self.settings.iterations
         bend = settings.weight_bend ** (1 - progress) * settings.weight_bend_end**progress
         smooth = settings.weight_smooth ** (1 - progress) * settings.weight_smooth_end**progress
         terms |= prior_terms(
-            self.surface.edges, environment, normals, materials, parameters["metal"], bend, smooth, settings.weight_metal,
+            self.surface.edges, environment, surface, parameters["metal"], bend, smooth, settings.weight_metal,
             settings.weight_white_light, settings.weight_rough_light,
         )  # fmt: skip
         return StepLoss(terms, target.camera, squared_error)
 
-    def _shaded(
-        self, target: ViewTarget, environment: Tensor, normals: Tensor, materials: dict[str, Tensor]
-    ) -> tuple[Tensor, float | None]:
+    def _shaded(self, target: ViewTarget, environment: Tensor, surface: Tensor) -> tuple[Tensor, float | None]:
         """The mean error of the pixels that mask and mesh fill, in display space, by two estimates of their colours, and the squared one of the
         first; None where there is no such pixel."""
         solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
@@ -208,7 +205,7 @@ class _Steps:
         tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
         light = self.surface.light_of(filter_environment(environment))(target)
         cost = partial(_cost_of_pixels, solid, target, tracer, light)
-        leaves = (light.tables, packed_surface(normals, materials))
+        leaves = (light.tables, surface)
         total, (squared, count) = cost_in_slices(len(solid), leaves, cost, self.state.generator)
         return (total / count, float(squared / count)) if count else (total, None)
 
@@ -231,30 +228,3 @@ def _cost_of_pixels(
     count = photo.numel()
     error = crossed_halves(halves[0], halves[1], photo) * count if count else tables.sum() * 0
     return error, torch.stack([(halves[0].detach().clamp(0, 1) - photo).square().sum(), tables.new_tensor(count)])
-
-
-def prior_terms(
-    edges: MeshEdges,
-    environment: Tensor,
-    normals: Tensor,
-    materials: dict[str, Tensor],
-    evidence: Tensor,
-    bend: float,
-    smooth: float,
-    metal: float,
-    white: float,
-    rough: float,
-) -> dict[str, Tensor]:
-    """Weighted loss terms that look at no photograph: normals and materials along edges, metallic against the evidence, the light."""
-    start, end = (corner.contiguous() for corner in edges.vertices.unbind(1))
-    across = {
-        name: values.index_select(0, start) - values.index_select(0, end) for name, values in (materials | {"normals": normals}).items()
-    }
-    decided = (evidence > 0).to(evidence)
-    return {
-        "bend": bend * across["normals"].norm(dim=-1).mean(),
-        "smooth": smooth * torch.stack([across[name].abs().mean() for name in materials]).sum(),
-        "metal": metal * (evidence.abs() * (materials["metallic"] - decided).abs()).mean(),
-        "white_light": white * white_light(environment),
-        "rough_light": rough * rough_light(environment),
-    }

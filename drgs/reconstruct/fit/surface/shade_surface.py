@@ -10,10 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from drgs.maths.brdf import f0_from_base
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, mirrored_light
-from drgs.reconstruct.fit.light.split_sum import shade_split_sum
-from drgs.reconstruct.fit.losses import display_image
+from drgs.reconstruct.fit.surface.surface_color import surface_color
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -38,8 +36,9 @@ class SeenPlaces:
     weights: Float[Tensor, "place 3"]
     """Of the corners."""
 
-    def __getitem__(self, chosen: Tensor) -> "SeenPlaces":
-        return SeenPlaces(*(values[chosen] for values in vars(self).values()))
+    def __getitem__(self, chosen: Bool[Tensor, "place"] | Int[Tensor, "chosen"]) -> "SeenPlaces":
+        at = chosen.nonzero().squeeze(1) if chosen.dtype == torch.bool else chosen
+        return SeenPlaces(*(values.index_select(0, at) for values in vars(self).values()))
 
     @property
     def nearest(self) -> Int[Tensor, "place"]:
@@ -84,13 +83,11 @@ def _places_of(chosen: Tensor, pixels: Tensor, direction: Tensor, hits: Hits, tr
     return SeenPlaces(pixels[at], -direction[at], face, tracer.mesh.faces[face].long(), corner_weights(hits.barycentric[at]))
 
 
-def packed_surface(normals: Float[Tensor, "vertex 3"], materials: dict[str, Tensor]) -> Float[Tensor, "vertex 8"]:
-    """Normals, albedo, roughness and metallic of the vertices side by side: places gather them at once.
-
-    Args:
-        materials: albedo, roughness and metallic.
-    """
-    return torch.cat([normals, materials["albedo"], materials["roughness"][:, None], materials["metallic"][:, None]], 1)
+def packed_surface(parameters: dict[str, Tensor]) -> Float[Tensor, "vertex 8"]:
+    """Normals, albedo, roughness and metallic of a fit's vertices side by side: places gather them at once."""
+    one = (parameters[f"{name}_logits"][:, None] for name in ("roughness", "metallic"))
+    logits = torch.cat([parameters["albedo_logits"], *one], 1)
+    return torch.cat([torch.nn.functional.normalize(parameters["normals"], dim=-1), torch.sigmoid(logits)], 1)
 
 
 @torch.no_grad()
@@ -114,21 +111,8 @@ def shade_places(
     Args:
         tracer: its mesh has the materials that mirrors see. surface: of packed_surface. light: its tables may want a gradient.
     """
-    corners, weights = seen.corners, seen.weights
-    # Split once: back through a slice autograd writes zeros for all that it leaves out.
-    blended_normal, albedo, roughness, metallic = at_corners(surface, corners, weights).split([3, 3, 1, 1], 1)
-    normal, roughness, metallic = torch.nn.functional.normalize(blended_normal, dim=-1), roughness[:, 0].contiguous(), metallic[:, 0]
-    diffuse, f0 = albedo * (1 - metallic)[:, None], f0_from_base(albedo, metallic)
-    open_share = at_corners(light.open_share, corners, weights)
-    position = at_corners(tracer.mesh.vertices, corners, weights).detach()
     known = MeshLight(light.tables.detach(), light.open_share, light.light_from_world)
-    photo = target.saturation.reshape(-1, 3)[seen.pixels]
     with torch.no_grad():
-        transmittance, met = mirrored_light(
-            tracer, position, tracer.face_normals[seen.face], normal.detach(), roughness.detach(), seen.wo, known, generator
-        )
-    radiance = shade_split_sum(
-        diffuse, torch.zeros_like(albedo), f0, roughness, normal, seen.wo, light.tables, transmittance, met, open_share,
-        light.light_from_world,
-    )  # fmt: skip
-    return display_image(radiance, torch.ones_like(roughness), photo, target.ceiling)
+        transmittance, met = mirrored_light(tracer, seen.face, seen.weights, seen.wo, known, generator)
+    photo = target.saturation.reshape(-1, 3)[seen.pixels]
+    return surface_color(seen.corners, seen.weights, seen.wo, transmittance, met, photo, target.ceiling, surface, light)

@@ -23,12 +23,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, crossed_squares
-from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, prior_terms
+from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates
 from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.prior_terms import prior_terms
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_places, shade_places, steep_enough
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import drawn_view, view_targets
@@ -296,29 +298,40 @@ class Trials:
         light_of = surface.light_of(filter_environment(environment))
         seen, nearest = self._seen(surface.tracer, beside, only)
 
-        def current() -> tuple[Tensor, dict[str, Tensor]]:
-            materials = {name: torch.sigmoid(values[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
-            return torch.nn.functional.normalize(values["normals"], dim=-1), materials
+        def compared(index: int, packed: Tensor) -> SeenPlaces:
+            return seen[index][steep_enough(seen[index], packed[:, :3])]
 
-        def shown(index: int, normals: Tensor, materials: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-            """Pixels, their nearest vertices, two estimates of the colours and the photograph's colours of a view's pixels."""
-            target, places = self._targets[index], seen[index][steep_enough(seen[index], normals)]
-            tracer = surface.tracer.with_materials(mesh_from_surface_fit(state, self._faces))
-            packed = packed_surface(normals, materials)
-            first, second = (shade_places(places, target, tracer, packed, light_of(target), state.generator) for _ in range(2))
-            return places.pixels, places.nearest, first, second, target.saturation.reshape(-1, 3)[places.pixels]
+        def shown(
+            index: int, places: SeenPlaces, tracer: AbstractTracer, packed: Tensor, generator: torch.Generator
+        ) -> tuple[Tensor, Tensor, Tensor]:
+            """Two estimates of the colours of a view's places, and the photograph's colours."""
+            target = self._targets[index]
+            first, second = (shade_places(places, target, tracer, packed, light_of(target), generator) for _ in range(2))
+            return first, second, target.saturation.reshape(-1, 3)[places.pixels]
+
+        def materials_of_now() -> AbstractTracer:
+            return surface.tracer.with_materials(mesh_from_surface_fit(state, self._faces))
 
         def step(iteration: int) -> StepLoss:
             index = drawn_view(iteration, len(self._targets), self._seed)
-            normals, materials = current()
+            packed = packed_surface(values)
             terms = prior_terms(
-                self.edges, environment, normals, materials, values["metal"], settings.weight_bend, settings.weight_smooth, 0.0, 0.0, 0.0
+                self.edges, environment, packed, values["metal"], settings.weight_bend, settings.weight_smooth, 0.0, 0.0, 0.0
             )
-            _, _, first, second, photo = shown(index, normals, materials)
-            squared_error = None
-            if len(photo):
-                terms["shaded"] = crossed_halves(first, second, photo)
-                squared_error = float((first.detach().clamp(0, 1) - photo).square().mean())
+            tracer = materials_of_now()
+            with torch.no_grad():
+                places = compared(index, packed)
+
+            def cost(start: int, end: int, leaves: tuple[Tensor, ...], generator: torch.Generator) -> tuple[Tensor, Tensor]:
+                some = places[torch.arange(start, end, device=places.pixels.device)]
+                first, second, photo = shown(index, some, tracer, leaves[0], generator)
+                squared = (first.detach().clamp(0, 1) - photo).square().sum()
+                return crossed_halves(first, second, photo) * photo.numel() if len(some.pixels) else leaves[0].sum() * 0, squared[None]
+
+            squared_error, count = None, 3 * len(places.pixels)
+            if count:
+                total, squares = cost_in_slices(len(places.pixels), (packed,), cost, state.generator)
+                terms["shaded"], squared_error = total / count, float(squares) / count
             return StepLoss(terms, self._targets[index].camera, squared_error)
 
         def rates(iteration: int) -> dict[str, float]:
@@ -330,16 +343,17 @@ class Trials:
         self._done += settings.steps
         errors, squares = torch.zeros(len(values["vertices"]), 2, device=self._faces.device), []
         with torch.no_grad():
-            normals, materials = current()
+            packed, tracer = packed_surface(values), materials_of_now()
             for index, target in enumerate(self._targets):
                 if self.stopped:
                     break
-                pixels, vertex, first, second, photo = shown(index, normals, materials)
+                places = compared(index, packed)
+                first, second, photo = shown(index, places, tracer, packed, state.generator)
                 # A square would count the noise of mirrored rays, which hollows have and what fills them has not.
                 error = crossed_squares(first, second, photo)
-                errors.index_add_(0, vertex, torch.stack([error, torch.ones_like(error)], 1))
+                errors.index_add_(0, places.nearest, torch.stack([error, torch.ones_like(error)], 1))
                 of_all = torch.full((target.mask.numel(),), math.nan, device=errors.device)
-                of_all[pixels] = error
+                of_all[places.pixels] = error
                 squares.append(of_all[self._solid[index]])
                 foreign = seen_places(target, self._bare[index], surface.tracer).nearest
                 wrong = torch.tensor([FOREIGN_ERROR, 1.0], device=errors.device)

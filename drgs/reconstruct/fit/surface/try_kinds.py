@@ -153,9 +153,8 @@ def _sums(views: Views, state: FitState, faces: Tensor, targets: list[ViewTarget
 def _error(views: Views, state: FitState, faces: Tensor, targets: list[ViewTarget], settings: SurfaceSettings) -> float:
     """Mean squared error (display values) over the pixels that mask and mesh fill, without the noise of mirrored rays."""
     surface, parameters = MovingSurface(views, faces, state), state.parameters
-    normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
-    materials = {name: torch.sigmoid(parameters[f"{name}_logits"]) for name in ("albedo", "roughness", "metallic")}
-    packed = packed_surface(normals, materials)
+    packed = packed_surface(parameters)
+    normals = packed[:, :3]
     light_of = surface.light_of(filter_environment(environment_table(parameters)))
     generator = torch.Generator().manual_seed(settings.seed)
     total, count = 0.0, 0

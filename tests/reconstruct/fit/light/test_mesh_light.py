@@ -84,18 +84,8 @@ def test_what_a_mirror_shows_of_another_mirrors_the_object_as_often_as_it_is_sai
     albedo, count = 0.8, 256
     mesh = facing_mirrors(albedo)
     light = MeshLight(filter_environment(torch.ones(*ENVIRONMENT_SIZE, 3)), torch.zeros_like(mesh.vertices))
-    up = torch.tensor([0.0, 0, 1]).expand(count, 3).contiguous()
+    face, weights = torch.zeros(count, dtype=torch.long), torch.tensor([0.5, 0.0, 0.5]).expand(count, 3)  # its longest side's middle
     towards = torch.nn.functional.normalize(torch.tensor([0.1, 0, 1.0]), dim=0).expand(count, 3)
-    transmittance, met = mirrored_light(
-        build_tracer(mesh),
-        torch.zeros(count, 3),
-        up,
-        up,
-        torch.full((count,), 0.1),
-        towards,
-        light,
-        torch.Generator().manual_seed(1),
-        mirrors,
-    )
+    transmittance, met = mirrored_light(build_tracer(mesh), face, weights, towards, light, torch.Generator().manual_seed(1), mirrors)
     assert float(transmittance.max()) == 0
     assert abs(float(met.mean()) / albedo ** (mirrors + 1) - 1) < 0.02

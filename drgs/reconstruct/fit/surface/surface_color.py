@@ -1,0 +1,238 @@
+"""What places of a mesh look like in a photograph, from the numbers at its vertices: split sum and the display's curve in one kernel.
+
+A step of the surface's fit shades some ten thousand places and goes back through it. As separate operations, each reading and writing all places, that
+took three times as long. Gradients are written out (split_sum_kernels.py) and added where vertices and the light's tables are.
+
+In: places of pixels on the mesh, numbers of its vertices, the filtered light. Out: (place, 3) colours in display space; gradients reach the numbers
+of the vertices and the tables.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import warp as wp
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from drgs.maths.constants import SRGB_GAMMA, SRGB_LINEAR_END, SRGB_OFFSET, SRGB_SCALE, SRGB_SLOPE
+from drgs.reconstruct.fit.light.mesh_light import MeshLight
+from drgs.reconstruct.fit.light.mesh_light_kernels import base_f0, normal_at, rotation_of, vector_at
+from drgs.reconstruct.fit.light.split_sum import factor_table
+from drgs.reconstruct.fit.light.split_sum_kernels import gradients_of_point, radiance_of_point
+from drgs.warp_torch import gradient_slices, in_gradient_slices, launch, load_kernel, warp_argument, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+NUMBERS = 8
+"""Of a vertex: normal, albedo, roughness, metallic."""
+SATURATED = 254 / 255
+"""Of the ceiling, from where on a photograph only says "at least"."""
+
+
+@wp.struct
+class _Seen:
+    """One place."""
+
+    corner: wp.vec3i
+    weight: wp.vec3
+    blended: wp.vec3
+    """Normal before it has unit length."""
+    normal: wp.vec3
+    albedo: wp.vec3
+    roughness: float
+    metallic: float
+    diffuse: wp.vec3
+    f0: wp.vec3
+    open_share: wp.vec3
+
+
+@wp.func
+def _seen(
+    i: int, corners: wp.array2d[wp.int64], weights: wp.array[wp.vec3], surface: wp.array2d[float], open_share: wp.array[wp.vec3]
+) -> _Seen:
+    place = _Seen()
+    place.corner = wp.vec3i(int(corners[i, 0]), int(corners[i, 1]), int(corners[i, 2]))
+    place.weight = weights[i]
+    albedo = wp.vec3(0.0, 0.0, 0.0)
+    blended = wp.vec3(0.0, 0.0, 0.0)
+    roughness = float(0.0)
+    metallic = float(0.0)
+    for k in range(3):
+        c = place.corner[k]
+        w = place.weight[k]
+        blended += w * wp.vec3(surface[c, 0], surface[c, 1], surface[c, 2])
+        albedo += w * wp.vec3(surface[c, 3], surface[c, 4], surface[c, 5])
+        roughness += w * surface[c, 6]
+        metallic += w * surface[c, 7]
+    place.blended = blended
+    place.normal = normal_at(blended)
+    place.albedo = albedo
+    place.roughness = roughness
+    place.metallic = metallic
+    place.diffuse = albedo * (1.0 - metallic)
+    place.f0 = base_f0(albedo, metallic)
+    place.open_share = vector_at(open_share, place.corner, place.weight)
+    return place
+
+
+@wp.func
+def _display(linear: float) -> float:
+    return wp.where(
+        linear <= SRGB_LINEAR_END,
+        SRGB_SLOPE * linear,
+        SRGB_SCALE * wp.pow(wp.max(linear, SRGB_LINEAR_END), 1.0 / SRGB_GAMMA) - SRGB_OFFSET,
+    )
+
+
+@wp.func
+def _display_slope(linear: float, shown: float) -> float:
+    # By what is shown, for a power costs as much as all else.
+    return wp.where(linear <= SRGB_LINEAR_END, SRGB_SLOPE, (shown + SRGB_OFFSET) / (SRGB_GAMMA * wp.max(linear, SRGB_LINEAR_END)))
+
+
+@wp.kernel
+def color_kernel(
+    first: int,
+    corners: wp.array2d[wp.int64],
+    weights: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    transmittance: wp.array[float],
+    met: wp.array[wp.vec3],
+    photo: wp.array[wp.vec3],
+    open_share: wp.array[wp.vec3],
+    factors: wp.array[wp.vec2],
+    light_from_world: wp.mat33,
+    ceiling: float,
+    surface: wp.array2d[float],
+    tables: wp.array[wp.vec3],
+    # outputs
+    radiance: wp.array[wp.vec3],
+    uncut: wp.array[wp.vec3],
+    color: wp.array[wp.vec3],
+):
+    """`uncut` is the colour where nothing is saturated.
+
+    Many arguments because a struct of them would be filled anew, array by array, for each launch.
+    """
+    i = first + wp.tid()
+    place = _seen(i, corners, weights, surface, open_share)
+    linear = radiance_of_point(
+        place.diffuse, place.f0, place.roughness, light_from_world * place.normal, light_from_world * wo[i], transmittance[i], met[i],
+        place.open_share, tables, factors,
+    )  # fmt: skip
+    radiance[i] = linear
+    value = wp.vec3(_display(linear[0]), _display(linear[1]), _display(linear[2]))
+    uncut[i] = value
+    shown = value
+    for k in range(3):
+        shown[k] = wp.where(photo[i][k] >= SATURATED * ceiling, wp.min(value[k], ceiling), value[k])
+    color[i] = shown
+
+
+@wp.kernel
+def color_adjoint(
+    first: int,
+    corners: wp.array2d[wp.int64],
+    weights: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    transmittance: wp.array[float],
+    met: wp.array[wp.vec3],
+    photo: wp.array[wp.vec3],
+    open_share: wp.array[wp.vec3],
+    factors: wp.array[wp.vec2],
+    light_from_world: wp.mat33,
+    ceiling: float,
+    surface: wp.array2d[float],
+    tables: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+    uncut: wp.array[wp.vec3],
+    color_gradient: wp.array[wp.vec3],
+    # outputs
+    surface_gradients: wp.array2d[float],
+    table_gradients: wp.array[wp.vec3],
+):
+    """Many arguments because a struct of them would be filled anew, array by array, for each launch."""
+    i = first + wp.tid()
+    place = _seen(i, corners, weights, surface, open_share)
+    linear = radiance[i]
+    g = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(3):
+        beyond = wp.where(photo[i][k] >= SATURATED * ceiling, uncut[i][k], 0.0) > ceiling
+        g[k] = wp.where(beyond, 0.0, color_gradient[i][k] * _display_slope(linear[k], uncut[i][k]))
+    found = gradients_of_point(
+        g, place.diffuse, place.f0, place.roughness, light_from_world * place.normal, light_from_world * wo[i], transmittance[i], met[i],
+        place.open_share, tables, factors, table_gradients,
+    )  # fmt: skip
+    m = place.metallic
+    g_albedo = found.diffuse_albedo * (1.0 - m) + found.f0 * m
+    g_metallic = wp.dot(found.f0, place.albedo - base_f0(place.albedo, 0.0)) - wp.dot(found.diffuse_albedo, place.albedo)
+    g_normal = wp.transpose(light_from_world) * found.normal
+    g_normal = (g_normal - wp.dot(g_normal, place.normal) * place.normal) / wp.max(wp.length(place.blended), 1.0e-12)
+    for k in range(3):
+        c = place.corner[k]
+        w = place.weight[k]
+        for axis in range(3):
+            wp.atomic_add(surface_gradients, c, axis, w * g_normal[axis])
+            wp.atomic_add(surface_gradients, c, 3 + axis, w * g_albedo[axis])
+        wp.atomic_add(surface_gradients, c, 6, w * found.roughness)
+        wp.atomic_add(surface_gradients, c, 7, w * g_metallic)
+
+
+def surface_color(
+    corners: Int[Tensor, "place 3"],
+    weights: Float[Tensor, "place 3"],
+    wo: Float[Tensor, "place 3"],
+    transmittance: Float[Tensor, "place"],
+    met: Float[Tensor, "place 3"],
+    photo: Float[Tensor, "place 3"],
+    ceiling: float,
+    surface: Float[Tensor, "vertex 8"],
+    light: MeshLight,
+) -> Float[Tensor, "place 3"]:
+    """Colours in display space, as display_image has them; differentiable in `surface` and in the light's tables.
+
+    Args:
+        corners, weights: of each place. wo: unit, world. transmittance, met: of mirrored_light. photo: what the photograph shows there, for what is
+            saturated. ceiling: its largest value. surface: of packed_surface.
+    """
+    given = (corners, weights, wo, transmittance, met, photo, light.open_share, factor_table(wo.device))
+    return _SurfaceColor.apply(surface, light.tables, given, rotation_of(light.light_from_world), ceiling)
+
+
+_TYPES = (None, wp.vec3, wp.vec3, None, wp.vec3, wp.vec3, wp.vec3, wp.vec2)
+
+
+class _SurfaceColor(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, surface, tables, given, rotation, ceiling):
+        radiance, uncut, color = (torch.empty_like(given[2]) for _ in range(3))
+        surface, tables = surface.detach().contiguous(), tables.detach().contiguous()
+        ctx.given, ctx.rotation, ctx.ceiling = tuple(x.detach().contiguous() for x in given), rotation, ceiling
+        ctx.save_for_backward(surface, tables, radiance, uncut)
+        outputs = [warp_argument(x, wp.vec3) for x in (radiance, uncut, color)]
+        launch(color_kernel, len(color), _arguments(ctx, surface, tables), outputs, warp_device(color))
+        return color
+
+    @staticmethod
+    def backward(ctx, gradient):
+        surface, tables, radiance, uncut = ctx.saved_tensors
+        slices, device, count = gradient_slices(), warp_device(gradient), len(gradient)
+        by_surface, by_tables = (torch.zeros(slices, *x.shape, device=gradient.device) for x in (surface, tables))
+        if count:
+            load_kernel(color_adjoint, device)
+            inputs = [*_arguments(ctx, surface, tables), *(warp_argument(x, wp.vec3) for x in (radiance, uncut, gradient))]
+            in_gradient_slices(lambda k, of: _add_slice(k, of, count, inputs, by_surface[k], by_tables[k], device), device, count)
+        return (*(x[0] if slices == 1 else x.sum(0) for x in (by_surface, by_tables)), None, None, None)
+
+
+def _arguments(ctx: Any, surface: Tensor, tables: Tensor) -> list:
+    given = [warp_argument(x, dtype) for x, dtype in zip(ctx.given, _TYPES, strict=True)]
+    return [*given, ctx.rotation, ctx.ceiling, warp_argument(surface), warp_argument(tables, wp.vec3)]
+
+
+def _add_slice(k: int, slices: int, count: int, inputs: Sequence, by_surface: Tensor, by_tables: Tensor, device: Any) -> None:
+    """Gradients of one of so many parts of the places."""
+    first, last = count * k // slices, count * (k + 1) // slices
+    outputs = [warp_argument(by_surface), warp_argument(by_tables, wp.vec3)]
+    wp.launch(color_adjoint, dim=last - first, inputs=[first, *inputs], outputs=outputs, device=device)
