@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from drgs.reconstruct.capture.ray_costs import ray_costs
 from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 
@@ -90,11 +91,6 @@ class RadianceGrid:
         opacity = (1 - torch.exp(-density * step)) * (self.looked_up(self.inside, places) > 0.5)
         passed = torch.cumprod(torch.cat([torch.ones_like(near)[:, None], 1 - opacity + 1e-7], 1), 1)
         return distance, places, opacity * passed[:, :-1]
-
-    def colors_at(self, places: Float[Tensor, "n 3"], direction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """SRGB seen in those directions; the derivative goes to the coefficients alone."""
-        harmonics = torch.cat([torch.ones_like(direction[:, :1]), direction], -1)
-        return torch.sigmoid((self.coefficients_at(places).reshape(-1, 3, HARMONICS) * harmonics[:, None]).sum(-1))
 
     def coefficients_at(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 12"]:
         """Trilinearly, as `colors` has them."""
@@ -210,35 +206,11 @@ def _cost_of_rays(
     """
     some = slice(first, last)
     rays, colors, shake = batch
-    here = replace(grid, density=leaves[0], colors=leaves[1])
-    return _loss(here, rays[some], colors[some], shake[some], settings, gather) * (last - first), shake.new_zeros(())
-
-
-def _loss(
-    grid: RadianceGrid,
-    rays: Rays,
-    colors: Float[Tensor, "ray 3"],
-    shake: Float[Tensor, "ray 1"],
-    settings: RadianceGridSettings,
-    gather: bool,
-) -> Float[Tensor, ""]:
-    """Mean over rays."""
-    count = len(grid.density)
-    offsets = (torch.arange(count, device=shake.device) + shake) / count
-    _, places, weights = grid.samples(rays, offsets)
-    ray, sample = (weights.detach() > settings.least_weight).nonzero(as_tuple=True)
-    kept = weights[ray, sample]
-    shown = grid.colors_at(places[ray, sample].detach(), rays.direction[ray])
-    opacity = weights.sum(1)
-    empty = torch.zeros_like(opacity)
-    # What was not looked up has the photograph's colour, and no say.
-    rest = (opacity - empty.index_add(0, ray, kept)).detach()
-    image = torch.zeros_like(colors).index_add(0, ray, kept[:, None] * shown) + rest[:, None] * colors
-    loss = (image - colors).square().mean()
-    loss = loss - settings.weight_opaque * opacity.clamp(1e-4, 1).log().mean()
-    if not gather:
-        return loss
-    side = grid.cell * (count - 5)
-    at = (offsets * ((rays.far - rays.near + 2 * grid.cell) / side)[:, None]).detach()
-    middle = (weights * at).sum(1, keepdim=True) / opacity.detach()[:, None].clamp(min=0.01)
-    return loss + settings.weight_gathered * (weights * (at - middle).abs()).sum(1).mean()
+    here = rays[some]
+    weights = (settings.weight_opaque, settings.weight_gathered if gather else 0.0)
+    density, hue = leaves
+    through = (here.origin, here.direction, here.near, here.far)
+    cost = ray_costs(
+        through, colors[some], shake[some], grid.low, grid.cell, grid.inside, grid.row, density, hue, weights, settings.least_weight
+    )
+    return cost, shake.new_zeros(())

@@ -1,0 +1,251 @@
+"""What rays through a radiance grid cost, and the gradient of that: one thread a ray, there and back.
+
+As some fifty operations on all samples a step of the fit took five times as long. Formulas: drgs/reference/ray_costs.py.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from drgs.warp_torch import gradient_slices, in_gradient_slices, load_kernel, warp_argument, warp_device
+
+wp.set_module_options({"enable_backward": False})
+
+PASSED = 1e-7
+"""Is added to what passes a sample, so that it can be divided by."""
+
+
+@wp.struct
+class _Cell:
+    """Of the grid, with a place in it."""
+
+    base: wp.vec3i
+    """Its first node."""
+    part: wp.vec3
+    """Of its side, along each axis."""
+
+
+@wp.func
+def _cell_at(at: wp.vec3) -> _Cell:
+    found = _Cell()
+    found.base = wp.vec3i(int(wp.floor(at[0])), int(wp.floor(at[1])), int(wp.floor(at[2])))
+    found.part = at - wp.vec3(float(found.base[0]), float(found.base[1]), float(found.base[2]))
+    return found
+
+
+@wp.func
+def _node(here: _Cell, corner: int, count: int) -> int:
+    """Of the eight around a place; -1 where there is none."""
+    i = here.base[0] + corner // 4
+    j = here.base[1] + (corner // 2) % 2
+    k = here.base[2] + corner % 2
+    within = wp.min(wp.min(i, j), k) >= 0 and wp.max(wp.max(i, j), k) < count
+    return wp.where(within, (i * count + j) * count + k, -1)
+
+
+@wp.func
+def _share(here: _Cell, corner: int) -> float:
+    x = wp.where(corner // 4 == 1, here.part[0], 1.0 - here.part[0])
+    y = wp.where((corner // 2) % 2 == 1, here.part[1], 1.0 - here.part[1])
+    return x * y * wp.where(corner % 2 == 1, here.part[2], 1.0 - here.part[2])
+
+
+@wp.func
+def _value(field: wp.array[float], here: _Cell, count: int) -> float:
+    total = float(0.0)
+    for corner in range(8):
+        node = _node(here, corner, count)
+        if node >= 0:
+            total += _share(here, corner) * field[node]
+    return total
+
+
+@wp.func
+def _inner(at: wp.vec3, count: int) -> wp.vec3:
+    last = float(count) - 1.001
+    return wp.vec3(wp.clamp(at[0], 0.0, last), wp.clamp(at[1], 0.0, last), wp.clamp(at[2], 0.0, last))
+
+
+@wp.func
+def _shown(colors: wp.array2d[float], row: wp.array[wp.int64], here: _Cell, count: int, direction: wp.vec3) -> wp.vec3:
+    raw = wp.vec3(0.0, 0.0, 0.0)
+    for corner in range(8):
+        r = int(row[_node(here, corner, count)])
+        share = _share(here, corner)
+        for c in range(3):
+            value = colors[r, 4 * c] + colors[r, 4 * c + 1] * direction[0] + colors[r, 4 * c + 2] * direction[1]
+            raw[c] = raw[c] + share * (value + colors[r, 4 * c + 3] * direction[2])
+    return wp.vec3(1.0 / (1.0 + wp.exp(-raw[0])), 1.0 / (1.0 + wp.exp(-raw[1])), 1.0 / (1.0 + wp.exp(-raw[2])))
+
+
+@wp.kernel
+def ray_costs_kernel(
+    first: int,
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    near: wp.array[float],
+    far: wp.array[float],
+    photo: wp.array[wp.vec3],
+    shake: wp.array[float],
+    low: wp.vec3,
+    cell: float,
+    count: int,
+    density: wp.array[float],
+    inside: wp.array[float],
+    colors: wp.array2d[float],
+    row: wp.array[wp.int64],
+    weights: wp.vec2,
+    least: float,
+    # working memory, (ray, sample)
+    raw: wp.array2d[float],
+    opacity: wp.array2d[float],
+    weight: wp.array2d[float],
+    # outputs
+    cost: wp.array[float],
+    density_gradient: wp.array[float],
+    color_gradient: wp.array2d[float],
+):
+    """`weights` are those of an opaque object and of gathered density. Long because the way back needs all of the way there.
+
+    Many arguments because a struct of them would be filled anew, array by array, for each launch.
+    """
+    ray = first + wp.tid()
+    d = direction[ray]
+    start = near[ray] - cell
+    length = far[ray] + cell - start
+    step = length / (float(count) * cell)
+    passed = float(1.0)
+    total = float(0.0)
+    kept = float(0.0)
+    middle = float(0.0)
+    image = wp.vec3(0.0, 0.0, 0.0)
+    scale = length / (cell * float(count - 5))
+    for k in range(count):
+        offset = (float(k) + shake[ray]) / float(count)
+        at = (origin[ray] + (start + length * offset) * d - low) / cell
+        here = _cell_at(at)
+        value = float(0.0)
+        stopped = float(0.0)
+        if _value(inside, here, count) > 0.5:
+            value = _value(density, here, count)
+            dense = wp.where(value > 20.0, value, wp.log(1.0 + wp.exp(wp.min(value, 20.0))))
+            stopped = 1.0 - wp.exp(-dense * step)
+        w = stopped * passed
+        raw[ray, k] = value
+        opacity[ray, k] = stopped
+        weight[ray, k] = w
+        passed *= 1.0 - stopped + PASSED
+        total += w
+        middle += w * offset * scale
+        if w > least:
+            kept += w
+            image += w * _shown(colors, row, _cell_at(_inner(at, count)), count, d)
+    # What was not looked up has the photograph's colour.
+    off = image + (total - kept) * photo[ray] - photo[ray]
+    safe = wp.max(total, 0.01)
+    middle /= safe
+    clear = wp.clamp(total, 1.0e-4, 1.0)
+    scattered = float(0.0)
+    pull = float(0.0)
+    for k in range(count):
+        away = (float(k) + shake[ray]) / float(count) * scale - middle
+        scattered += weight[ray, k] * wp.abs(away)
+        pull -= weight[ray, k] * wp.where(away > 0.0, 1.0, wp.where(away < 0.0, -1.0, 0.0))
+    cost[ray] = wp.dot(off, off) / 3.0 - weights[0] * wp.log(clear) + weights[1] * scattered
+
+    g_image = 2.0 / 3.0 * off
+    g_total = wp.where(clear == total, -weights[0] / clear, 0.0)
+    behind = float(0.0)
+    for back in range(count):
+        k = count - 1 - back
+        offset = (float(k) + shake[ray]) / float(count)
+        w = weight[ray, k]
+        stopped = opacity[ray, k]
+        g_weight = g_total + weights[1] * (wp.abs(offset * scale - middle) + pull * offset * scale / safe)
+        at = (origin[ray] + (start + length * offset) * d - low) / cell
+        if w > least:
+            within = _cell_at(_inner(at, count))
+            shown = _shown(colors, row, within, count, d)
+            g_weight += wp.dot(g_image, shown)
+            for c in range(3):
+                g = g_image[c] * w * shown[c] * (1.0 - shown[c])
+                for corner in range(8):
+                    r = int(row[_node(within, corner, count)])
+                    part = g * _share(within, corner)
+                    wp.atomic_add(color_gradient, r, 4 * c, part)
+                    wp.atomic_add(color_gradient, r, 4 * c + 1, part * d[0])
+                    wp.atomic_add(color_gradient, r, 4 * c + 2, part * d[1])
+                    wp.atomic_add(color_gradient, r, 4 * c + 3, part * d[2])
+        if stopped > 0.0:
+            before = w / stopped
+            g_opacity = g_weight * before - behind / (1.0 - stopped + PASSED)
+            value = raw[ray, k]
+            g_value = g_opacity * step * (1.0 - stopped) / (1.0 + wp.exp(-value))
+            around = _cell_at(at)
+            for corner in range(8):
+                node = _node(around, corner, count)
+                if node >= 0:
+                    wp.atomic_add(density_gradient, node, g_value * _share(around, corner))
+        behind += g_weight * w
+
+
+def ray_costs(
+    rays: tuple[Tensor, Tensor, Tensor, Tensor],
+    photo: Float[Tensor, "ray 3"],
+    shake: Float[Tensor, "ray 1"],
+    low: Float[Tensor, "3"],
+    cell: float,
+    inside: Float[Tensor, "n n n"],
+    row: Int[Tensor, "node"],
+    density: Float[Tensor, "n n n"],
+    colors: Float[Tensor, "row 12"],
+    weights: tuple[float, float],
+    least: float,
+) -> Float[Tensor, ""]:
+    """Their sum, differentiable in `density` and `colors`, once.
+
+    Args:
+        rays: origins (ray, 3), unit directions (ray, 3), where they enter the hull (ray,) and leave it (ray,). photo: sRGB. shake: 0..1, of a ray's
+            samples in their stretches. low, cell, inside, row, density, colors: of RadianceGrid. weights: of an opaque object and of gathered density.
+        least: RadianceGridSettings.least_weight.
+    """
+    given = (*rays, photo, shake[:, 0])
+    return _RayCosts.apply(density, colors, given, tuple(low.tolist()), cell, inside, row, weights, least)
+
+
+_TYPES = (wp.vec3, wp.vec3, None, None, wp.vec3, None)
+
+
+class _RayCosts(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, density, colors, given, low, cell, inside, row, weights, least) -> Tensor:
+        density, colors = density.detach().contiguous(), colors.detach().contiguous()
+        slices, device, count, side = gradient_slices(), warp_device(density), len(given[0]), len(density)
+        by_density, by_colors = (torch.zeros(slices, *x.shape, device=x.device) for x in (density, colors))
+        cost, working = density.new_zeros(count), density.new_empty(3, count, side)
+        if count:
+            load_kernel(ray_costs_kernel, device)
+            flat = (warp_argument(x.reshape(-1)) for x in (density, inside))
+            inputs = [
+                *(warp_argument(x, dtype) for x, dtype in zip(given, _TYPES, strict=True)), wp.vec3(*low), cell, side, *flat,
+                warp_argument(colors), warp_argument(row), wp.vec2(*weights), least, *(warp_argument(x) for x in working),
+            ]  # fmt: skip
+            in_gradient_slices(
+                lambda k, of: _add_slice(k, of, count, inputs, [cost, by_density[k].reshape(-1), by_colors[k]], device), device, count
+            )
+        ctx.save_for_backward(*(x[0] if slices == 1 else x.sum(0) for x in (by_density, by_colors)))
+        return cost.sum()
+
+    @staticmethod
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return (*(gradient * upstream for gradient in ctx.saved_tensors), *[None] * 7)
+
+
+def _add_slice(k: int, slices: int, count: int, inputs: list, outputs: list[Tensor], device: Any) -> None:
+    """Costs and gradients of one of so many parts of the rays."""
+    first, last = count * k // slices, count * (k + 1) // slices
+    arrays = [warp_argument(x) for x in outputs]
+    wp.launch(ray_costs_kernel, dim=last - first, inputs=[first, *inputs], outputs=arrays, device=device)

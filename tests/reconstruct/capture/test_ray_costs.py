@@ -1,0 +1,72 @@
+"""Costs of rays through a radiance grid, and their gradients, against the float64 twin."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays
+from drgs.reconstruct.capture.ray_costs import ray_costs
+from drgs.reference import ray_costs as reference
+
+NODES, RAYS = 14, 300
+
+
+def hull_of_fog() -> tuple[RadianceGrid, Rays, torch.Tensor, torch.Tensor]:
+    """A ball of uneven density and colour in a box of its own, and rays across it."""
+    generator = torch.Generator().manual_seed(3)
+    rand = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    cell = 2.0 / (NODES - 5)
+    low = torch.full((3,), -cell * (NODES - 1) / 2, dtype=torch.float64)
+    node = torch.stack(torch.meshgrid(*3 * [torch.arange(NODES)], indexing="ij"), -1).reshape(-1, 3)
+    inside = ((low + cell * node).norm(dim=1) < 1).double().reshape(NODES, NODES, NODES)
+    active = torch.nn.functional.max_pool3d(inside[None, None], 5, 1, 2).flatten().nonzero().squeeze(1)
+    row = torch.zeros(NODES**3, dtype=torch.long)
+    row[active] = torch.arange(1, len(active) + 1)
+    density, colors = 6 * rand(NODES, NODES, NODES) - 4, 2 * rand(len(active) + 1, 12) - 1
+    density[6, 6, 6] = 30.0  # beyond where the softplus is a line
+    grid = RadianceGrid(low, cell, density, inside, colors, row)
+    direction = torch.nn.functional.normalize(rand(RAYS, 3) - 0.5, dim=1)
+    aside = 0.9 * torch.nn.functional.normalize(torch.linalg.cross(direction, rand(RAYS, 3) - 0.5), dim=1) * rand(RAYS, 1)
+    half = (1 - aside.square().sum(1)).sqrt()
+    rays = Rays(aside - 3 * direction, direction, 3 - half, 3 + half)
+    return grid, rays, rand(RAYS, 3), rand(RAYS, 1)
+
+
+def tuple_of(rays: Rays, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    origin, direction, near, far = (values.float().to(device) for values in (rays.origin, rays.direction, rays.near, rays.far))
+    return origin, direction, near, far
+
+
+@pytest.mark.parametrize("gather", [False, True])
+def test_costs_and_gradients_equal_the_twin(device: str, gather: bool):
+    grid, rays, colors, shake = hull_of_fog()
+    settings = RadianceGridSettings(weight_gathered=0.3)
+    exact = replace(grid, density=grid.density.clone().requires_grad_(True), colors=grid.colors.clone().requires_grad_(True))
+    expected = reference.ray_costs(exact, rays, colors, shake, settings, gather)
+    slopes = torch.autograd.grad(expected, [exact.density, exact.colors])
+
+    own = {name: value.float().to(device) if name != "row" else value.to(device) for name, value in vars(grid).items() if name != "cell"}
+    density, hue = (own[name].requires_grad_(True) for name in ("density", "colors"))
+    found = ray_costs(
+        tuple_of(rays, device), colors.float().to(device), shake.float().to(device), own["low"],
+        grid.cell, own["inside"], own["row"], density, hue, (settings.weight_opaque, settings.weight_gathered if gather else 0.0),
+        settings.least_weight,
+    )  # fmt: skip
+    assert float(found.detach()) == pytest.approx(float(expected.detach()), rel=1e-4)
+    for gradient, wanted in zip(torch.autograd.grad(found, [density, hue]), slopes, strict=True):
+        error = (gradient.cpu().double() - wanted).abs() / (wanted.abs() + 1e-2 * wanted.abs().max())
+        # A sample whose weight lies next to the least that is looked up may fall on either side.
+        assert float(error.max()) < 2e-2 and float(error.mean()) < 1e-4
+
+
+def test_no_rays_cost_nothing():
+    grid, rays, colors, shake = hull_of_fog()
+    none = slice(0, 0)
+    density, hue = grid.density.float().requires_grad_(True), grid.colors.float().requires_grad_(True)
+    cost = ray_costs(
+        tuple_of(rays[none], "cpu"), colors[none].float(), shake[none].float(), grid.low.float(), grid.cell,
+        grid.inside.float(), grid.row, density, hue, (0.02, 0.005), 4e-3,
+    )  # fmt: skip
+    cost.backward()
+    assert float(cost.detach()) == 0 and density.grad is not None and float(density.grad.abs().max()) == 0
