@@ -23,7 +23,6 @@ from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Hits
 from drgs.scene.camera import Camera, world_from_pixel
 from drgs.scene.views import Views
-from drgs.warp_torch import by_pool
 
 FARTHEST = 6
 """[pixels] beyond which an outline of the mesh and one of the mask are not the same."""
@@ -91,61 +90,80 @@ def mask_outlines(views: Views) -> list[MaskOutline | None]:
     return [mask_outline(mask.float() / 255) for mask in views.coverage]
 
 
-@torch.no_grad()
-def outline_residuals(tracer: AbstractTracer, cameras: tuple[Camera, ...], outlines: list[MaskOutline | None]) -> OutlineResiduals:
-    """How far the mesh's outlines lie from the masks'."""
-    views = [(camera, outline) for camera, outline in zip(cameras, outlines, strict=True) if outline is not None]
-    parts = by_pool(lambda k, _: _residuals_of_view(tracer, *views[k]), range(len(views) + 1), tracer.mesh.vertices.device)
+@dataclass(frozen=True, eq=False)
+class OutlineRays:
+    """Of all places of all masks' outlines: a ray through s pixels outside such a place has the direction `straight` + s `sideways`."""
+
+    origin: Float[Tensor, "place 3"]
+    straight: Float[Tensor, "place 3"]
+    """Not of unit length."""
+    sideways: Float[Tensor, "place 3"]
+    """[1 / pixel]"""
+    normals: Float[Tensor, "place 2"]
+    lengths: Float[Tensor, "place"]
+    camera_from_world: Float[Tensor, "place 3 4"]
+    focal: Float[Tensor, "place 2"]
+    """[pixels]"""
+
+    def __getitem__(self, chosen: Int[Tensor, "chosen"]) -> "OutlineRays":
+        return OutlineRays(*(values.index_select(0, chosen) for values in vars(self).values()))
+
+    def hits(self, tracer: AbstractTracer, outside: Float[Tensor, "place"]) -> Hits:
+        """What rays so many pixels outside meet."""
+        direction = torch.nn.functional.normalize(self.straight + outside[:, None] * self.sideways, dim=-1)
+        return trace_rays(self.origin, direction, tracer)
+
+
+def outline_rays(cameras: tuple[Camera, ...], outlines: list[MaskOutline | None], device: torch.device) -> OutlineRays:
+    """Of places that are not at a picture's border."""
+    parts = [_rays_of_view(camera, outline) for camera, outline in zip(cameras, outlines, strict=True) if outline is not None]
     if not parts:
-        nothing = tracer.mesh.vertices.new_zeros(0)
-        return OutlineResiduals(nothing.new_zeros(0, 3).long(), *(nothing.new_zeros(0, *tail) for tail in ((3,), (), (3,), ())))
-    names = ("corners", "weights", "distance", "gradient", "length")
-    return OutlineResiduals(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        tails = ((3,), (3,), (3,), (2,), (), (3, 4), (2,))
+        return OutlineRays(*(torch.zeros(0, *tail, device=device) for tail in tails))
+    return OutlineRays(*(torch.cat(values).to(device) for values in zip(*(vars(part).values() for part in parts), strict=True)))
 
 
-def _residuals_of_view(tracer: AbstractTracer, camera: Camera, outline: MaskOutline) -> OutlineResiduals:
-    mesh = tracer.mesh
-    points, normals, lengths = (values.to(mesh.vertices) for values in (outline.points, outline.normals, outline.lengths))
+def _rays_of_view(camera: Camera, outline: MaskOutline) -> OutlineRays:
+    camera = camera.to("cpu")
+    points, normals, lengths = outline.points, outline.normals, outline.lengths
     size = torch.tensor([camera.width, camera.height]).to(points)
     within = ((points > MARGIN) & (points < size - MARGIN)).all(1)
     points, normals, lengths = points[within], normals[within], lengths[within]
+    matrix, one = world_from_pixel(camera).to(points), torch.ones_like(points[:, :1])
+    straight, sideways = (torch.cat([values, last], 1) @ matrix.T for values, last in ((points, one), (normals, 0 * one)))
+    of_camera = (camera.center_world, camera.camera_from_world[:3, :4], torch.diagonal(camera.intrinsics)[:2])
+    origin, transform, focal = (values.to(points).expand(len(points), *values.shape) for values in of_camera)
+    return OutlineRays(origin, straight, sideways, normals, lengths, transform, focal)
 
+
+@torch.no_grad()
+def outline_residuals(tracer: AbstractTracer, rays: OutlineRays) -> OutlineResiduals:
+    """How far the mesh's outlines lie from the masks'."""
+    mesh = tracer.mesh
     # Nearly everywhere the mesh ends within a pixel; only the other places are looked at farther off.
-    inside, outside = -torch.ones_like(lengths), torch.ones_like(lengths)
-    ends = _hits(camera, tracer, _outside(points, normals, torch.stack([inside, outside], 1))).hit.view(-1, 2)
-    other = (~(ends[:, 0] & ~ends[:, 1])).nonzero().squeeze(1)
-    offsets = torch.arange(-FARTHEST, FARTHEST + 1).to(points)
-    hit = _hits(camera, tracer, _outside(points[other], normals[other], offsets.expand(len(other), -1))).hit.view(-1, len(offsets))
+    inside, outside = -torch.ones_like(rays.lengths), torch.ones_like(rays.lengths)
+    found = rays.hits(tracer, inside).hit & ~rays.hits(tracer, outside).hit
+    other = (~found).nonzero().squeeze(1)
+    offsets = torch.arange(-FARTHEST, FARTHEST + 1).to(rays.lengths)
+    farther = rays[other]
+    hit = torch.stack([farther.hits(tracer, offset.expand(len(other))).hit for offset in offsets], 1)
     far = torch.where(hit[:, :-1] & ~hit[:, 1:], (offsets[:-1] + 0.5).abs(), torch.inf)
     inside[other] = offsets[far.argmin(1)]
     outside[other] = inside[other] + 1
-    found = torch.ones_like(ends[:, 0])
     found[other] = far.amin(1) < torch.inf
-    points, normals, lengths, inside, outside = (values[found] for values in (points, normals, lengths, inside, outside))
+    chosen = found.nonzero().squeeze(1)
+    rays, inside, outside = rays[chosen], inside[chosen], outside[chosen]
     for _ in range(HALVINGS):
         middle = 0.5 * (inside + outside)
-        hit = _hits(camera, tracer, _outside(points, normals, middle[:, None])).hit
+        hit = rays.hits(tracer, middle).hit
         inside, outside = torch.where(hit, middle, inside), torch.where(hit, outside, middle)
-    last = _hits(camera, tracer, _outside(points, normals, inside[:, None]))
+    last = rays.hits(tracer, inside)
     corners = mesh.faces[last.face.long()].long()
     weights = torch.cat([1 - last.barycentric.sum(-1, keepdim=True), last.barycentric], -1)
-    rotation, translation = (values.to(points) for values in (camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]))
-    x, y, z = ((mesh.vertices[corners] * weights[..., None]).sum(1) @ rotation.T + translation).unbind(1)
-    fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
-    across, down = fx * normals[:, 0], fy * normals[:, 1]
+    place = (mesh.vertices[corners] * weights[..., None]).sum(1)
+    rotation, translation = rays.camera_from_world[:, :, :3], rays.camera_from_world[:, :, 3]
+    x, y, z = ((rotation @ place[..., None])[..., 0] + translation).unbind(1)
+    across, down = (rays.focal * rays.normals).unbind(1)
     by_camera = torch.stack([across / z, down / z, -(across * x + down * y) / z**2], 1)
-    return OutlineResiduals(corners, weights, 0.5 * (inside + outside), by_camera @ rotation, lengths)
-
-
-def _outside(
-    points: Float[Tensor, "point 2"], normals: Float[Tensor, "point 2"], distance: Float[Tensor, "point place"]
-) -> Float[Tensor, "all 2"]:
-    """Places so many pixels outside the mask's outline, those of one point after another."""
-    return (points[:, None] + distance[..., None] * normals[:, None]).reshape(-1, 2)
-
-
-def _hits(camera: Camera, tracer: AbstractTracer, places: Tensor) -> Hits:
-    """What rays through places (n, 2) of the picture meet."""
-    pixel = torch.cat([places, torch.ones_like(places[:, :1])], -1)
-    direction = torch.nn.functional.normalize(pixel @ world_from_pixel(camera).T.to(places), dim=-1)
-    return trace_rays(camera.center_world.to(direction).expand_as(direction), direction, tracer)
+    gradient = (by_camera[:, None] @ rotation)[:, 0]
+    return OutlineResiduals(corners, weights, 0.5 * (inside + outside), gradient, rays.lengths)

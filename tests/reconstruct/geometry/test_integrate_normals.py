@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
-from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outline, outline_residuals
+from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outline, outline_rays, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.camera import Camera
@@ -36,7 +36,7 @@ def solved(mesh: TriangleMesh, wanted: torch.Tensor, settings: IntegrationSettin
     cameras, outlines = views_of_a_unit_sphere()
     edges = mesh_edges(mesh.faces)
     for _ in range(rounds):
-        residuals = outline_residuals(build_tracer(mesh), cameras, outlines)
+        residuals = outline_residuals(build_tracer(mesh), outline_rays(cameras, outlines, mesh.faces.device))
         vertices = integrate_normals(mesh.vertices, mesh.faces, wanted, edges, residuals, settings)
         mesh = dataclasses.replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces))
     return mesh.vertices
@@ -69,7 +69,7 @@ def test_what_nothing_holds_goes_home():
     """The same normals everywhere: a sheet may lie at any depth, and lies where it began."""
     true = sphere_mesh(subdivisions=3)
     edges = mesh_edges(true.faces)
-    none = outline_residuals(build_tracer(true), (), [])
+    none = outline_residuals(build_tracer(true), outline_rays((), [], true.faces.device))
     radii = []
     for homeward in (None, -0.03 * true.vertices):
         vertices = true.vertices
@@ -86,7 +86,7 @@ def test_texture_that_lies_deeper_is_followed_though_half_of_it_is_noise():
     """Places three hundredths deeper, each off by as much again and half of the vertices without any: the surface sinks evenly."""
     true = sphere_mesh(subdivisions=4)
     edges, count = mesh_edges(true.faces), len(true.vertices)
-    none = outline_residuals(build_tracer(true), (), [])
+    none = outline_residuals(build_tracer(true), outline_rays((), [], true.faces.device))
     generator = torch.Generator().manual_seed(0)
     depth = 0.03 + 0.03 * torch.randn(count, 1, generator=generator)
     places, weight = true.vertices * (1 - depth), (torch.rand(count, generator=generator) > 0.5).float()
@@ -102,7 +102,7 @@ def test_a_mesh_of_any_size_is_moved_in_proportion():
     true = sphere_mesh(subdivisions=3)
     bumpy = true.vertices * (1 + 0.02 * torch.sin(9 * true.vertices).prod(1, keepdim=True))
     edges = mesh_edges(true.faces)
-    none = outline_residuals(build_tracer(true), (), [])
+    none = outline_residuals(build_tracer(true), outline_rays((), [], true.faces.device))
     results = [
         integrate_normals(scale * bumpy, true.faces, true.normals, edges, none, IntegrationSettings()) / scale for scale in (1.0, 1e3)
     ]

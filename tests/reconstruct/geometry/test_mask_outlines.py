@@ -5,7 +5,7 @@ import math
 
 import torch
 
-from drgs.reconstruct.geometry.mask_outlines import mask_outline, outline_residuals
+from drgs.reconstruct.geometry.mask_outlines import mask_outline, outline_rays, outline_residuals
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.scene.camera import Camera, pixel_rays_world, scaled_camera
 from tests.render.closed_form_scenes import front_camera, sphere_mesh, two_spheres
@@ -31,7 +31,7 @@ def disc_mask(radius: float, samples: int = 8) -> torch.Tensor:
 
 def residuals(mesh, mask):
     tracer = build_tracer(mesh)
-    return outline_residuals(tracer, (camera(),), [mask_outline(mask)])
+    return outline_residuals(tracer, outline_rays((camera(),), [mask_outline(mask)], tracer.mesh.faces.device))
 
 
 def test_an_outline_lies_on_the_circle_to_a_seventh_of_a_pixel_everywhere_and_a_thirtieth_in_the_mean():

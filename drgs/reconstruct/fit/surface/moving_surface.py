@@ -25,7 +25,7 @@ from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.alike_systems import AlikeSystems
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
-from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outlines, outline_residuals
+from drgs.reconstruct.geometry.mask_outlines import OutlineRays, mask_outlines, outline_rays, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
@@ -70,8 +70,9 @@ class MovingSurface:
         self._sky = None if views.light_from_world is None else seen_sky(self.tracer)
 
     @cached_property
-    def _outlines(self) -> list[MaskOutline | None]:
-        return mask_outlines(self._views) if self._views.has_masks else [None] * len(self._cameras)
+    def _outlines(self) -> OutlineRays:
+        outlines = mask_outlines(self._views) if self._views.has_masks else []
+        return outline_rays(self._cameras if outlines else (), outlines, self.faces.device)
 
     def _tracer(self) -> AbstractTracer:
         tracer = build_tracer(mesh_from_surface_fit(self._state, self.faces))
@@ -89,7 +90,7 @@ class MovingSurface:
         normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
         systems = AlikeSystems()
         for _ in range(settings.solves):
-            residuals = outline_residuals(self.tracer, self._cameras, self._outlines)
+            residuals = outline_residuals(self.tracer, self._outlines)
             vertices, homeward = parameters["vertices"], parameters["homeward"]
             # Of metal mirrors say where it lies.
             homes = Places(homeward, (-parameters["metal"]).clamp(0, 1))
