@@ -73,7 +73,7 @@ def as_in_thread_pool() -> Iterator[None]:
 
 
 def gradient_slices() -> int:
-    """Parts that in_gradient_slices cuts a launch of the caller's into."""
+    """Parts that launch_adding cuts a launch of the caller's into."""
     return 1 if in_thread_pool() else GRADIENT_SLICES
 
 
@@ -131,8 +131,20 @@ def warp_array(tensor: Tensor, dtype: Any = None) -> wp.array:
 
 
 def warp_argument(tensor: Tensor, dtype: Any = None) -> Any:
-    """What warp_array gives, for arguments of kernels alone, where launches are many and short: a third of the price, and no check by Warp."""
-    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False, return_ctype=True)
+    """What warp_array gives, for arguments of kernels alone, where launches are many and short: a third of the price, and no check by Warp.
+
+    It does not keep the tensor: the caller must, until the launch is over.
+
+    Raises:
+        ValueError: the tensor is not contiguous, so that the kernel would read what lies where a copy was.
+    """
+    if not tensor.is_contiguous():
+        raise ValueError(
+            f"an argument of strides {tensor.stride()} would be copied, and the copy gone before the launch; make it contiguous and keep it"
+        )
+    # What is expanded and empty counts as contiguous, but not for Warp.
+    tensor = tensor.detach() if tensor.numel() else tensor.new_empty(tensor.shape)
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def warp_view(tensor: Tensor, dtype: Any = None) -> wp.array:
@@ -238,13 +250,28 @@ def device_from_name(name: str) -> torch.device:
     return torch.device(name)
 
 
-def in_gradient_slices(run: Callable[[int, int], None], device: wp.Device, count: int) -> None:
-    """run(k, slices) for each of gradient_slices() parts of `count` indices: by the thread pool on the CPU, one after another on CUDA and where they
-    are few."""
-    slices = gradient_slices()
-    if device.is_cuda or count < FEWEST_FOR_THREADS or slices == 1:
-        for k in range(slices):
-            run(k, slices)
-    else:
-        for done in [thread_pool().submit(run, k, slices) for k in range(slices)]:
-            done.result()
+def launch_adding(kernel: Any, count: int, inputs: list, outputs: list, added: Sequence[tuple[Tensor, Any]], device: Any) -> list[Tensor]:
+    """Run `kernel`, as launch does, for `count` indices that add into the same arrays, its last outputs: what they add, sums that do not depend on
+    how many cores there are. Each of gradient_slices() parts of the indices adds into a copy of its own: by the thread pool on the CPU, one after
+    another on CUDA and where they are few.
+
+    Args:
+        added: for each of those outputs a tensor of its shape, and Warp's type of its entries.
+    """
+    slices, device = gradient_slices(), wp.get_device(device)
+    copies = [torch.zeros(slices, *like.shape, device=like.device) for like, _ in added]
+
+    def run(k: int) -> None:
+        first, last = count * k // slices, count * (k + 1) // slices
+        own = [warp_argument(copy[k], dtype) for copy, (_, dtype) in zip(copies, added, strict=True)]
+        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=[*outputs, *own], device=device)
+
+    if count:
+        load_kernel(kernel, device)
+        if device.is_cuda or count < FEWEST_FOR_THREADS or slices == 1:
+            for k in range(slices):
+                run(k)
+        else:
+            for done in [thread_pool().submit(run, k) for k in range(slices)]:
+                done.result()
+    return [copy[0] if slices == 1 else copy.sum(0) for copy in copies]

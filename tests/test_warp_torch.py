@@ -7,7 +7,17 @@ import torch
 import warp as wp
 
 from drgs import warp_torch
-from drgs.warp_torch import in_thread_pool, launch, share_out, thread_count, use_threads, warp_array
+from drgs.warp_torch import (
+    in_thread_pool,
+    launch,
+    launch_adding,
+    share_out,
+    thread_count,
+    use_threads,
+    warp_argument,
+    warp_array,
+    warp_device,
+)
 
 
 @pytest.fixture
@@ -93,3 +103,27 @@ def test_a_thread_that_is_told_so_uses_fewer_and_then_all_again_and_others_all()
     thread.join()
     torch.set_num_threads(begun)
     assert told == [(3, 3), (1, 1), (3, 0), (3, 3)]
+
+
+def test_an_argument_that_would_be_a_copy_is_refused():
+    """The copy would be gone before the launch, and the kernel would read what lies there then."""
+    with pytest.raises(ValueError, match="gone before the launch"):
+        warp_argument(torch.rand(4, 3).T)
+
+
+@wp.kernel
+def scattered(first: int, place: wp.array[int], doubled: wp.array[float], total: wp.array[float]):
+    i = first + wp.tid()
+    doubled[i] = 2.0 * float(i)
+    wp.atomic_add(total, place[i], float(i))
+
+
+@pytest.mark.parametrize("count", [0, 10, 5000])
+def test_what_many_indices_add_to_is_the_same_whoever_adds(device: str, count: int):
+    place = (torch.arange(count, dtype=torch.int32) % 7).to(device)
+    doubled = torch.zeros(count, device=device)
+    (total,) = launch_adding(
+        scattered, count, [warp_argument(place)], [warp_argument(doubled)], [(torch.empty(7, device=device), None)], warp_device(place)
+    )
+    wanted = torch.zeros(7).index_add(0, place.cpu().long(), torch.arange(count).float())
+    assert torch.equal(total.cpu(), wanted) and torch.equal(doubled.cpu(), 2 * torch.arange(count).float())

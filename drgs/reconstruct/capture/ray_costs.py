@@ -10,12 +10,14 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drgs.warp_torch import gradient_slices, in_gradient_slices, load_kernel, warp_argument, warp_device
+from drgs.warp_torch import launch, launch_adding, warp_argument, warp_device
 
 wp.set_module_options({"enable_backward": False})
 
 PASSED = 1e-7
 """Is added to what passes a sample, so that it can be divided by."""
+LEAST_STOPPED = 0.01
+"""Share of a ray's light below which its middle is drawn to the eye."""
 
 
 @wp.struct
@@ -81,8 +83,26 @@ def _shown(colors: wp.array2d[float], row: wp.array[wp.int64], here: _Cell, coun
     return wp.vec3(1.0 / (1.0 + wp.exp(-raw[0])), 1.0 / (1.0 + wp.exp(-raw[1])), 1.0 / (1.0 + wp.exp(-raw[2])))
 
 
+@wp.func
+def _add_color(gradients: wp.array2d[float], row: wp.array[wp.int64], here: _Cell, count: int, direction: wp.vec3, g: wp.vec3):
+    """The gradient g of what _shown has before the sigmoid."""
+    for corner in range(8):
+        r = int(row[_node(here, corner, count)])
+        share = _share(here, corner)
+        for c in range(3):
+            wp.atomic_add(gradients, r, 4 * c, share * g[c])
+            for axis in range(3):
+                wp.atomic_add(gradients, r, 4 * c + 1 + axis, share * g[c] * direction[axis])
+
+
+@wp.func
+def _offset(k: int, shake: float, count: int) -> float:
+    """Share of the way at which a ray's k-th sample lies."""
+    return (float(k) + shake) / float(count)
+
+
 @wp.kernel
-def ray_costs_kernel(
+def rays_there(
     first: int,
     origin: wp.array[wp.vec3],
     direction: wp.array[wp.vec3],
@@ -97,18 +117,14 @@ def ray_costs_kernel(
     inside: wp.array[float],
     colors: wp.array2d[float],
     row: wp.array[wp.int64],
-    weights: wp.vec2,
     least: float,
-    # working memory, (ray, sample)
-    raw: wp.array2d[float],
-    opacity: wp.array2d[float],
-    weight: wp.array2d[float],
     # outputs
-    cost: wp.array[float],
-    density_gradient: wp.array[float],
-    color_gradient: wp.array2d[float],
+    samples: wp.array2d[wp.vec3],
+    off: wp.array[wp.vec3],
+    stopped_and_middle: wp.array[wp.vec2],
 ):
-    """`weights` are those of an opaque object and of gathered density. Long because the way back needs all of the way there.
+    """What each ray shows, less the photograph. Of its samples (ray, sample): density before softplus, opacity, weight; of all: opacity, and where
+    in sides of the box the weight lies on average.
 
     Many arguments because a struct of them would be filled anew, array by array, for each launch.
     """
@@ -117,14 +133,14 @@ def ray_costs_kernel(
     start = near[ray] - cell
     length = far[ray] + cell - start
     step = length / (float(count) * cell)
+    side = cell * float(count - 5)
     passed = float(1.0)
     total = float(0.0)
     kept = float(0.0)
     middle = float(0.0)
     image = wp.vec3(0.0, 0.0, 0.0)
-    scale = length / (cell * float(count - 5))
     for k in range(count):
-        offset = (float(k) + shake[ray]) / float(count)
+        offset = _offset(k, shake[ray], count)
         at = (origin[ray] + (start + length * offset) * d - low) / cell
         here = _cell_at(at)
         value = float(0.0)
@@ -134,61 +150,85 @@ def ray_costs_kernel(
             dense = wp.where(value > 20.0, value, wp.log(1.0 + wp.exp(wp.min(value, 20.0))))
             stopped = 1.0 - wp.exp(-dense * step)
         w = stopped * passed
-        raw[ray, k] = value
-        opacity[ray, k] = stopped
-        weight[ray, k] = w
+        samples[ray, k] = wp.vec3(value, stopped, w)
         passed *= 1.0 - stopped + PASSED
         total += w
-        middle += w * offset * scale
+        middle += w * offset * length / side
         if w > least:
             kept += w
             image += w * _shown(colors, row, _cell_at(_inner(at, count)), count, d)
     # What was not looked up has the photograph's colour.
-    off = image + (total - kept) * photo[ray] - photo[ray]
-    safe = wp.max(total, 0.01)
-    middle /= safe
+    off[ray] = image + (total - kept) * photo[ray] - photo[ray]
+    stopped_and_middle[ray] = wp.vec2(total, middle / wp.max(total, LEAST_STOPPED))
+
+
+@wp.kernel
+def rays_back(
+    first: int,
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    near: wp.array[float],
+    far: wp.array[float],
+    shake: wp.array[float],
+    low: wp.vec3,
+    cell: float,
+    count: int,
+    colors: wp.array2d[float],
+    row: wp.array[wp.int64],
+    weights: wp.vec2,
+    least: float,
+    samples: wp.array2d[wp.vec3],
+    off: wp.array[wp.vec3],
+    stopped_and_middle: wp.array[wp.vec2],
+    # outputs
+    cost: wp.array[float],
+    density_gradient: wp.array[float],
+    color_gradient: wp.array2d[float],
+):
+    """Each ray's cost and its gradient. `weights` are those of an opaque object and of gathered density.
+
+    Many arguments because a struct of them would be filled anew, array by array, for each launch.
+    """
+    ray = first + wp.tid()
+    d = direction[ray]
+    start = near[ray] - cell
+    length = far[ray] + cell - start
+    step = length / (float(count) * cell)
+    scale = length / (cell * float(count - 5))
+    total = stopped_and_middle[ray][0]
+    middle = stopped_and_middle[ray][1]
     clear = wp.clamp(total, 1.0e-4, 1.0)
     scattered = float(0.0)
     pull = float(0.0)
     for k in range(count):
-        away = (float(k) + shake[ray]) / float(count) * scale - middle
-        scattered += weight[ray, k] * wp.abs(away)
-        pull -= weight[ray, k] * wp.where(away > 0.0, 1.0, wp.where(away < 0.0, -1.0, 0.0))
-    cost[ray] = wp.dot(off, off) / 3.0 - weights[0] * wp.log(clear) + weights[1] * scattered
+        away = _offset(k, shake[ray], count) * scale - middle
+        scattered += samples[ray, k][2] * wp.abs(away)
+        pull -= samples[ray, k][2] * wp.where(away > 0.0, 1.0, wp.where(away < 0.0, -1.0, 0.0))
+    cost[ray] = wp.dot(off[ray], off[ray]) / 3.0 - weights[0] * wp.log(clear) + weights[1] * scattered
 
-    g_image = 2.0 / 3.0 * off
+    g_image = 2.0 / 3.0 * off[ray]
     g_total = wp.where(clear == total, -weights[0] / clear, 0.0)
     behind = float(0.0)
     for back in range(count):
         k = count - 1 - back
-        offset = (float(k) + shake[ray]) / float(count)
-        w = weight[ray, k]
-        stopped = opacity[ray, k]
-        g_weight = g_total + weights[1] * (wp.abs(offset * scale - middle) + pull * offset * scale / safe)
+        offset = _offset(k, shake[ray], count)
+        stopped = samples[ray, k][1]
+        w = samples[ray, k][2]
         at = (origin[ray] + (start + length * offset) * d - low) / cell
+        g_weight = g_total + weights[1] * (wp.abs(offset * scale - middle) + pull * offset * scale / wp.max(total, LEAST_STOPPED))
         if w > least:
             within = _cell_at(_inner(at, count))
             shown = _shown(colors, row, within, count, d)
             g_weight += wp.dot(g_image, shown)
-            for c in range(3):
-                g = g_image[c] * w * shown[c] * (1.0 - shown[c])
-                for corner in range(8):
-                    r = int(row[_node(within, corner, count)])
-                    part = g * _share(within, corner)
-                    wp.atomic_add(color_gradient, r, 4 * c, part)
-                    wp.atomic_add(color_gradient, r, 4 * c + 1, part * d[0])
-                    wp.atomic_add(color_gradient, r, 4 * c + 2, part * d[1])
-                    wp.atomic_add(color_gradient, r, 4 * c + 3, part * d[2])
+            _add_color(color_gradient, row, within, count, d, wp.cw_mul(g_image, wp.cw_mul(shown, wp.vec3(1.0, 1.0, 1.0) - shown)) * w)
         if stopped > 0.0:
-            before = w / stopped
-            g_opacity = g_weight * before - behind / (1.0 - stopped + PASSED)
-            value = raw[ray, k]
-            g_value = g_opacity * step * (1.0 - stopped) / (1.0 + wp.exp(-value))
-            around = _cell_at(at)
+            g_opacity = g_weight * w / stopped - behind / (1.0 - stopped + PASSED)
+            g_value = g_opacity * step * (1.0 - stopped) / (1.0 + wp.exp(-samples[ray, k][0]))
+            here = _cell_at(at)
             for corner in range(8):
-                node = _node(around, corner, count)
+                node = _node(here, corner, count)
                 if node >= 0:
-                    wp.atomic_add(density_gradient, node, g_value * _share(around, corner))
+                    wp.atomic_add(density_gradient, node, g_value * _share(here, corner))
         behind += g_weight * w
 
 
@@ -212,7 +252,7 @@ def ray_costs(
             samples in their stretches. low, cell, inside, row, density, colors: of RadianceGrid. weights: of an opaque object and of gathered density.
         least: RadianceGridSettings.least_weight.
     """
-    given = (*rays, photo, shake[:, 0])
+    given = tuple(values.contiguous() for values in (*rays, photo, shake[:, 0]))
     return _RayCosts.apply(density, colors, given, tuple(low.tolist()), cell, inside, row, weights, least)
 
 
@@ -223,29 +263,22 @@ class _RayCosts(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, density, colors, given, low, cell, inside, row, weights, least) -> Tensor:
         density, colors = density.detach().contiguous(), colors.detach().contiguous()
-        slices, device, count, side = gradient_slices(), warp_device(density), len(given[0]), len(density)
-        by_density, by_colors = (torch.zeros(slices, *x.shape, device=x.device) for x in (density, colors))
-        cost, working = density.new_zeros(count), density.new_empty(3, count, side)
-        if count:
-            load_kernel(ray_costs_kernel, device)
-            flat = (warp_argument(x.reshape(-1)) for x in (density, inside))
-            inputs = [
-                *(warp_argument(x, dtype) for x, dtype in zip(given, _TYPES, strict=True)), wp.vec3(*low), cell, side, *flat,
-                warp_argument(colors), warp_argument(row), wp.vec2(*weights), least, *(warp_argument(x) for x in working),
-            ]  # fmt: skip
-            in_gradient_slices(
-                lambda k, of: _add_slice(k, of, count, inputs, [cost, by_density[k].reshape(-1), by_colors[k]], device), device, count
-            )
-        ctx.save_for_backward(*(x[0] if slices == 1 else x.sum(0) for x in (by_density, by_colors)))
+        flat, device, count, side = density.reshape(-1), warp_device(density), len(given[0]), len(density)
+        samples = density.new_empty(count, side, 3)
+        off, sums, cost = (density.new_empty(count, *tail) for tail in ((3,), (2,), ()))
+        origin, direction, near, far, photo, shake = (warp_argument(x, dtype) for x, dtype in zip(given, _TYPES, strict=True))
+        space, there = (
+            (wp.vec3(*low), cell, side),
+            [warp_argument(samples, wp.vec3), warp_argument(off, wp.vec3), warp_argument(sums, wp.vec2)],
+        )
+        hues = [warp_argument(colors), warp_argument(row)]
+        inputs = [origin, direction, near, far, photo, shake, *space, warp_argument(flat), warp_argument(inside.reshape(-1)), *hues, least]
+        launch(rays_there, count, inputs, there, device)
+        inputs = [origin, direction, near, far, shake, *space, *hues, wp.vec2(*weights), least, *there]
+        by_density, by_colors = launch_adding(rays_back, count, inputs, [warp_argument(cost)], [(flat, None), (colors, None)], device)
+        ctx.save_for_backward(by_density.reshape(density.shape), by_colors)
         return cost.sum()
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         return (*(gradient * upstream for gradient in ctx.saved_tensors), *[None] * 7)
-
-
-def _add_slice(k: int, slices: int, count: int, inputs: list, outputs: list[Tensor], device: Any) -> None:
-    """Costs and gradients of one of so many parts of the rays."""
-    first, last = count * k // slices, count * (k + 1) // slices
-    arrays = [warp_argument(x) for x in outputs]
-    wp.launch(ray_costs_kernel, dim=last - first, inputs=[first, *inputs], outputs=arrays, device=device)

@@ -16,45 +16,19 @@ from torch import Tensor
 
 from drgs.maths.angles_warp import azimuth
 from drgs.maths.constants import F0, MIN_ROUGHNESS
+from drgs.maths.lat_long_warp import Texels, add_to_texels, texel_value, texels_at
 from drgs.render.integrate.brdf_warp import PI
 from drgs.render.records import Rays, ShadingPoints
-from drgs.warp_torch import gradient_slices, in_gradient_slices, launch, load_kernel, warp_argument, warp_device
+from drgs.warp_torch import launch, launch_adding, warp_argument, warp_device
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
-class _Texels:
-    """Four texels around a direction, and their weights."""
-
-    corner: wp.vec4i
-    weight: wp.vec4
-
-
 @wp.func
-def _texels(height: int, direction: wp.vec3) -> _Texels:
-    width = 2 * height
+def _texels_along(height: int, direction: wp.vec3) -> Texels:
     u = 0.5 - azimuth(direction[0], direction[1]) / (2.0 * PI)
     v = azimuth(direction[2], wp.sqrt(direction[0] * direction[0] + direction[1] * direction[1])) / PI
-    x = u * float(width) - 0.5
-    y = wp.clamp(v * float(height) - 0.5, 0.0, float(height) - 1.0)
-    x_floor = wp.floor(x)
-    y_floor = wp.min(wp.floor(y), float(height) - 2.0)
-    fx = x - x_floor
-    fy = y - y_floor
-    column0 = (int(x_floor) + width) % width
-    column1 = (column0 + 1) % width
-    row = int(y_floor) * width
-    around = _Texels()
-    around.corner = wp.vec4i(row + column0, row + column1, row + width + column0, row + width + column1)
-    around.weight = wp.vec4((1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy)
-    return around
-
-
-@wp.func
-def _radiance(table: wp.array[wp.vec3], around: _Texels) -> wp.vec3:
-    above = table[around.corner[0]] * around.weight[0] + table[around.corner[1]] * around.weight[1]
-    return above + table[around.corner[2]] * around.weight[2] + table[around.corner[3]] * around.weight[3]
+    return texels_at(0, height, u, v)
 
 
 @wp.struct
@@ -127,7 +101,7 @@ def radiance_of_rays(
         if weight[i] != 0.0:
             wi = direction[i]
             lobe = _lobe(normal[point], wo[point], wi, albedo[point], roughness[point], metallic[point])
-            incoming = _radiance(table, _texels(height, wi)) * transmittance[i] + hit_radiance[i]
+            incoming = texel_value(table, _texels_along(height, wi)) * transmittance[i] + hit_radiance[i]
             total += wp.cw_mul(lobe.reflectance, incoming) * (lobe.n_dot_l * weight[i])
     radiance[point] = total
 
@@ -170,13 +144,12 @@ def rays_adjoint(
         if weight[i] != 0.0:
             wi = direction[i]
             lobe = _lobe(n, v, wi, a, roughness[point], m)
-            around = _texels(height, wi)
+            around = _texels_along(height, wi)
             g = radiance_gradient[point] * weight[i]
             g_incoming = wp.cw_mul(g, lobe.reflectance) * (lobe.n_dot_l * transmittance[i])
-            for corner in range(4):
-                wp.atomic_add(table_gradients, around.corner[corner], g_incoming * around.weight[corner])
+            add_to_texels(table_gradients, around, g_incoming)
 
-            g_lit = wp.cw_mul(g, _radiance(table, around) * transmittance[i] + hit_radiance[i])
+            g_lit = wp.cw_mul(g, texel_value(table, around) * transmittance[i] + hit_radiance[i])
             g_reflectance = g_lit * lobe.n_dot_l
             g_l = wp.dot(g_lit, lobe.reflectance)
             dv = lobe.d * lobe.v
@@ -197,7 +170,8 @@ def rays_adjoint(
 
             # Of D = a2 / (pi denominator^2), its denominator |n x h|^2 + (n.h)^2 a2
             g_d = g_dv * lobe.v
-            g_denominator = -2.0 * g_d * lobe.d / lobe.denominator
+            narrow = lobe.denominator < 1.0e-15  # where ggx_d is cut
+            g_denominator = wp.where(narrow, 0.0, -2.0 * g_d * lobe.d / wp.max(lobe.denominator, 1.0e-15))
             g_a2 += g_d * lobe.d / lobe.a2 + g_denominator * lobe.n_dot_h * lobe.n_dot_h
             n_dot_h = wp.dot(n, lobe.h)
             within = wp.where(n_dot_h == lobe.n_dot_h, 1.0, 0.0)
@@ -227,29 +201,16 @@ class _Radiance(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        inputs, device, count = ctx.saved_tensors, warp_device(gradient), len(gradient)
+        inputs, gradient = ctx.saved_tensors, gradient.contiguous()
         of_points = [torch.empty_like(x) for x in inputs[5:-1]]
-        of_table = torch.zeros(gradient_slices(), *inputs[-1].shape, device=gradient.device)
-        if count:
-            load_kernel(rays_adjoint, device)
-            values = [*_arguments(ctx, inputs), warp_argument(gradient, wp.vec3)]
-            outputs = [warp_argument(x, dtype) for x, dtype in zip(of_points, _POINT_TYPES, strict=True)]
-            in_gradient_slices(
-                lambda k, slices: _add_slice(k, slices, count, values, [*outputs, warp_argument(of_table[k], wp.vec3)], device),
-                device,
-                count,
-            )
-        return None, None, *[None] * 5, *of_points, of_table[0] if len(of_table) == 1 else of_table.sum(0)
+        values = [*_arguments(ctx, inputs), warp_argument(gradient, wp.vec3)]
+        outputs = [warp_argument(x, dtype) for x, dtype in zip(of_points, _POINT_TYPES, strict=True)]
+        of_table = launch_adding(rays_adjoint, len(gradient), values, outputs, [(inputs[-1], wp.vec3)], warp_device(gradient))
+        return None, None, *[None] * 5, *of_points, *of_table
 
 
 def _arguments(ctx: Any, inputs: Sequence[Tensor]) -> list:
     return [ctx.samples, ctx.height, *(warp_argument(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True))]
-
-
-def _add_slice(k: int, slices: int, count: int, values: list, outputs: list, device: Any) -> None:
-    """The gradients of one of so many parts of the points."""
-    first, last = count * k // slices, count * (k + 1) // slices
-    wp.launch(rays_adjoint, dim=last - first, inputs=[first, *values], outputs=outputs, device=device)
 
 
 def integrate_samples(

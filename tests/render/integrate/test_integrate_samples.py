@@ -149,3 +149,17 @@ def test_no_points_give_no_radiance():
     radiance = integrate_samples(none, rays, scene.transmittance[:0], scene.hit_radiance[:0], table)
     radiance.sum().backward()
     assert radiance.shape == (0, 3) and float(table.grad.abs().max()) == 0.0
+
+
+def test_opposite_directions_have_a_finite_gradient():
+    """Between them there is no half vector; the lobe is cut there."""
+    points = points_seen_at([20.0], albedo=0.5, roughness=0.4, metallic=0.5)
+    points = dataclasses.replace(
+        points, normal_world=points.normal_world.requires_grad_(True), roughness=points.roughness.requires_grad_(True)
+    )
+    table = torch.ones(4, 8, 3)
+    rays = sample_rays(points, build_environment_table(constant_sky(1.0)), SampleCounts(4, 0, 0), seed=1)
+    against = dataclasses.replace(rays, direction_world=-points.wo_world[:, None].expand_as(rays.direction_world).contiguous())
+    radiance = integrate_samples(points, against, torch.ones_like(rays.weight), torch.zeros_like(rays.direction_world), table)
+    gradients = torch.autograd.grad(radiance.sum(), [points.normal_world, points.roughness])
+    assert all(bool(torch.isfinite(values).all()) for values in gradients)

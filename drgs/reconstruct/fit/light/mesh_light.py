@@ -79,9 +79,10 @@ def hit_radiance(
     Args:
         face, weights: where, int64 and by corner_weights. mirrored: of mirrored_light; None: all that is mirrored there is the sky.
     """
+    weights, towards = weights.contiguous(), towards.contiguous()
     radiance = torch.empty_like(towards)
     # Never read where nothing is mirrored again.
-    transmittance, met = (light.open_share[:, 0], light.open_share) if mirrored is None else mirrored
+    transmittance, met = (mesh.roughness, light.open_share) if mirrored is None else mirrored
     vectors = (warp_argument(x, wp.vec3) for x in (mesh.normals, mesh.albedo))
     inputs = [
         warp_argument(face), warp_argument(weights, wp.vec3), warp_argument(towards, wp.vec3), warp_argument(mesh.faces), *vectors,
@@ -134,6 +135,7 @@ def mirrored_light(
     Args:
         face, weights: where, int64 and by corner_weights. mirrors: of radiance_along.
     """
+    weights, wo = weights.contiguous(), wo.contiguous()
     mesh, drawn = tracer.mesh, torch.rand(2, len(face), generator=generator).to(wo.device)
     origin, direction, above = torch.empty_like(wo), torch.empty_like(wo), torch.empty(len(face), dtype=torch.bool, device=wo.device)
     inputs = [

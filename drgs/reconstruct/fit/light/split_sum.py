@@ -13,7 +13,6 @@ Source: Karis 2013, with the BRDF of drgs/maths/brdf.py (docs/sources.md: karis2
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import torch
 import warp as wp
@@ -30,7 +29,7 @@ from drgs.reconstruct.fit.light.split_sum_kernels import (
     split_sum_kernel,
 )
 from drgs.scene.environment import direction_from_uv
-from drgs.warp_torch import gradient_slices, in_gradient_slices, launch, load_kernel, warp_argument, warp_device
+from drgs.warp_torch import launch, launch_adding, warp_argument, warp_device
 
 ENVIRONMENT_SIZE = (128, 256)
 """Rows and columns of the learned table."""
@@ -108,7 +107,7 @@ def brdf_table(size: int = TABLE_SIZE, samples: int = 1024) -> Float[Tensor, "2 
 @cache
 def factor_table(device: torch.device) -> Float[Tensor, "texel 2"]:
     """brdf_table as kernels read it."""
-    return brdf_table(TABLE_SIZE).permute(1, 2, 0).reshape(-1, 2).to(device)
+    return brdf_table(TABLE_SIZE).permute(1, 2, 0).reshape(-1, 2).contiguous().to(device)
 
 
 class _SplitSum(torch.autograd.Function):
@@ -126,19 +125,12 @@ class _SplitSum(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         inputs, gradient = ctx.saved_tensors, gradient.contiguous()
-        diffuse, f0, roughness, normal = (torch.empty_like(inputs[k]) for k in (0, 2, 3, 4))
-        tables = torch.zeros(gradient_slices(), *inputs[9].shape, device=gradient.device)
-        device, count = warp_device(gradient), len(gradient)
-        if count:
-            load_kernel(split_sum_adjoint, device)
-            given = [*_arguments(inputs), warp_argument(gradient, wp.vec3)]
-            points = [warp_argument(x, x_type) for x, x_type in zip((diffuse, f0, roughness, normal), _POINT_TYPES, strict=True)]
-            in_gradient_slices(
-                lambda k, slices: _launch_slice(k, slices, count, given, [*points, warp_argument(tables[k], wp.vec3)], device),
-                device,
-                count,
-            )
-        return diffuse, gradient, f0, roughness, normal, None, None, None, None, tables.sum(0), None
+        points = [torch.empty_like(inputs[k]) for k in (0, 2, 3, 4)]
+        given = [*_arguments(inputs), warp_argument(gradient, wp.vec3)]
+        outputs = [warp_argument(x, dtype) for x, dtype in zip(points, _POINT_TYPES, strict=True)]
+        (tables,) = launch_adding(split_sum_adjoint, len(gradient), given, outputs, [(inputs[9], wp.vec3)], warp_device(gradient))
+        diffuse, f0, roughness, normal = points
+        return diffuse, gradient, f0, roughness, normal, None, None, None, None, tables, None
 
 
 _DTYPES = (wp.vec3, wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3, wp.vec2)
@@ -147,12 +139,6 @@ _POINT_TYPES = (wp.vec3, wp.vec3, wp.float32, wp.vec3)
 
 def _arguments(inputs: Sequence[Tensor]) -> list:
     return [warp_argument(x, dtype) for x, dtype in zip(inputs, _DTYPES, strict=True)]
-
-
-def _launch_slice(k: int, slices: int, count: int, given: list, outputs: list, device: Any) -> None:
-    """The adjoint of one of so many parts of the points."""
-    first, last = count * k // slices, count * (k + 1) // slices
-    wp.launch(split_sum_adjoint, dim=last - first, inputs=[first, *given], outputs=outputs, device=device)
 
 
 def shade_split_sum(

@@ -7,6 +7,7 @@ fits spend a tenth of their time there. Kernels that shade places of a mesh call
 import warp as wp
 
 from drgs.maths.angles_warp import arc_cosine, azimuth
+from drgs.maths.lat_long_warp import Texels, add_to_texels, texel_slopes, texel_value, texels_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,68 +43,6 @@ def _uv_gradient(direction: wp.vec3, g_u: float, g_v: float) -> wp.vec3:
     z = direction[2]
     down = wp.where(wp.abs(z) <= 0.999999, -g_v / (wp.pi * wp.sqrt(wp.max(1.0 - z * z, 1.0e-12))), 0.0)
     return wp.vec3(around * y, -around * x, down)
-
-
-@wp.struct
-class _Texels:
-    """Four texels around a place of a table."""
-
-    corner: wp.vec4i
-    """Above left and right, below left and right."""
-    fx: float
-    fy: float
-    inside: float
-    """0 where the row is clamped: no slope across rows."""
-
-
-@wp.func
-def _texels(start: int, rows: int, u: float, v: float) -> _Texels:
-    columns = 2 * rows
-    x = u * float(columns) - 0.5
-    row_place = v * float(rows) - 0.5
-    y = wp.clamp(row_place, 0.0, float(rows) - 1.0)
-    x_floor = wp.floor(x)
-    y_floor = wp.min(wp.floor(y), float(rows) - 2.0)
-    column0 = (int(x_floor) + columns) % columns
-    column1 = (column0 + 1) % columns
-    row = start + int(y_floor) * columns
-    around = _Texels()
-    around.corner = wp.vec4i(row + column0, row + column1, row + columns + column0, row + columns + column1)
-    around.fx = x - x_floor
-    around.fy = y - y_floor
-    around.inside = wp.where(row_place == y, 1.0, 0.0)
-    return around
-
-
-@wp.func
-def _value(tables: wp.array[wp.vec3], around: _Texels) -> wp.vec3:
-    fx = around.fx
-    top = tables[around.corner[0]] * (1.0 - fx) + tables[around.corner[1]] * fx
-    bottom = tables[around.corner[2]] * (1.0 - fx) + tables[around.corner[3]] * fx
-    return top * (1.0 - around.fy) + bottom * around.fy
-
-
-@wp.func
-def _slopes(tables: wp.array[wp.vec3], around: _Texels, rows: int, gradient: wp.vec3) -> wp.vec2:
-    # By u and v, of the value times `gradient`.
-    a = wp.dot(tables[around.corner[0]], gradient)
-    b = wp.dot(tables[around.corner[1]], gradient)
-    c = wp.dot(tables[around.corner[2]], gradient)
-    d = wp.dot(tables[around.corner[3]], gradient)
-    by_x = (b - a) * (1.0 - around.fy) + (d - c) * around.fy
-    by_y = (c - a) * (1.0 - around.fx) + (d - b) * around.fx
-    return wp.vec2(by_x * float(2 * rows), by_y * float(rows) * around.inside)
-
-
-@wp.func
-def _add(table_gradients: wp.array[wp.vec3], around: _Texels, gradient: wp.vec3):
-    fx = around.fx
-    top = gradient * (1.0 - around.fy)
-    bottom = gradient * around.fy
-    wp.atomic_add(table_gradients, around.corner[0], top * (1.0 - fx))
-    wp.atomic_add(table_gradients, around.corner[1], top * fx)
-    wp.atomic_add(table_gradients, around.corner[2], bottom * (1.0 - fx))
-    wp.atomic_add(table_gradients, around.corner[3], bottom * fx)
 
 
 @wp.struct
@@ -149,8 +88,8 @@ class _Mirrored:
     """Where the mirrored light is looked up."""
 
     direction: wp.vec3
-    near: _Texels
-    far: _Texels
+    near: Texels
+    far: Texels
     level: int
     fraction: float
     """Of the table of the next level."""
@@ -165,8 +104,8 @@ def _mirrored(normal: wp.vec3, wo: wp.vec3, roughness: float) -> _Mirrored:
     level = _level_below(r)
     found.level = level
     found.fraction = (r - _ROUGHNESS[level]) / (_ROUGHNESS[level + 1] - _ROUGHNESS[level])
-    found.near = _texels(_OFFSET[level], _ROWS[level], uv[0], uv[1])
-    found.far = _texels(_OFFSET[level + 1], _ROWS[level + 1], uv[0], uv[1])
+    found.near = texels_at(_OFFSET[level], _ROWS[level], uv[0], uv[1])
+    found.far = texels_at(_OFFSET[level + 1], _ROWS[level + 1], uv[0], uv[1])
     return found
 
 
@@ -184,11 +123,11 @@ def radiance_of_point(
     factor_table: wp.array[wp.vec2],
 ) -> wp.vec3:
     mirror = _mirrored(normal, wo, roughness)
-    sky = _value(tables, mirror.near) * (1.0 - mirror.fraction) + _value(tables, mirror.far) * mirror.fraction
+    sky = texel_value(tables, mirror.near) * (1.0 - mirror.fraction) + texel_value(tables, mirror.far) * mirror.fraction
     reflected = sky * transmittance + hit_radiance
     factors = _factors(factor_table, wp.dot(normal, wo), roughness).value
     about = _uv(normal)
-    irradiance = _value(tables, _texels(_IRRADIANCE_START, _IRRADIANCE_ROWS, about[0], about[1]))
+    irradiance = texel_value(tables, texels_at(_IRRADIANCE_START, _IRRADIANCE_ROWS, about[0], about[1]))
     specular = wp.cw_mul(reflected, f0 * factors[0] + wp.vec3(factors[1], factors[1], factors[1]))
     return wp.cw_mul(diffuse_albedo, wp.cw_mul(irradiance, open_share)) + specular
 
@@ -221,13 +160,13 @@ def gradients_of_point(
     """Of g times radiance_of_point; those of the tables are added to `table_gradients`."""
     n_dot_v = wp.dot(normal, wo)
     mirror = _mirrored(normal, wo, roughness)
-    near = _value(tables, mirror.near)
-    far = _value(tables, mirror.far)
+    near = texel_value(tables, mirror.near)
+    far = texel_value(tables, mirror.far)
     f = mirror.fraction
     reflected = (near * (1.0 - f) + far * f) * transmittance + hit_radiance
     factors = _factors(factor_table, n_dot_v, roughness)
     about = _uv(normal)
-    overhead = _texels(_IRRADIANCE_START, _IRRADIANCE_ROWS, about[0], about[1])
+    overhead = texels_at(_IRRADIANCE_START, _IRRADIANCE_ROWS, about[0], about[1])
     g_open = wp.cw_mul(g, open_share)
     g_irradiance = wp.cw_mul(g_open, diffuse_albedo)
 
@@ -240,15 +179,15 @@ def gradients_of_point(
     level = mirror.level
     between = wp.dot(g_sky, far - near) / (_ROUGHNESS[level + 1] - _ROUGHNESS[level])
     within = wp.where(roughness >= _ROUGHNESS[0], 1.0, 0.0) * wp.where(roughness <= _ROUGHNESS[_LEVEL_COUNT - 1], 1.0, 0.0)
-    by_uv = _slopes(tables, mirror.near, _ROWS[level], g_near) + _slopes(tables, mirror.far, _ROWS[level + 1], g_far)
+    by_uv = texel_slopes(tables, mirror.near, _ROWS[level], g_near) + texel_slopes(tables, mirror.far, _ROWS[level + 1], g_far)
     g_mirror = _uv_gradient(mirror.direction, by_uv[0], by_uv[1])
-    by_about = _slopes(tables, overhead, _IRRADIANCE_ROWS, g_irradiance)
-    _add(table_gradients, mirror.near, g_near)
-    _add(table_gradients, mirror.far, g_far)
-    _add(table_gradients, overhead, g_irradiance)
+    by_about = texel_slopes(tables, overhead, _IRRADIANCE_ROWS, g_irradiance)
+    add_to_texels(table_gradients, mirror.near, g_near)
+    add_to_texels(table_gradients, mirror.far, g_far)
+    add_to_texels(table_gradients, overhead, g_irradiance)
 
     found = PointGradients()
-    found.diffuse_albedo = wp.cw_mul(g_open, _value(tables, overhead))
+    found.diffuse_albedo = wp.cw_mul(g_open, texel_value(tables, overhead))
     found.f0 = g_reflectance * factors.value[0]
     found.roughness = wp.dot(g_factors, factors.by_roughness) + between * within
     g_cosine = wp.dot(g_factors, factors.by_cosine) + 2.0 * wp.dot(g_mirror, normal)

@@ -7,7 +7,6 @@ In: places of pixels on the mesh, numbers of its vertices, the filtered light. O
 of the vertices and the tables.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -20,7 +19,7 @@ from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.mesh_light_kernels import base_f0, normal_at, rotation_of, vector_at
 from drgs.reconstruct.fit.light.split_sum import factor_table
 from drgs.reconstruct.fit.light.split_sum_kernels import gradients_of_point, radiance_of_point
-from drgs.warp_torch import gradient_slices, in_gradient_slices, launch, load_kernel, warp_argument, warp_device
+from drgs.warp_torch import launch, launch_adding, warp_argument, warp_device
 
 wp.set_module_options({"enable_backward": False})
 
@@ -217,22 +216,12 @@ class _SurfaceColor(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         surface, tables, radiance, uncut = ctx.saved_tensors
-        slices, device, count = gradient_slices(), warp_device(gradient), len(gradient)
-        by_surface, by_tables = (torch.zeros(slices, *x.shape, device=gradient.device) for x in (surface, tables))
-        if count:
-            load_kernel(color_adjoint, device)
-            inputs = [*_arguments(ctx, surface, tables), *(warp_argument(x, wp.vec3) for x in (radiance, uncut, gradient))]
-            in_gradient_slices(lambda k, of: _add_slice(k, of, count, inputs, by_surface[k], by_tables[k], device), device, count)
-        return (*(x[0] if slices == 1 else x.sum(0) for x in (by_surface, by_tables)), None, None, None)
+        gradient = gradient.contiguous()
+        inputs = [*_arguments(ctx, surface, tables), *(warp_argument(x, wp.vec3) for x in (radiance, uncut, gradient))]
+        added = [(surface, None), (tables, wp.vec3)]
+        return (*launch_adding(color_adjoint, len(gradient), inputs, [], added, warp_device(gradient)), None, None, None)
 
 
 def _arguments(ctx: Any, surface: Tensor, tables: Tensor) -> list:
     given = [warp_argument(x, dtype) for x, dtype in zip(ctx.given, _TYPES, strict=True)]
     return [*given, ctx.rotation, ctx.ceiling, warp_argument(surface), warp_argument(tables, wp.vec3)]
-
-
-def _add_slice(k: int, slices: int, count: int, inputs: Sequence, by_surface: Tensor, by_tables: Tensor, device: Any) -> None:
-    """Gradients of one of so many parts of the places."""
-    first, last = count * k // slices, count * (k + 1) // slices
-    outputs = [warp_argument(by_surface), warp_argument(by_tables, wp.vec3)]
-    wp.launch(color_adjoint, dim=last - first, inputs=[first, *inputs], outputs=outputs, device=device)
