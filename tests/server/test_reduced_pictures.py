@@ -4,7 +4,7 @@ import pytest
 
 from drgs_server.live.frame_header import unpack_frame
 from drgs_server.live.messages import CameraMessage, ErrorMessage, Settings, StatusMessage
-from drgs_server.live.pace import REDUCED_SECONDS
+from drgs_server.live.pace import CROWDED_SHARE, REDUCED_SECONDS
 from drgs_server.live.viewer import ANSWER_SECONDS, MOVING_SECONDS, Posed, Viewer
 from drgs_server.render.interface import AbstractPicture
 from tests.server.painter import PaintedPose, Painter, Painting
@@ -27,7 +27,7 @@ def moved(viewer: Viewer, number: int) -> None:
     viewer.set_camera(CameraMessage(type="camera", number=number, world_from_camera=pose, fov_y_degrees=40, width=640, height=480))
 
 
-@pytest.mark.parametrize(("seconds", "waits"), [(0.02, False), (0.15, True)])
+@pytest.mark.parametrize(("seconds", "waits"), [(0.02, False), (0.15, True), (0.3, True)])
 def test_only_after_a_reduced_picture_the_next_one_waits(seconds: float, waits: bool) -> None:
     pose, said = SlowPose(seconds), list[bytes | StatusMessage | ErrorMessage]()
     viewer = Viewer(said.append, lambda: Posed(0, pose), clock=lambda: pose.now)
@@ -41,6 +41,9 @@ def test_only_after_a_reduced_picture_the_next_one_waits(seconds: float, waits: 
     assert viewer.due_at() == (pytest.approx(began + REDUCED_SECONDS) if waits else 0.0)
     notes = [note for message in said if isinstance(message, StatusMessage) for note in message.notes]
     assert any(f"at most {1 / REDUCED_SECONDS:.0f} a second" in note for note in notes) == waits
+    took = pose.now - began
+    crowded = began + max(REDUCED_SECONDS, took / CROWDED_SHARE)
+    assert viewer.due_at(crowded=True) == (pytest.approx(crowded) if waits else 0.0)
 
 
 def test_one_input_is_refined_at_once_and_those_in_a_row_when_the_next_one_does_not_come() -> None:

@@ -143,24 +143,22 @@ def shade_chunks(
 
 
 class ScratchOfThread(threading.local):
-    """Final. Each thread's own, made once for chunks of one kind: launches come by the hundred."""
-
-    kind: tuple[int, int] | None = None
-    """Rays of a chunk; 0, 1, or 2 bounces for more."""
+    """Final. Each thread's own, kept for all chunks: launches come by the hundred."""
 
     def __init__(self) -> None:
-        self.scratch, self.counts = FusedScratch(), torch.zeros(3, dtype=torch.int32)
+        self.counts = torch.zeros(3, dtype=torch.int32)
+        self._scratch: Any = FusedScratch()
+        self._rays = 0
 
-    def fit(self, rays: int, bounces: int) -> None:
-        """Space for chunks of so many rays, whose counts are 0."""
+    def fit(self, rays: int) -> Any:
+        """FusedScratch for chunks of so many rays, whose counts are 0."""
         self.counts.zero_()
-        if self.kind == (rays, min(bounces, 2)):
-            return
-        self.kind = rays, min(bounces, 2)
-        self.scratch.rays = ray_samples(rays, torch.device("cpu"))
-        self.scratch.even = path_arrays(rays if bounces > 0 else 0)
-        self.scratch.odd = path_arrays(rays if bounces > 1 else 0)
-        self.scratch.counts = warp_array(self.counts)
+        if rays > self._rays:
+            self._rays = max(rays, RAYS_A_CHUNK)
+            self._scratch.rays = ray_samples(self._rays, torch.device("cpu"))
+            self._scratch.even, self._scratch.odd = path_arrays(self._rays), path_arrays(self._rays)
+            self._scratch.counts = warp_array(self.counts)
+        return self._scratch
 
 
 _of_thread = ScratchOfThread()
@@ -177,7 +175,7 @@ class FusedEmbreeIntegrator(AbstractIntegrator):
 
     def shade_slice(self, estimate: Estimate, first: int, last: int) -> int:
         chunk = max(1, RAYS_A_CHUNK // estimate.rays_a_point)
-        _of_thread.fit(chunk * estimate.rays_a_point, estimate.bounces)
+        scratch = _of_thread.fit(chunk * estimate.rays_a_point)
         remembered = RememberedRays()
         if estimate.known is not None:
             remembered.known = traced_arrays(estimate.known)
@@ -185,6 +183,6 @@ class FusedEmbreeIntegrator(AbstractIntegrator):
             remembered.kept = traced_arrays(estimate.kept)
         inputs: list[Any] = [self.tracer.handle, first, last, chunk, estimate.bounces]
         inputs += [estimate.points, estimate.starts, estimate.scene, estimate.samples]
-        outputs = [remembered, _of_thread.scratch, estimate.sums]
+        outputs = [remembered, scratch, estimate.sums]
         wp.launch(shade_chunks, dim=-(-(last - first) // chunk), inputs=inputs, outputs=outputs, device="cpu")
         return int(_of_thread.counts[2])

@@ -71,6 +71,11 @@ KEPT_LIGHT = Skip(
     "light kept on the mesh's vertices says what they would bring",
     "a standard error of at most 20 %, and a quarter between the corners of a face; none at rest, where all rays are traced",
 )
+LENT_SPECULAR = Skip(
+    "mirror rays of three in four pixels of rough paint in a moving picture",
+    "neighbours on the same surface, whose diffuse light is kept as well, say what they would bring",
+    "the noise of fewer rays, and what paint of a roughness of 0.3 and more mirrors is blurred over three pixels; none at rest, where all rays are traced",
+)
 KEPT_HITS = Skip(
     "rays from surfaces that a moving picture's rays meet",
     "light kept on the mesh's vertices says what these surfaces send",
@@ -216,7 +221,7 @@ def plan_frame(
     kept_light = moving and facts is not None and facts.diffuse_share >= WORTH_KEEPING
     if moving:
         fewer = moving_counts(counts).total < counts.total
-        skips += [PIXEL_MIDDLES, *([FEWER_RAYS] if fewer else []), *([KEPT_LIGHT] if kept_light else [])]
+        skips += [PIXEL_MIDDLES, *([FEWER_RAYS] if fewer else []), *([KEPT_LIGHT, LENT_SPECULAR] if kept_light else [])]
         skips += [KEPT_HITS] if kept_light and bounces == 1 else []
     return RenderPlan(counts, by_material, bounces, tuple(skips), candidates, moving, kept_light, True, spread_places)
 
@@ -231,7 +236,7 @@ def _rays_above_horizons(skip_error: float) -> Skip:
 
 def at_rest(plan: RenderPlan) -> RenderPlan:
     """The same for passes that trace all their rays."""
-    skips = tuple(skip for skip in plan.skips if skip not in (PIXEL_MIDDLES, FEWER_RAYS, KEPT_LIGHT, KEPT_HITS, EVERY_OTHER))
+    skips = tuple(skip for skip in plan.skips if skip not in (PIXEL_MIDDLES, FEWER_RAYS, KEPT_LIGHT, LENT_SPECULAR, KEPT_HITS, EVERY_OTHER))
     return replace(plan, moving=False, every_other=False, kept_light=False, skips=skips)
 
 

@@ -1,6 +1,7 @@
 """The mesh as kernels see it: the surface at a hit, and the rays that need no tracing."""
 
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 import warp as wp
@@ -36,12 +37,26 @@ class MeshArrays:
     """Of each vertex; empty: all wear all of it."""
 
 
+_known: WeakKeyDictionary[TriangleMesh, tuple[tuple[float, Tensor | None, Any], ...]] = WeakKeyDictionary()
+"""What mesh_arrays gave for meshes that live: a moving picture asks six times for the same two."""
+
+
 def mesh_arrays(mesh: TriangleMesh, lift: float, horizon: Tensor | None = None) -> Any:
-    """The struct that kernels read; shares memory with the tensors.
+    """The struct that kernels read; shares memory with the tensors. Nobody writes to it.
 
     Args:
         horizon: (face, SECTORS) sines; rays above them are not traced.
     """
+    known = _known.get(mesh, ())
+    for given_lift, given_horizon, arrays in known:
+        if given_lift == lift and given_horizon is horizon:
+            return arrays
+    arrays = _mesh_arrays(mesh, lift, horizon)
+    _known[mesh] = (*known[-1:], (lift, horizon, arrays))
+    return arrays
+
+
+def _mesh_arrays(mesh: TriangleMesh, lift: float, horizon: Tensor | None) -> Any:
     arrays = MeshArrays()
     arrays.vertices = warp_array(mesh.vertices.float(), wp.vec3)
     arrays.faces = warp_array(mesh.faces.to(torch.int32).reshape(-1))

@@ -17,6 +17,7 @@ from drgs.render.integrate.integrator import light_sums
 from drgs.render.integrate.sample_rays import PointArrays, point_arrays
 from drgs.render.integrate.sum_samples import LightSums
 from drgs.render.progressive.demodulate_albedo import diffuse_reflectance, mean_square, specular_reflectance
+from drgs.render.progressive.neighbours import Neighbourhood, column_of, neighbour_alike, neighbourhood, point_beside, row_of
 from drgs.render.progressive.quick_picture import QuickPicture
 from drgs.render.progressive.reproject import LightMaps, light_maps
 from drgs.render.records import DemodulatedLight, GBuffer, History, PrimaryPoints, RayStarts, ShadedPoints
@@ -26,36 +27,6 @@ from drgs.scene.camera import Camera
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
-
-LEAST_COSINE = wp.constant(0.9)
-"""Between the normals of neighbours that take each other's light."""
-MOST_OFF_PLANE = wp.constant(2.0)
-"""That one lies off the other's tangent plane [pixel footprints]."""
-MOST_UNLIKE = wp.constant(0.1)
-"""That their roughness, or metallic, differs by."""
-
-
-@wp.struct
-class Neighbourhood:
-    """Where points lie in a window that begins at a tile's corner [pixels]."""
-
-    row: int
-    column: int
-    image_width: int
-    footprint: float
-    """Of a pixel at distance 1 [world units]."""
-    place: wp.array2d[int]
-    """Of each pixel of the window its point's number and one; 0 where there is none."""
-
-
-@wp.func
-def row_of(there: Neighbourhood, pixel: int) -> int:
-    return pixel // there.image_width - there.row
-
-
-@wp.func
-def column_of(there: Neighbourhood, pixel: int) -> int:
-    return pixel % there.image_width - there.column
 
 
 @wp.kernel
@@ -80,27 +51,6 @@ def write_surface(
     maps.position[i] = points.position[p]
     maps.normal[i] = points.normal[p]
     maps.wo[i] = points.wo[p]
-
-
-@wp.func
-def point_beside(points: PointArrays, there: Neighbourhood, p: int, side: int) -> int:
-    """The point above, below, left or right of a point; -1 where there is none."""
-    y = row_of(there, points.pixel[p]) + wp.where(side == 0, -1, wp.where(side == 1, 1, 0))
-    x = column_of(there, points.pixel[p]) + wp.where(side == 2, -1, wp.where(side == 3, 1, 0))
-    if y < 0 or x < 0 or y >= there.place.shape[0] or x >= there.place.shape[1]:
-        return -1
-    return there.place[y, x] - 1
-
-
-@wp.func
-def neighbour_alike(points: PointArrays, depth: wp.array[float], there: Neighbourhood, p: int, side: int) -> int:
-    """The point on this side of a point, if its light will do for both; else -1."""
-    q = point_beside(points, there, p, side)
-    if q < 0 or wp.dot(points.normal[p], points.normal[q]) < LEAST_COSINE:
-        return -1
-    off_plane = wp.abs(wp.dot(points.normal[p], points.position[q] - points.position[p]))
-    unlike = wp.max(wp.abs(points.roughness[p] - points.roughness[q]), wp.abs(points.metallic[p] - points.metallic[q]))
-    return wp.where(off_plane <= MOST_OFF_PLANE * there.footprint * depth[p] and unlike <= MOST_UNLIKE, q, -1)
 
 
 @wp.kernel
@@ -194,9 +144,7 @@ class EditedPoints:
         """
         points, device, warp = primary.points, primary.depth.device, warp_device(primary.depth)
         self._camera, self._count = camera, len(points.pixel)
-        self._there: Any = Neighbourhood()
-        self._there.row, self._there.column, self._there.image_width = window.rows.start, window.columns.start, window.width
-        self._there.footprint = 1.0 / float(camera.intrinsics[0, 0])
+        self._there: Any = neighbourhood(window, 1.0 / float(camera.intrinsics[0, 0]))
         self._points = [point_arrays(points), warp_array(primary.depth), self._there]
         view = _views.get(primary.starts)
         if view is None or view.window != window:

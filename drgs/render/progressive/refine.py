@@ -27,6 +27,7 @@ from drgs.render.progressive.frame_state import FrameState, GaussianView, MeshVi
 from drgs.render.progressive.frame_sums import add_estimate, copy_sums, no_sums, sum_arrays
 from drgs.render.progressive.kept_light.shade_moving import shade_moving
 from drgs.render.progressive.mean_radiance import frame_history, mean_gbuffer
+from drgs.render.progressive.neighbours import neighbourhood
 from drgs.render.progressive.quick_picture import quick_picture
 from drgs.render.progressive.reproject import reproject
 from drgs.render.progressive.see_middles import see_middles
@@ -118,7 +119,8 @@ def _move(state: FrameState) -> FrameState:
     kept, kept_samples = state.kept_light, None
     if state.plan.kept_light:
         assert kept is not None
-        moving = shade_moving(integrator, primary, light, how, kept, _horizon(state), 1.0 / float(state.inputs.camera.intrinsics[0, 0]))
+        where = neighbourhood(middles.window, 1.0 / float(state.inputs.camera.intrinsics[0, 0]), middles.place)
+        moving = shade_moving(integrator, primary, light, how, kept, _horizon(state), where)
         found, kept, kept_samples = moving.light, moving.kept, moving.kept_samples
     else:
         found = integrator.shade(primary.points, primary.starts, light, how, 0, None, _horizon(state))

@@ -11,6 +11,8 @@ TARGET_SECONDS = 1 / 13
 """Wanted for one moving picture, so that twelve a second come though some are late."""
 REDUCED_SECONDS = 1 / 15
 """From one reduced picture to the next at least: what is left is for those who made the reduction necessary."""
+CROWDED_SHARE = 0.8
+"""Of the time that reduced pictures take at most where others want the cores: on a slow day they take all of REDUCED_SECONDS, and leave nothing."""
 STEPS = (1.0, 0.75, 0.6, 0.5)
 SMALLEST_SIDE = 240
 """Pixels; a picture that was asked for smaller than this is never reduced."""

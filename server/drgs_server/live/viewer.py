@@ -21,7 +21,7 @@ from drgs_server.live.frame_header import (
     pack_frame,
 )
 from drgs_server.live.messages import MAX_FRAMES_IN_FLIGHT, CameraMessage, ErrorMessage, Phase, Settings, StatusMessage
-from drgs_server.live.pace import REDUCED_SECONDS, Pace
+from drgs_server.live.pace import CROWDED_SHARE, REDUCED_SECONDS, Pace
 from drgs_server.render.encode import encode_jpeg, encode_png, has_alpha
 from drgs_server.render.interface import AbstractPicture, AbstractPose
 
@@ -73,6 +73,8 @@ class _Progress:
     begun_at: float
     pace: Pace
     """That said the scale."""
+    seconds: float = 0.0
+    """That its first part took."""
     rests_until: float = 0.0
     """Nothing is added before, unless something comes in."""
     samples_sent: int = 0
@@ -188,8 +190,12 @@ class Viewer:
         """That work failed; the client goes on."""
         self._deliver(ErrorMessage(message=sentence))
 
-    def due_at(self) -> float | None:
-        """When `work()` has something to do: a time of the clock (0 for now), or None until the next input or ack."""
+    def due_at(self, crowded: bool = False) -> float | None:
+        """When `work()` has something to do: a time of the clock (0 for now), or None until the next input or ack.
+
+        Args:
+            crowded: others want the cores.
+        """
         with self._lock:
             inputs = self._inputs()
             if inputs is None or self._last_frame_id - self._acked_frame_id >= MAX_FRAMES_IN_FLIGHT:
@@ -199,7 +205,8 @@ class Viewer:
             return 0.0
         if progress.inputs.generation != inputs.generation:
             # Other work, for which a picture was reduced, gets the rest of the time.
-            return 0.0 if progress.scale == 1 else progress.begun_at + REDUCED_SECONDS
+            apart = max(REDUCED_SECONDS, progress.seconds / CROWDED_SHARE) if crowded else REDUCED_SECONDS
+            return 0.0 if progress.scale == 1 else progress.begun_at + apart
         if progress.scale < 1:
             return self._input_at + MOVING_SECONDS
         return None if progress.converged_sent else progress.rests_until
@@ -243,7 +250,8 @@ class Viewer:
         if begun:
             if self._in_a_row:
                 progress.rests_until = self._clock() + min(ANSWER_SECONDS + (self._round_trip or 0.0), MOVING_SECONDS)
-            progress.pace.measured(picture.width, picture.height, progress.scale, self._clock() - start)
+            progress.seconds = self._clock() - start
+            progress.pace.measured(picture.width, picture.height, progress.scale, progress.seconds)
 
     def _begin(self, inputs: _Inputs, moving: bool) -> _Progress:
         asked, begun_at = inputs.camera, self._clock()

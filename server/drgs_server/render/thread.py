@@ -135,7 +135,7 @@ class RenderThread:
         soonest = now + LONGEST_WAIT_SECONDS
         due = []
         for viewer in self._viewers:
-            at = viewer.due_at()
+            at = viewer.due_at(self._crowding.crowded)
             if at is None:
                 continue
             at = max(at, self._failed_until.get(viewer, 0.0))

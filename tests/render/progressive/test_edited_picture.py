@@ -7,8 +7,9 @@ import torch
 
 from drgs.render.film.resolve_frame import resolve_frame
 from drgs.render.integrate.plan import EVERY_OTHER
-from drgs.render.progressive.edited_picture import LEAST_COSINE, MOST_OFF_PLANE, MOST_UNLIKE, EditedPoints
+from drgs.render.progressive.edited_picture import EditedPoints
 from drgs.render.progressive.frame_state import FrameState, MeshView
+from drgs.render.progressive.neighbours import LEAST_COSINE, MOST_OFF_PLANE, MOST_UNLIKE
 from drgs.render.progressive.refine import refine_frame
 from drgs.render.progressive.start_frame import start_frame
 from drgs.render.records import PrimaryPoints, RenderSettings, SampleCounts, ShadedPoints

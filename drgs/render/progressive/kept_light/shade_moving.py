@@ -1,7 +1,7 @@
 """The light of a moving picture: kept light where it is good enough, rays for what is left.
 
 In: the points of a pass, the kept light. Out: their light, which of them were read, and kept light with more rounds. Points that are read
-pay for specular rays alone. What is spent on the next picture's kept light is bounded by what this one spends (SPENT_FIRST, SPENT_LATER).
+pay for specular rays alone, and of rough paint one in four does (lend_specular.py). What is spent on the next picture's kept light is bounded by what this one spends (SPENT_FIRST, SPENT_LATER).
 """
 
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ from drgs.render.integrate.sum_samples import LightSums
 from drgs.render.progressive.demodulate_albedo import mean_square
 from drgs.render.progressive.kept_light.gather_light import gather_light, vertices_to_light
 from drgs.render.progressive.kept_light.kept_light import A_ROUND, KeptLight
+from drgs.render.progressive.kept_light.lend_specular import find_lenders, lend_specular
 from drgs.render.progressive.kept_light.light_of_hits import light_of_hits
 from drgs.render.progressive.kept_light.read_light import READ, ThereArrays, read_light, there_arrays
 from drgs.render.records import PrimaryPoints, SampleCounts, ShadedPoints, ShadingPoints
@@ -56,20 +57,22 @@ def shade_moving(
     how: IntegratorSettings,
     kept: KeptLight,
     horizon: Tensor | None,
-    footprint: float,
+    where: Any,
 ) -> MovingLight:
     """Light of a picture's first pass.
 
     Args:
-        how: of points that are not read. horizon: of the tracer's mesh. footprint: of a pixel at distance 1 [world units].
+        how: of points that are not read. horizon: of the tracer's mesh. where: Neighbourhood of the points.
     """
-    there = read_light(kept, primary, integrator.tracer, footprint)
+    there = read_light(kept, primary, integrator.tracer, where.footprint)
     known = light_of_hits(kept, integrator.tracer) if how.bounces == 1 else None
     read = there.verdict == int(READ)
     here, elsewhere = (torch.nonzero(chosen).squeeze(-1).int() for chosen in (read, ~read))
     light = integrator.shade(primary.points, primary.starts, environment_light, how, 0, None, horizon, known, elsewhere)
     fewer, glossy = replace(how, counts=specular_counts(how.counts)), only_specular(primary.points)
-    light = integrator.shade(glossy, primary.starts, environment_light, fewer, 0, None, horizon, known, here, light)
+    lenders = find_lenders(primary, there.verdict, where)
+    light = integrator.shade(glossy, primary.starts, environment_light, fewer, 0, None, horizon, known, lenders.with_rays, light)
+    lend_specular(lenders, primary, light)
     inputs = [warp_array(here), point_arrays(primary.points), there_arrays(there)]
     launch(add_read_light, len(here), inputs, [light_sums(light)], warp_device(read))
     young = int((there.wanted & (kept.indirect_rounds < ENOUGH_ROUNDS)).sum())
