@@ -41,6 +41,7 @@ from drgs.scene.posed_scene import PrimarySurface
 from drgs.warp_torch import device_from_name
 from drgs_server.client import Client, Stream
 from drgs_server.live.messages import AcceptedMessage
+from drgs_server.render.settle_memory import settle_memory
 
 WARM_UP = 3
 """Pictures before the first that is measured."""
@@ -67,6 +68,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
     asset = load_asset(given.asset, device_from_name(given.device))
+    settle_memory()  # as a server does once its first picture is made
     truth = true_pictures(asset, given.size, given.truth, given.frames, given.primary)
     result = moving(asset, given.size, given.spp, given.frames, given.primary, truth)
     result["traced"] = moving(asset, given.size, given.spp, given.frames, given.primary, truth, keep_light=False)
