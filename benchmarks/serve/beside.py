@@ -2,8 +2,9 @@
 
     python -m benchmarks beside DATASET ASSET [--preset draft] [--size 400] [--seconds 20] [--script] [--json]
 
-The same build is run four times: alone; twice at once; and, as the service's worker runs it (giving way to others by some steps of priority), while a
-viewer of ASSET moves its camera with each picture that comes. A viewer that has the machine to itself is measured for `--seconds` before.
+The same build is run five times: alone; twice at once; as the service's worker runs it (giving way to others by some steps of priority), while a
+viewer of ASSET moves its camera with each picture that comes; and alone once more, for a shared machine's speed differs by a half from one minute to the next. A
+viewer that has the machine to itself is measured for `--seconds` before and after its build. What is alone is the mean of both.
 beside_build_ratio, beside_viewer_ratio: seconds over those alone, of the two builds the longer one's; ..._cpu_ratio: the same of processor time, which says
 what threads that wait for each other burn. viewer_kept: pictures a second that the viewer gets while the build runs, over those without it.
 With --script a build is not a command but a script's call of drgs.build_asset, which imports torch before drgs and chooses nothing of how threads wait.
@@ -64,7 +65,7 @@ def main(arguments: list[str]) -> None:
 
 
 def measure(dataset: Path, asset: Path, preset: str, device: str, size: int, seconds: float, folder: Path, by_script: bool = False) -> dict:
-    """All four builds and both viewers.
+    """All builds and viewers.
 
     Raises:
         ValueError: a build failed; its own words are on stderr.
@@ -77,14 +78,13 @@ def measure(dataset: Path, asset: Path, preset: str, device: str, size: int, sec
         # The first two words are what Python is to run.
         return run_build(["-c", GIVING_WAY, *command[2:]] if giving_way else command)
 
-    alone = build("alone")
+    alone = [build("alone")]
     with ThreadPoolExecutor(2) as pool:
         both = list(pool.map(build, ("one", "other")))
     with served(asset, size, device) as (_, _, stream):
         turn = camera_path(asset, size)
         pictures_a_second(stream, turn, size, lambda: True, WARM_UP)
-        until = time.perf_counter() + seconds
-        fps_alone = pictures_a_second(stream, turn, size, lambda: time.perf_counter() < until)
+        fps_alone = [_pictures_for(seconds, stream, turn, size)]
         over, found = threading.Event(), []
 
         def run() -> None:
@@ -97,8 +97,10 @@ def measure(dataset: Path, asset: Path, preset: str, device: str, size: int, sec
         builder.start()
         fps_beside = pictures_a_second(stream, turn, size, lambda: not over.is_set())
         builder.join()
+        fps_alone.append(_pictures_for(seconds, stream, turn, size))
     if not found:
         raise ValueError("the build beside the viewer failed; its own words are above")
+    alone.append(build("alone_again"))
     return figures(alone, both, found[0], fps_alone, fps_beside) | {
         "dataset": dataset.name,
         "asset": asset.name,
@@ -108,21 +110,31 @@ def measure(dataset: Path, asset: Path, preset: str, device: str, size: int, sec
     }
 
 
-def figures(alone: BuildRun, both: list[BuildRun], watched: BuildRun, fps_alone: float, fps_beside: float) -> dict:
+def figures(alone: list[BuildRun], both: list[BuildRun], watched: BuildRun, fps_alone: list[float], fps_beside: float) -> dict:
     """What the document holds."""
+    seconds, cpu_seconds = (statistics.mean(values) for values in zip(*((run.seconds, run.cpu_seconds) for run in alone), strict=True))
+    fps = statistics.mean(fps_alone)
     return {
-        "alone_s": alone.seconds,
-        "alone_cpu_s": alone.cpu_seconds,
+        "alone_s": round(seconds, 2),
+        "alone_cpu_s": round(cpu_seconds, 2),
+        "alone_each_s": [run.seconds for run in alone],
         "beside_build_s": [run.seconds for run in both],
-        "beside_build_ratio": round(max(run.seconds for run in both) / alone.seconds, 2),
-        "beside_build_cpu_ratio": round(statistics.mean(run.cpu_seconds for run in both) / alone.cpu_seconds, 2),
+        "beside_build_ratio": round(max(run.seconds for run in both) / seconds, 2),
+        "beside_build_cpu_ratio": round(statistics.mean(run.cpu_seconds for run in both) / cpu_seconds, 2),
         "beside_viewer_s": watched.seconds,
-        "beside_viewer_ratio": round(watched.seconds / alone.seconds, 2),
-        "beside_viewer_cpu_ratio": round(watched.cpu_seconds / alone.cpu_seconds, 2),
-        "viewer_fps_alone": round(fps_alone, 2),
+        "beside_viewer_ratio": round(watched.seconds / seconds, 2),
+        "beside_viewer_cpu_ratio": round(watched.cpu_seconds / cpu_seconds, 2),
+        "viewer_fps_alone": round(fps, 2),
+        "viewer_fps_alone_each": [round(each, 2) for each in fps_alone],
         "viewer_fps_beside": round(fps_beside, 2),
-        "viewer_kept": round(fps_beside / fps_alone, 3),
+        "viewer_kept": round(fps_beside / fps, 3),
     }
+
+
+def _pictures_for(seconds: float, stream: Stream, turn: Callable[[], list[list[float]]], size: int) -> float:
+    """A second, for so many seconds."""
+    until = time.perf_counter() + seconds
+    return pictures_a_second(stream, turn, size, lambda: time.perf_counter() < until)
 
 
 def camera_path(asset: Path, size: int) -> Callable[[], list[list[float]]]:

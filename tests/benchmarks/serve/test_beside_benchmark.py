@@ -18,8 +18,8 @@ def run(seconds: float, cpu_seconds: float) -> BuildRun:
     return BuildRun(seconds, cpu_seconds, {}, 100)
 
 
-def test_ratios_are_of_the_longer_build_and_of_the_mean_of_their_processor_time():
-    found = figures(run(100, 150), [run(180, 160), run(210, 170)], run(140, 155), fps_alone=10, fps_beside=6.5)
+def test_ratios_are_of_the_longer_build_of_the_mean_of_their_processor_time_and_to_what_was_alone_before_and_after():
+    found = figures([run(90, 140), run(110, 160)], [run(180, 160), run(210, 170)], run(140, 155), fps_alone=[9, 11], fps_beside=6.5)
     assert (found["beside_build_ratio"], found["beside_build_cpu_ratio"]) == (2.1, 1.1)
     assert (found["beside_viewer_ratio"], found["beside_viewer_cpu_ratio"], found["viewer_kept"]) == (1.4, 1.03, 0.65)
 
