@@ -24,8 +24,8 @@ from drgs.warp_torch import launch, warp_array, warp_device
 wp.set_module_options({"enable_backward": False})
 
 ROUGH_ENOUGH = wp.constant(0.3)
-"""Roughness from which on points borrow. Errors of pictures with and without, over one degree a picture: 1 to 2 % more of the demo's sample and none of a bunny; with 0.2
-and every other pixel 6 and 4 %, with 0 7 and 45 % (docs/decisions/0004)."""
+"""From which on points borrow. Errors of pictures with and without, of a camera that turns by a degree a picture: 1 to 3 % more of the demo's sample and none of a bunny;
+with 0.2 and every other pixel 5 and 4 %, with 0 7 and 47 % (docs/decisions/0004)."""
 
 
 @dataclass(frozen=True, eq=False)
