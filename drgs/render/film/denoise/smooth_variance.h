@@ -5,7 +5,7 @@
 // in   at (first pixel of the group), coverage, variance (2 planes)
 // out  smooth (2 planes)
 const float* const cover = coverage.data;
-const long plane = (long)height * pitch;
+const long plane = ((long)height * pitch + PLANE_ROUND - 1) / PLANE_ROUND * PLANE_ROUND + PLANE_SKEW;
 const int y = at / pitch;
 v16 total[2] = {v16(0.0f), v16(0.0f)}, weights(0.0f);
 for (int dy = -2; dy <= 2; ++dy) {

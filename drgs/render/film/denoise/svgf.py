@@ -10,12 +10,14 @@ Source: Schied et al. 2017 (weights, variance update); Dammertz et al. 2010 (ker
 tangent plane instead of depth gradients, which splats make noisy. Twin: drgs/reference/denoise.py.
 """
 
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from drgs.maths.constants import LUMINANCE_BLUE, LUMINANCE_GREEN, LUMINANCE_RED
 from drgs.render.color_warp import luminance_of
@@ -190,9 +192,17 @@ def filter_level(
 
 PAD = wp.constant(32)
 """Empty pixels at both ends of a row: as far as the widest kernel reaches."""
+VARIANCE, LIGHT_PLANES = wp.constant(8), wp.constant(10)
+"""Of light in planes: diffuse and specular, the luminance of both, the variance of both."""
+PLANE_ROUND, PLANE_SKEW = 1024, 80
+"""Planes begin a whole number of 4096 bytes and five cache lines after each other: a round reads eighteen of them at once, and where they are all
+as far from a multiple of 4096 bytes, as of windows of 384 rows of 256 pixels, they drive each other out of the first cache."""
 
 
-@wp.func_native(native_source(Path(__file__).with_name("smooth_variance.h")))
+PLANES_APART = {"PLANE_ROUND": PLANE_ROUND, "PLANE_SKEW": PLANE_SKEW}
+
+
+@wp.func_native(native_source(Path(__file__).with_name("smooth_variance.h"), constants=PLANES_APART))
 def smooth_sixteen(
     at: int, height: int, pitch: int, step: int, coverage: wp.array[float], variance: wp.array[float], smooth: wp.array[float]
 ): ...  # fmt: skip
@@ -202,7 +212,9 @@ LUMINANCE_WEIGHTS = {"LUMINANCE_RED": LUMINANCE_RED, "LUMINANCE_GREEN": LUMINANC
 
 
 @wp.func_native(
-    native_source(Path(__file__).with_name("filter_level.h"), constants={"NORMAL_POWER": int(NORMAL_POWER), **LUMINANCE_WEIGHTS})
+    native_source(
+        Path(__file__).with_name("filter_level.h"), constants={"NORMAL_POWER": int(NORMAL_POWER), **LUMINANCE_WEIGHTS, **PLANES_APART}
+    )
 )
 def filter_sixteen(
     at: int, height: int, pitch: int, step: int, sigma_luminance: float, sigma_plane: float, neighbour_variance: float,
@@ -302,12 +314,44 @@ def _light_pixels(light: DemodulatedLight) -> Any:
     return pixels
 
 
+class _PlanesOfThread(threading.local):
+    """Final. Each thread's own, kept from picture to picture: memory asked for anew costs more than a round reads."""
+
+    def __init__(self) -> None:
+        self._shape = (0, 0)
+
+    def fit(self, height: int, width: int) -> "_PlanesOfThread":
+        """For pictures of this size; guides and light still hold another picture's, but 0 at both ends of each row; the other light is 0."""
+        if self._shape != (height, width):
+            # An odd number of cache lines, so that rows lie in different parts of the cache, as planes do.
+            self._shape, self.pitch = (height, width), 16 * (-(-width // 16) | 1) + 2 * PAD
+            self.guides, self.smooth = _planes(8, height, self.pitch), _planes(2, height, self.pitch)
+            self.light, self.other = (_planes(LIGHT_PLANES, height, self.pitch) for _ in range(2))
+        else:
+            self.other.zero_()
+        return self
+
+
+_of_thread = _PlanesOfThread()
+
+
+def _planes(count: int, height: int, pitch: int) -> Tensor:
+    """(count, height, pitch) zeros, as far apart as filter_level.h and smooth_variance.h want them."""
+    apart = -(-height * pitch // PLANE_ROUND) * PLANE_ROUND + PLANE_SKEW
+    return torch.zeros(count, apart)[:, : height * pitch].view(count, height, pitch)
+
+
+def _flat(planes: Tensor) -> wp.array:
+    """From the first number of the first plane to the last of the last."""
+    count, size, apart = len(planes), planes[0].numel(), planes.stride(0)
+    return warp_array(planes.as_strided(((count - 1) * apart + size,), (1,)))
+
+
 def filter_sixteen_pixels(light: DemodulatedLight, gbuffer: GBuffer, footprint: float, settings: FilterSettings) -> DemodulatedLight:
     """filter_pixels on the CPU, sixteen at once; 0 where nothing is covered."""
     height, width = gbuffer.coverage.shape
-    columns = -(-width // 16) * 16
-    pitch = columns + 2 * PAD
-    guides, source = torch.zeros(8, height, pitch), torch.zeros(8, height, pitch)
+    planes = _of_thread.fit(height, width)
+    guides, source, target, pitch = planes.guides, planes.light, planes.other, planes.pitch
     launch(
         lay_in_planes,
         height * width,
@@ -315,23 +359,22 @@ def filter_sixteen_pixels(light: DemodulatedLight, gbuffer: GBuffer, footprint: 
             width, footprint, warp_view(gbuffer.coverage), warp_view(gbuffer.depth), warp_view(gbuffer.position_world, wp.vec3),
             warp_view(gbuffer.normal_world, wp.vec3), warp_view(light.diffuse, wp.vec3), warp_view(light.specular, wp.vec3), warp_view(light.variance, wp.vec2),
         ],
-        [warp_array(guides), warp_array(source)],
+        [warp_view(guides), warp_view(source)],
         "cpu",
     )  # fmt: skip
-    target, smooth = torch.zeros_like(source), torch.zeros(2, height, pitch)
-    full = (guides[0, :, PAD : PAD + columns].reshape(height, -1, 16) > 0).any(-1).nonzero()
+    full = (guides[0, :, PAD : pitch - PAD].reshape(height, -1, 16) > 0).any(-1).nonzero()
     groups = warp_array((full[:, 0] * pitch + PAD + 16 * full[:, 1]).int())
-    smooth_array, guide_array = warp_array(smooth.view(-1)), warp_array(guides.view(-1))
+    coverage, guide_array, smooth_array = _flat(guides[:1]), _flat(guides), _flat(planes.smooth)
     for level in range(settings.levels):
+        if level == settings.levels - 1:
+            target = _planes(LIGHT_PLANES, height, pitch)  # what is given away is nobody's to write into
         place = [groups, height, pitch, 1 << level]
-        variance = warp_array(source[6:].view(-1))
-        launch(smooth_variance_simd, len(full), [*place, warp_array(guides[0].view(-1)), variance], [smooth_array], "cpu")
+        launch(smooth_variance_simd, len(full), [*place, coverage, _flat(source[VARIANCE:])], [smooth_array], "cpu")
         sigmas = [settings.sigma_luminance, SIGMA_PLANE, settings.neighbour_variance]
-        inputs = [*place, *sigmas, guide_array, warp_array(source.view(-1)), smooth_array]
-        launch(filter_level_simd, len(full), inputs, [warp_array(target.view(-1))], "cpu")
+        launch(filter_level_simd, len(full), [*place, *sigmas, guide_array, _flat(source), smooth_array], [_flat(target)], "cpu")
         source, target = target, source
     inside = source[:, :, PAD : PAD + width].permute(1, 2, 0)
-    return DemodulatedLight(inside[..., :3], inside[..., 3:6], inside[..., 6:])
+    return DemodulatedLight(inside[..., :3], inside[..., 3:6], inside[..., VARIANCE : VARIANCE + 2])
 
 
 @wp.kernel
@@ -350,13 +393,17 @@ def lay_in_planes(
     guides: wp.array3d[float],
     source: wp.array3d[float],
 ):
-    """Maps as smooth_variance.h wants them; what is not covered stays 0."""
+    """Maps as smooth_variance.h wants them; 0 where nothing is covered."""
     i = first + wp.tid()
     y = i / width
     x = i - y * width
-    if coverage[y, x] <= 0.0:
-        return
     at = x + PAD
+    if coverage[y, x] <= 0.0:
+        for k in range(8):
+            guides[k, y, at] = 0.0
+        for k in range(LIGHT_PLANES):
+            source[k, y, at] = 0.0
+        return
     guides[0, y, at] = coverage[y, x]
     guides[1, y, at] = footprint * depth[y, x]
     for k in range(3):
@@ -364,8 +411,10 @@ def lay_in_planes(
         guides[5 + k, y, at] = normal[y, x][k]
         source[k, y, at] = diffuse[y, x][k]
         source[3 + k, y, at] = specular[y, x][k]
-    source[6, y, at] = variance[y, x][0]
-    source[7, y, at] = variance[y, x][1]
+    source[6, y, at] = luminance_of(diffuse[y, x])
+    source[7, y, at] = luminance_of(specular[y, x])
+    source[VARIANCE, y, at] = variance[y, x][0]
+    source[VARIANCE + 1, y, at] = variance[y, x][1]
 
 
 def denoise_svgf(radiance: Radiance, gbuffer: GBuffer, camera: Camera, settings: FilterSettings | None = None) -> Radiance:
