@@ -62,8 +62,10 @@ class Estimate:
     """SampleSet."""
     rays_a_point: int
     bounces: int
+    order: Tensor | None
+    """(chosen,) int32, the points that are meant; None: all."""
     known: TracedRays | None
-    """What rays met before, of all points; used for those that are still the same."""
+    """What rays met before, of all points, chosen or not; used for those that are still the same."""
     kept: TracedRays | None
     """Where to write down what the rays meet."""
     sums: Any
@@ -107,14 +109,15 @@ class AbstractIntegrator(ABC):
         Args:
             light: EnvironmentLight struct (environment_table.environment_light).
             samples_round: how many estimates of the same settings came before; continues their sequences. (point,) int32 where it differs.
-            memory: of an estimate of the same counts from the same starts: rays that are known are not traced, and it then knows these.
+            memory: of an estimate of the same counts from the same starts: rays that are known are not traced, and it then knows these;
+                where only some points are meant it stays as it is.
             horizon: (face, SECTORS) sines (horizon.Horizons); rays above them are not traced.
             known: what surfaces of the tracer's mesh send, read where a ray meets one; only with one bounce.
-            order: (chosen,) int32, the points that are meant, without a memory; None: all, one after the other. The others stay 0, or
+            order: (chosen,) int32, the points that are meant; None: all, one after the other. The others stay 0, or
             onto: what is known of all points so far; the light of those that are meant is written into it.
             pool_rounds: (point,) int32, the rounds whose pools samples choose from (environment_pool.py); None: their own.
         """
-        assert (known is None or settings.bounces == 1) and (order is None or memory is None)
+        assert known is None or settings.bounces == 1
         device, rays_a_point = points.normal_world.device, settings.counts.total
         point_count = len(points.pixel) if order is None else len(order)
         result = _no_light(len(points.pixel), settings.split_indirect, device) if onto is None else onto
@@ -132,8 +135,9 @@ class AbstractIntegrator(ABC):
             sample_set(settings.counts, settings.seed, first_round, settings.by_material, settings.candidates),
             rays_a_point,
             settings.bounces,
-            usable_rays(memory, ray_count, finds_surfaces),
-            empty_rays(memory, ray_count, finds_surfaces, device),
+            order,
+            usable_rays(memory, len(points.pixel) * rays_a_point, finds_surfaces),
+            empty_rays(memory, ray_count, finds_surfaces, device) if order is None else None,
             light_sums(result),
         )
         self.load_kernels()
@@ -145,7 +149,7 @@ class AbstractIntegrator(ABC):
             max(1, self.rays_a_slice() // rays_a_point),
             max(1, MIN_RAYS_A_SLICE // rays_a_point) if shrinking else None,
         )
-        if memory is not None:
+        if memory is not None and order is None:
             memory.rays = estimate.kept
         return result
 

@@ -164,16 +164,18 @@ for (int lane = 0; lane < lanes; ++lane) {
     bool met = false, is_known = false;
     int triangle = -1;
     float weights[2] = {0.0f, 0.0f};
+    // Known of all points, though only some be meant.
+    const long number_known = (long)point_lane[lane] * count + number % count;
     if (traced && has_known) {
-        const float* const before = (const float*)known.direction.data + 3 * number;
+        const float* const before = (const float*)known.direction.data + 3 * number_known;
         is_known = before[0] == along[0] && before[1] == along[1] && before[2] == along[2];
     }
     if (is_known) {
-        met = known.hit.data[number];
+        met = known.hit.data[number_known];
         if (met && finds_surfaces) {
-            triangle = known.face.data[number];
-            weights[0] = ((const float*)known.barycentric.data)[2 * number];
-            weights[1] = ((const float*)known.barycentric.data)[2 * number + 1];
+            triangle = known.face.data[number_known];
+            weights[0] = ((const float*)known.barycentric.data)[2 * number_known];
+            weights[1] = ((const float*)known.barycentric.data)[2 * number_known + 1];
         }
     } else if (traced && !finds_surfaces) {
         scratch.counts.data[2]++;

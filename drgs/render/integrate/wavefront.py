@@ -32,7 +32,7 @@ from drgs.render.integrate.sample_rays import (
 from drgs.render.integrate.sum_samples import RaySamples, ray_samples, sum_samples
 from drgs.render.integrate.trace_indirect import add_contributions, paths_of_hits, read_known_light, scatter_hits, trace_indirect
 from drgs.render.intersect.mesh_surface import face_limit, far_along
-from drgs.render.intersect.ray_memory import note_directions, trace_batch
+from drgs.render.intersect.ray_memory import note_directions, rays_of_points, trace_batch
 from drgs.warp_torch import load_kernel, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -128,7 +128,10 @@ class WavefrontIntegrator(AbstractIntegrator):
             outputs=[warp_array(origin, wp.vec3), warp_array(direction, wp.vec3), rays],
             device=self._device(),
         )
-        hits, traced = trace_batch(origin, direction, first_ray, self.tracer, estimate.bounces > 0, estimate.known, estimate.kept)
+        known, first_known = estimate.known, first_ray
+        if known is not None and estimate.order is not None:
+            known, first_known = rays_of_points(known, estimate.order[first:last], estimate.rays_a_point), 0
+        hits, traced = trace_batch(origin, direction, first_known, self.tracer, estimate.bounces > 0, known, estimate.kept)
         rays.blocked = warp_array(hits.hit)
         if estimate.bounces > 0:
             indirect, further = trace_indirect(estimate, paths_of_hits(hits, direction), count, first, self.tracer)

@@ -2,7 +2,8 @@
 
 Between two frames of an unmoved camera and shape most first rays stay as they are: a new environment changes only those sampled from it, a
 new albedo hardly any. The comparison is exact, so nothing need be known about what an edit did to the samples.
-Only a frame's first pass is remembered: it is the one that somebody waits for. While the camera or the shape moves nothing is, for the next frame's
+Only a frame's first pass is remembered: it is the one that somebody waits for; the picture shown before it, of every other pixel
+(progressive/edited_picture.py), reads what it knows. While the camera or the shape moves nothing is, for the next frame's
 rays start elsewhere: the first edit after a move traces all its rays.
 """
 
@@ -97,6 +98,13 @@ def usable_rays(memory: RayMemory | None, count: int, surfaces: bool) -> TracedR
     """The remembered rays, where they are those of an estimate of this many."""
     rays = None if memory is None else memory.rays
     return None if rays is None or len(rays.hit) != count or (surfaces and rays.face is None) else rays
+
+
+def rays_of_points(rays: TracedRays, points: Tensor, rays_a_point: int) -> TracedRays:
+    """Those of the points (point,), one point's after another's, of rays that are remembered for all of them."""
+    chosen = (points.long()[:, None] * rays_a_point + torch.arange(rays_a_point, device=points.device)).flatten()
+    face, barycentric = (None if values is None else values[chosen] for values in (rays.face, rays.barycentric))
+    return TracedRays(rays.direction_world[chosen], rays.hit[chosen], face, barycentric)
 
 
 def trace_batch(

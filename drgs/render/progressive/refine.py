@@ -140,7 +140,8 @@ def _show_edit(state: FrameState) -> FrameState:
     edited = EditedPoints(primary, state.window, camera)
     found_out = time.perf_counter()
     integrator, light = choose_integrator(state.traced.tracer.swift_if_made), state.traced.environment_light
-    found = integrator.shade(primary.points, primary.starts, light, how, 0, None, _horizon(state), order=edited.order)
+    known, horizon = state.first_rays, _horizon(state)
+    found = integrator.shade(primary.points, primary.starts, light, how, 0, known, horizon, order=edited.order)
     shaded = time.perf_counter()
     picture = edited.picture(found, state.rays_a_pass)
     seconds = {"trace_primary": found_out - started, "shade": shaded - found_out, "history": time.perf_counter() - shaded}

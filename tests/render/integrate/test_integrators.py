@@ -1,5 +1,6 @@
 """The integrators against closed forms, the float64 references, each other, and themselves under other strategies."""
 
+import dataclasses
 import math
 
 import pytest
@@ -193,6 +194,29 @@ def test_remembered_rays_bring_what_they_brought(bounces: int, integrator: type)
     assert memory.rays is not None
     memory.rays.hit.fill_(False)
     assert float(estimate().visibility.min()) == 1 > float(first.visibility.min())
+
+
+@INTEGRATORS
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_some_of_the_points_know_what_all_of_them_met(bounces: int, integrator: type) -> None:
+    """In another order, of another roughness; and what is remembered stays."""
+    mesh, memory = two_spheres(metallic=0.3), RayMemory()
+    points, starts = points_on(mesh), RayStarts(mesh.vertices + 1e-3 * mesh.normals, mesh.normals)
+    light, chosen = environment_light(build_environment_table(sunny_sky())), integrator(EmbreeTracer(mesh))
+    how = IntegratorSettings(SampleCounts(3, 2, 2), bounces, 3, by_material=True)
+    chosen.shade(points, starts, light, how, memory=memory)
+    rays = memory.rays
+    assert rays is not None
+    rougher = dataclasses.replace(points, roughness=(points.roughness + 0.1).clamp(max=1))
+    order = torch.randperm(len(mesh.vertices), generator=torch.Generator().manual_seed(1))[:200].int()
+    alone, knowing = (chosen.shade(rougher, starts, light, how, memory=known, order=order) for known in (None, memory))
+    for name in MAPS:
+        assert torch.equal(getattr(alone, name), getattr(knowing, name)), name
+    assert memory.rays is rays
+    # The other way round: answers that are wrong are believed.
+    rays.hit.fill_(False)
+    believing = chosen.shade(points, starts, light, how, memory=memory, order=order)
+    assert float(believing.visibility[order.long()].min()) == 1 > float(alone.visibility[order.long()].min())
 
 
 @INTEGRATORS
