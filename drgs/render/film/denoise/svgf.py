@@ -194,6 +194,8 @@ PAD = wp.constant(32)
 """Empty pixels at both ends of a row: as far as the widest kernel reaches."""
 VARIANCE, LIGHT_PLANES = wp.constant(8), wp.constant(10)
 """Of light in planes: diffuse and specular, the luminance of both, the variance of both."""
+MOST_KEPT_PIXELS = 1 << 19
+"""Of pictures whose planes, 63 MB then, are kept for the next one."""
 PLANE_ROUND, PLANE_SKEW = 1024, 80
 """Planes begin a whole number of 4096 bytes and five cache lines after each other: a round reads eighteen of them at once, and where they are all
 as far from a multiple of 4096 bytes, as of windows of 384 rows of 256 pixels, they drive each other out of the first cache."""
@@ -314,31 +316,51 @@ def _light_pixels(light: DemodulatedLight) -> Any:
     return pixels
 
 
+class _Planes:
+    """Final. What pictures of one size are filtered in."""
+
+    def __init__(self, height: int, width: int, memory: Tensor | None = None) -> None:
+        """
+        Args:
+            memory: taken, and set to 0, where there is enough of it.
+        """
+        # An odd number of cache lines, so that rows lie in different parts of the cache, as planes do.
+        self.pitch = 16 * (-(-width // 16) | 1) + 2 * PAD
+        self.apart = -(-height * self.pitch // PLANE_ROUND) * PLANE_ROUND + PLANE_SKEW
+        count = 8 + 2 + 2 * int(LIGHT_PLANES)
+        if memory is None or len(memory) < count * self.apart:
+            memory = torch.zeros(count * self.apart)
+        else:
+            memory[: count * self.apart].zero_()
+        self.memory = memory
+        every = memory[: count * self.apart].view(count, self.apart)[:, : height * self.pitch].view(count, height, self.pitch)
+        self.guides, self.smooth, self.light, self.other = every.split([8, 2, LIGHT_PLANES, LIGHT_PLANES])
+
+    def new_light(self) -> Tensor:
+        """(LIGHT_PLANES, height, pitch) zeros of their own."""
+        height, pitch = self.light.shape[1:]
+        return torch.zeros(LIGHT_PLANES, self.apart)[:, : height * pitch].view(LIGHT_PLANES, height, pitch)
+
+
 class _PlanesOfThread(threading.local):
     """Final. Each thread's own, kept from picture to picture: memory asked for anew costs more than a round reads."""
 
     def __init__(self) -> None:
-        self._shape = (0, 0)
+        self._shape, self._planes = (0, 0), _Planes(0, 0)
 
-    def fit(self, height: int, width: int) -> "_PlanesOfThread":
-        """For pictures of this size; guides and light still hold another picture's, but 0 at both ends of each row; the other light is 0."""
-        if self._shape != (height, width):
-            # An odd number of cache lines, so that rows lie in different parts of the cache, as planes do.
-            self._shape, self.pitch = (height, width), 16 * (-(-width // 16) | 1) + 2 * PAD
-            self.guides, self.smooth = _planes(8, height, self.pitch), _planes(2, height, self.pitch)
-            self.light, self.other = (_planes(LIGHT_PLANES, height, self.pitch) for _ in range(2))
-        else:
-            self.other.zero_()
-        return self
+    def fit(self, height: int, width: int) -> _Planes:
+        """For a picture of this size. Guides and light may still hold another picture's, but for both ends of each row, which are 0, as the other
+        light is. Planes of large pictures are not kept."""
+        if height * width > MOST_KEPT_PIXELS:
+            return _Planes(height, width)
+        if self._shape == (height, width):
+            self._planes.other.zero_()
+            return self._planes
+        self._shape, self._planes = (height, width), _Planes(height, width, self._planes.memory)
+        return self._planes
 
 
 _of_thread = _PlanesOfThread()
-
-
-def _planes(count: int, height: int, pitch: int) -> Tensor:
-    """(count, height, pitch) zeros, as far apart as filter_level.h and smooth_variance.h want them."""
-    apart = -(-height * pitch // PLANE_ROUND) * PLANE_ROUND + PLANE_SKEW
-    return torch.zeros(count, apart)[:, : height * pitch].view(count, height, pitch)
 
 
 def _flat(planes: Tensor) -> wp.array:
@@ -367,7 +389,7 @@ def filter_sixteen_pixels(light: DemodulatedLight, gbuffer: GBuffer, footprint: 
     coverage, guide_array, smooth_array = _flat(guides[:1]), _flat(guides), _flat(planes.smooth)
     for level in range(settings.levels):
         if level == settings.levels - 1:
-            target = _planes(LIGHT_PLANES, height, pitch)  # what is given away is nobody's to write into
+            target = planes.new_light()  # what is given away is nobody's to write into
         place = [groups, height, pitch, 1 << level]
         launch(smooth_variance_simd, len(full), [*place, coverage, _flat(source[VARIANCE:])], [smooth_array], "cpu")
         sigmas = [settings.sigma_luminance, SIGMA_PLANE, settings.neighbour_variance]

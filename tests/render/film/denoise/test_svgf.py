@@ -63,20 +63,24 @@ def test_sixteen_pixels_at_once_are_the_pixels_one_by_one(size: int, far: float)
         torch.testing.assert_close(getattr(one_by_one, name)[covered], getattr(at_once, name)[covered], atol=1e-5, rtol=1e-4)
 
 
-def test_a_picture_knows_nothing_of_the_one_before_it() -> None:
-    """Planes are kept from picture to picture, but for those that are given away."""
+@pytest.mark.parametrize("most_kept", [1 << 19, 0])
+def test_a_picture_knows_nothing_of_the_one_before_it(most_kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planes are kept from picture to picture, of the same size and of others, but for those that are given away."""
+    monkeypatch.setattr("drgs.render.film.denoise.svgf.MOST_KEPT_PIXELS", most_kept)
     gbuffer, footprint, settings = trace_primary(sphere_mesh(3), CAMERA), 1 / float(CAMERA.intrinsics[0, 0]), FilterSettings(3)
     size = tuple(gbuffer.coverage.shape)
     light = DemodulatedLight(torch.rand(*size, 3), torch.rand(*size, 3), 0.1 * torch.rand(*size, 2))
-    everywhere = dataclasses.replace(gbuffer, coverage=torch.ones(size), depth=torch.ones(size))
-    nonsense = DemodulatedLight(*(torch.full_like(values, torch.nan) for values in vars(light).values()))
     first = filter_sixteen_pixels(light, gbuffer, footprint, settings)
     kept = first.diffuse.clone()
-    filter_sixteen_pixels(nonsense, everywhere, footprint, settings)
-    again = filter_sixteen_pixels(light, gbuffer, footprint, settings)
-    assert torch.equal(first.diffuse, kept)
-    for name in ("diffuse", "specular", "variance"):
-        assert torch.equal(getattr(first, name), getattr(again, name))
+    for narrower in (0, 11):
+        inside = {name: values[:, narrower:].contiguous() for name, values in vars(gbuffer).items()}
+        inside["coverage"] = torch.ones_like(inside["coverage"])
+        nonsense = DemodulatedLight(*(torch.full_like(values[:, narrower:], torch.nan) for values in vars(light).values()))
+        filter_sixteen_pixels(nonsense, GBuffer(**inside), footprint, settings)
+        again = filter_sixteen_pixels(light, gbuffer, footprint, settings)
+        assert torch.equal(first.diffuse, kept)
+        for name in ("diffuse", "specular", "variance"):
+            assert torch.equal(getattr(first, name), getattr(again, name))
 
 
 def test_independent_noise_falls_and_the_mean_stays() -> None:
