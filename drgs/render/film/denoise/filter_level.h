@@ -1,9 +1,9 @@
-// filter_level of denoise.py for 16 pixels of a row at once, CPU only. Body of a Warp native function; denoise.py puts simd_vector.h and
+// filter_level of svgf.py for 16 pixels of a row at once, CPU only. Body of a Warp native function; svgf.py puts simd_vector.h, planes.h and
 // the constants before it. A test keeps both equal. The maps lie as in smooth_variance.h.
 //
 // in   at, guides (8 planes: coverage, footprint, position, normal), source (10: diffuse, specular, luminance of both, variance), smooth (2)
 // out  target (10, as source)
-const long plane = ((long)height * pitch + PLANE_ROUND - 1) / PLANE_ROUND * PLANE_ROUND + PLANE_SKEW;
+const long plane = planes_apart(height, pitch);
 const float* const guide = guides.data;
 const float* const from = source.data;
 const float* const soft = smooth.data;

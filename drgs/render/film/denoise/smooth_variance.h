@@ -1,11 +1,11 @@
-// smooth_variance of denoise.py for 16 pixels of a row at once, CPU only. Body of a Warp native function; denoise.py puts simd_vector.h
+// smooth_variance of svgf.py for 16 pixels of a row at once, CPU only. Body of a Warp native function; svgf.py puts simd_vector.h, planes.h
 // before it. A test keeps both equal.
 //
 // Maps are planes of `height` rows of `pitch` pixels with at least 2 * step empty (coverage 0) pixels at both ends of each row.
 // in   at (first pixel of the group), coverage, variance (2 planes)
 // out  smooth (2 planes)
 const float* const cover = coverage.data;
-const long plane = ((long)height * pitch + PLANE_ROUND - 1) / PLANE_ROUND * PLANE_ROUND + PLANE_SKEW;
+const long plane = planes_apart(height, pitch);
 const int y = at / pitch;
 v16 total[2] = {v16(0.0f), v16(0.0f)}, weights(0.0f);
 for (int dy = -2; dy <= 2; ++dy) {

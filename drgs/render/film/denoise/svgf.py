@@ -10,17 +10,16 @@ Source: Schied et al. 2017 (weights, variance update); Dammertz et al. 2010 (ker
 tangent plane instead of depth gradients, which splats make noisy. Twin: drgs/reference/denoise.py.
 """
 
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
-from torch import Tensor
 
 from drgs.maths.constants import LUMINANCE_BLUE, LUMINANCE_GREEN, LUMINANCE_RED
 from drgs.render.color_warp import luminance_of
+from drgs.render.film.denoise.planes import LIGHT_PLANES, PAD, PLANES, PLANES_APART, VARIANCE, flat, planes_for
 from drgs.render.native_source import native_source
 from drgs.render.progressive.demodulate_albedo import demodulate_albedo, remodulate_albedo
 from drgs.render.records import DemodulatedLight, GBuffer, Radiance
@@ -190,21 +189,7 @@ def filter_level(
     )
 
 
-PAD = wp.constant(32)
-"""Empty pixels at both ends of a row: as far as the widest kernel reaches."""
-VARIANCE, LIGHT_PLANES = wp.constant(8), wp.constant(10)
-"""Of light in planes: diffuse and specular, the luminance of both, the variance of both."""
-MOST_KEPT_PIXELS = 1 << 19
-"""Of pictures whose planes, 63 MB then, are kept for the next one."""
-PLANE_ROUND, PLANE_SKEW = 1024, 80
-"""Planes begin a whole number of 4096 bytes and five cache lines after each other: a round reads eighteen of them at once, and where they are all
-as far from a multiple of 4096 bytes, as of windows of 384 rows of 256 pixels, they drive each other out of the first cache."""
-
-
-PLANES_APART = {"PLANE_ROUND": PLANE_ROUND, "PLANE_SKEW": PLANE_SKEW}
-
-
-@wp.func_native(native_source(Path(__file__).with_name("smooth_variance.h"), constants=PLANES_APART))
+@wp.func_native(native_source(Path(__file__).with_name("smooth_variance.h"), PLANES, constants=PLANES_APART))
 def smooth_sixteen(
     at: int, height: int, pitch: int, step: int, coverage: wp.array[float], variance: wp.array[float], smooth: wp.array[float]
 ): ...  # fmt: skip
@@ -215,7 +200,9 @@ LUMINANCE_WEIGHTS = {"LUMINANCE_RED": LUMINANCE_RED, "LUMINANCE_GREEN": LUMINANC
 
 @wp.func_native(
     native_source(
-        Path(__file__).with_name("filter_level.h"), constants={"NORMAL_POWER": int(NORMAL_POWER), **LUMINANCE_WEIGHTS, **PLANES_APART}
+        Path(__file__).with_name("filter_level.h"),
+        PLANES,
+        constants={"NORMAL_POWER": int(NORMAL_POWER), **LUMINANCE_WEIGHTS, **PLANES_APART},
     )
 )
 def filter_sixteen(
@@ -316,63 +303,10 @@ def _light_pixels(light: DemodulatedLight) -> Any:
     return pixels
 
 
-class _Planes:
-    """Final. What pictures of one size are filtered in."""
-
-    def __init__(self, height: int, width: int, memory: Tensor | None = None) -> None:
-        """
-        Args:
-            memory: taken, and set to 0, where there is enough of it.
-        """
-        # An odd number of cache lines, so that rows lie in different parts of the cache, as planes do.
-        self.pitch = 16 * (-(-width // 16) | 1) + 2 * PAD
-        self.apart = -(-height * self.pitch // PLANE_ROUND) * PLANE_ROUND + PLANE_SKEW
-        count = 8 + 2 + 2 * int(LIGHT_PLANES)
-        if memory is None or len(memory) < count * self.apart:
-            memory = torch.zeros(count * self.apart)
-        else:
-            memory[: count * self.apart].zero_()
-        self.memory = memory
-        every = memory[: count * self.apart].view(count, self.apart)[:, : height * self.pitch].view(count, height, self.pitch)
-        self.guides, self.smooth, self.light, self.other = every.split([8, 2, LIGHT_PLANES, LIGHT_PLANES])
-
-    def new_light(self) -> Tensor:
-        """(LIGHT_PLANES, height, pitch) zeros of their own."""
-        height, pitch = self.light.shape[1:]
-        return torch.zeros(LIGHT_PLANES, self.apart)[:, : height * pitch].view(LIGHT_PLANES, height, pitch)
-
-
-class _PlanesOfThread(threading.local):
-    """Final. Each thread's own, kept from picture to picture: memory asked for anew costs more than a round reads."""
-
-    def __init__(self) -> None:
-        self._shape, self._planes = (0, 0), _Planes(0, 0)
-
-    def fit(self, height: int, width: int) -> _Planes:
-        """For a picture of this size. Guides and light may still hold another picture's, but for both ends of each row, which are 0, as the other
-        light is. Planes of large pictures are not kept."""
-        if height * width > MOST_KEPT_PIXELS:
-            return _Planes(height, width)
-        if self._shape == (height, width):
-            self._planes.other.zero_()
-            return self._planes
-        self._shape, self._planes = (height, width), _Planes(height, width, self._planes.memory)
-        return self._planes
-
-
-_of_thread = _PlanesOfThread()
-
-
-def _flat(planes: Tensor) -> wp.array:
-    """From the first number of the first plane to the last of the last."""
-    count, size, apart = len(planes), planes[0].numel(), planes.stride(0)
-    return warp_array(planes.as_strided(((count - 1) * apart + size,), (1,)))
-
-
 def filter_sixteen_pixels(light: DemodulatedLight, gbuffer: GBuffer, footprint: float, settings: FilterSettings) -> DemodulatedLight:
     """filter_pixels on the CPU, sixteen at once; 0 where nothing is covered."""
     height, width = gbuffer.coverage.shape
-    planes = _of_thread.fit(height, width)
+    planes = planes_for(height, width)
     guides, source, target, pitch = planes.guides, planes.light, planes.other, planes.pitch
     launch(
         lay_in_planes,
@@ -386,14 +320,14 @@ def filter_sixteen_pixels(light: DemodulatedLight, gbuffer: GBuffer, footprint: 
     )  # fmt: skip
     full = (guides[0, :, PAD : pitch - PAD].reshape(height, -1, 16) > 0).any(-1).nonzero()
     groups = warp_array((full[:, 0] * pitch + PAD + 16 * full[:, 1]).int())
-    coverage, guide_array, smooth_array = _flat(guides[:1]), _flat(guides), _flat(planes.smooth)
+    coverage, guide_array, smooth_array = flat(guides[:1]), flat(guides), flat(planes.smooth)
     for level in range(settings.levels):
         if level == settings.levels - 1:
             target = planes.new_light()  # what is given away is nobody's to write into
         place = [groups, height, pitch, 1 << level]
-        launch(smooth_variance_simd, len(full), [*place, coverage, _flat(source[VARIANCE:])], [smooth_array], "cpu")
+        launch(smooth_variance_simd, len(full), [*place, coverage, flat(source[VARIANCE:])], [smooth_array], "cpu")
         sigmas = [settings.sigma_luminance, SIGMA_PLANE, settings.neighbour_variance]
-        launch(filter_level_simd, len(full), [*place, *sigmas, guide_array, _flat(source), smooth_array], [_flat(target)], "cpu")
+        launch(filter_level_simd, len(full), [*place, *sigmas, guide_array, flat(source), smooth_array], [flat(target)], "cpu")
         source, target = target, source
     inside = source[:, :, PAD : PAD + width].permute(1, 2, 0)
     return DemodulatedLight(inside[..., :3], inside[..., 3:6], inside[..., VARIANCE : VARIANCE + 2])

@@ -63,10 +63,10 @@ def test_sixteen_pixels_at_once_are_the_pixels_one_by_one(size: int, far: float)
         torch.testing.assert_close(getattr(one_by_one, name)[covered], getattr(at_once, name)[covered], atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("most_kept", [1 << 19, 0])
+@pytest.mark.parametrize("most_kept", [1 << 24, 0])
 def test_a_picture_knows_nothing_of_the_one_before_it(most_kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Planes are kept from picture to picture, of the same size and of others, but for those that are given away."""
-    monkeypatch.setattr("drgs.render.film.denoise.svgf.MOST_KEPT_PIXELS", most_kept)
+    monkeypatch.setattr("drgs.render.film.denoise.planes.MOST_KEPT_NUMBERS", most_kept)
     gbuffer, footprint, settings = trace_primary(sphere_mesh(3), CAMERA), 1 / float(CAMERA.intrinsics[0, 0]), FilterSettings(3)
     size = tuple(gbuffer.coverage.shape)
     light = DemodulatedLight(torch.rand(*size, 3), torch.rand(*size, 3), 0.1 * torch.rand(*size, 2))
