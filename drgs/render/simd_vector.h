@@ -64,7 +64,7 @@ const auto inverse_sqrt_by_steps = [](v16 a) -> v16 {
     return guess;
 };
 // The same where a processor has it ready; relative error below 1e-4. Roots and quotients take many times as long.
-const auto inverse_sqrt_roughly = [](v16 a) -> v16 {
+const auto inverse_sqrt_roughly = [&](v16 a) -> v16 {  // & for processors that have it not
 #if defined(__AVX512F__)
     return __builtin_ia32_rsqrt14ps512_mask(a, a, -1);
 #else
