@@ -57,7 +57,8 @@ def drive_surfels(
         weights = binding.barycentric[..., None]
         rotation, stretch = _polar(gradients)
         blended = (rotation[corners] * weights[..., None]).sum(1)
-        lengths = torch.linalg.eigvalsh((stretch[corners] * weights[..., None]).sum(1).double()).abs().to(tangents.dtype)  # ascending
+        # On the processor: cuSOLVER (of torch 2.11 with CUDA 13) refuses a batch of two hundred thousand.
+        lengths = torch.linalg.eigvalsh((stretch[corners] * weights[..., None]).sum(1).double().cpu()).abs().to(tangents)  # ascending
         scale = torch.stack([lengths[:, 1], lengths[:, 0]], -1)
         return centers + ((moved - vertices)[corners] * weights).sum(1), blended @ tangents * scale[:, None]
     places, gradient = drive_points(vertices, moved, faces, gradients, binding, centers)

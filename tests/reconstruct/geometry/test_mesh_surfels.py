@@ -9,7 +9,7 @@ import trimesh
 
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians, points_from_binding
-from drgs.reconstruct.geometry.mesh_surfels import EMPTY_OPACITY, SLIVER, face_frames, gathered_opacity, mesh_surfels
+from drgs.reconstruct.geometry.mesh_surfels import EMPTY_OPACITY, SLIVER, face_frames, gathered_opacity, larger_first, mesh_surfels
 from drgs.scene.gaussians import surfel_tangents
 from drgs.scene.mesh import TriangleMesh, vertex_normals
 from tests.reconstruct.surfel_spheres import surfel_sphere
@@ -114,6 +114,27 @@ def test_scales_and_axes_follow_the_triangles_second_moment():
     assert torch.allclose((axes * scales**2) @ axes.T, 8 * moment, atol=1e-5)
     assert torch.allclose(torch.linalg.det(frame.rotation), torch.tensor(1.0), atol=1e-6)
     assert torch.allclose(frame.rotation[0, :, 2], turn[:, 2], atol=1e-6)
+
+
+def test_a_build_has_as_many_faces_as_a_device_can_take(device):
+    corners = torch.rand(220_000, 3, 3, generator=torch.Generator().manual_seed(0))
+    mesh = grey_mesh(corners.reshape(-1, 3), torch.arange(3 * len(corners)).reshape(-1, 3))
+    frames = face_frames(TriangleMesh(**{name: value.to(device) for name, value in mesh.columns.items()}))
+    axes, scales = frames.rotation[:, :, :2].double(), frames.scales.double()
+    centred = (corners - corners.mean(1, keepdim=True)).to(device).double()
+    ample = scales[:, 1] > 2 * SLIVER * scales[:, 0]
+    made = (axes * scales[:, None] ** 2) @ axes.mT
+    torch.testing.assert_close(made[ample], (8 / 12 * centred.mT @ centred)[ample], atol=1e-5, rtol=0)
+
+
+def test_eigenvalues_in_closed_form_are_those_of_a_library():
+    half = torch.randn(1000, 2, 2, generator=torch.Generator().manual_seed(0)).double() * 10 ** torch.linspace(-6, 3, 1000)[:, None, None]
+    half[0], half[1], half[2, 1] = 0, torch.eye(2), 0
+    moment = half @ half.mT
+    values, first = larger_first(moment)
+    torch.testing.assert_close(values.flip(-1), torch.linalg.eigvalsh(moment).clamp(min=0), rtol=1e-9, atol=1e-20)
+    torch.testing.assert_close(first.norm(dim=-1), torch.ones(1000).double())
+    torch.testing.assert_close((moment @ first[..., None])[..., 0], values[:, :1] * first, rtol=1e-9, atol=1e-20)
 
 
 def test_normals_are_the_surfels_where_they_agree_with_the_face_and_the_faces_elsewhere():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import statistics
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -208,9 +209,9 @@ def fitted(
 
 @pytest.mark.slow
 def test_a_grey_sphere_takes_on_the_colours_of_its_photographs(painted_sphere):
-    state, reports = fitted(painted_sphere, short(40))
-    assert [r.iteration for r in reports] == list(range(1, 41))
-    assert reports[-1].psnr > reports[0].psnr + 4.0
+    state, reports = fitted(painted_sphere, short(50))
+    assert [r.iteration for r in reports] == list(range(1, 51))
+    assert statistics.fmean(r.psnr for r in reports[-5:]) > reports[0].psnr + 4.0
     surfels = gaussians_from_materials(state)
     normal = (surfels.centers - torch.tensor(SPHERE_CENTER, dtype=torch.float32)) / SPHERE_RADIUS
     for channel in range(3):  # the paint's red grows with the normal's x, and so on
