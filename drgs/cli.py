@@ -400,7 +400,3 @@ def main() -> None:
     if sys.argv[1:2] != ["serve"]:  # whose processes choose for themselves
         spin_briefly()
     app()
-
-
-if __name__ == "__main__":
-    main()

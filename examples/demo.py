@@ -90,7 +90,7 @@ def free_port(wanted: int) -> int:
 
 def start_service(data: Path, port: int, log: Path) -> subprocess.Popen:
     """`drgs serve` in a process of its own, so that Ctrl-C here reaches it only when we say so."""
-    command = [sys.executable, "-m", "drgs.cli", "serve", "--data", str(data), "--port", str(port)]
+    command = [sys.executable, "-m", "drgs", "serve", "--data", str(data), "--port", str(port)]
     with log.open("w") as output:
         return subprocess.Popen(
             command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True

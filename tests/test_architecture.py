@@ -25,6 +25,7 @@ TOP_FILES = {
     "drgs/__init__.py",
     "drgs/brief_waits.py",
     "drgs/cli.py",
+    "drgs/__main__.py",
     "drgs/cli_answers.py",
     "drgs/cli_endings.py",
     "drgs/cli_options.py",

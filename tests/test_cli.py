@@ -18,9 +18,7 @@ COMMANDS = ("pose", "build", "render", "import", "export", "simulate", "eval", "
 
 
 def drgs(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "drgs.cli", *map(str, arguments)], capture_output=True, text=True, timeout=PATIENCE_SECONDS
-    )
+    return subprocess.run([sys.executable, "-m", "drgs", *map(str, arguments)], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
 
 
 def drgs_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

@@ -107,4 +107,4 @@ def cli_command(dataset: Path, asset: Path, preset: str, seed: int = 0, device: 
     """
     resuming = ["--resume"] if resume and Path(f"{asset}.build").is_dir() else []
     options = ["--preset", preset, "--seed", str(seed), "--device", device, "--json-progress", *resuming]
-    return ["-m", "drgs.cli", "build", str(dataset), str(asset), *options]
+    return ["-m", "drgs", "build", str(dataset), str(asset), *options]

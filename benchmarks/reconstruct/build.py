@@ -43,7 +43,7 @@ def measure_build(dataset: Path, asset: Path, preset: str, device: str) -> dict:
 
 def evaluate(asset: Path, dataset: Path, renders: Path, samples_per_pixel: int, device: str) -> dict:
     """The figures of `drgs eval`."""
-    command = [sys.executable, "-m", "drgs.cli", "eval", str(asset), str(dataset), "--out", str(renders), "--spp", str(samples_per_pixel)]
+    command = [sys.executable, "-m", "drgs", "eval", str(asset), str(dataset), "--out", str(renders), "--spp", str(samples_per_pixel)]
     done = subprocess.run([*command, "--device", device, "--json"], stdout=subprocess.PIPE, text=True)
     if done.returncode != 0:
         raise ValueError(f"drgs eval ended with exit code {done.returncode}")

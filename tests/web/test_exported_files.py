@@ -192,7 +192,7 @@ def test_the_command_has_splat_transform_write_what_it_reads_back(run_node, tmp_
     asset = ball_asset()
     save_asset(asset, tmp_path / "asset")
     said = subprocess.run(
-        [sys.executable, "-m", "drgs.cli", "export", str(tmp_path / "asset"), str(tmp_path / name)],
+        [sys.executable, "-m", "drgs", "export", str(tmp_path / "asset"), str(tmp_path / name)],
         check=True, capture_output=True, text=True, timeout=PATIENCE_SECONDS, cwd=ROOT,
     ).stderr  # fmt: skip
     assert f"Wrote {tmp_path / name}" in said and "materials left out" in said

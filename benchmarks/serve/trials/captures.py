@@ -85,7 +85,7 @@ def trials() -> Iterator[Trial]:
 
 def _doctor(folder: str) -> tuple[str | None, dict]:
     """What is wrong with its answer, and the report."""
-    done = subprocess.run([sys.executable, "-m", "drgs.cli", "doctor", folder, "--json"], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([sys.executable, "-m", "drgs", "doctor", folder, "--json"], capture_output=True, text=True, timeout=300)
     if "Traceback" in done.stderr:
         return f"a stack: {done.stderr.strip().splitlines()[-1][:200]}", {}
     try:

@@ -90,7 +90,7 @@ class Site:
 
     def command(self) -> list[str]:
         worker = "--worker" if self.worker else "--no-worker"
-        return [sys.executable, "-m", "drgs.cli", "serve", "--data", str(self.data), "--port", "0", worker]
+        return [sys.executable, "-m", "drgs", "serve", "--data", str(self.data), "--port", "0", worker]
 
     def launch(self) -> subprocess.Popen:
         """The process, which may not have come up yet."""

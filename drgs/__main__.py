@@ -1,0 +1,5 @@
+"""`python -m drgs`: the command where it is not on the path."""
+
+from drgs.cli import main
+
+main()
