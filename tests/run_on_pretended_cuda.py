@@ -1,4 +1,4 @@
-"""A build, pictures, edits and matter on a device that is pretended (pretended_cuda.py); ends with 0 if all went through.
+"""A build, pictures, edits, matter and what a server shows on a device that is pretended (pretended_cuda.py); ends with 0 if all went through.
 
     python -m tests.run_on_pretended_cuda FOLDER
 
@@ -9,7 +9,7 @@ import json
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 import warp as wp
@@ -26,6 +26,8 @@ from drgs.render.progressive.start_frame import start_frame
 from drgs.render.records import Frame, RenderSettings
 from drgs.scene.asset import load_asset
 from drgs.scene.edits import parse_edits
+from drgs_server.live.messages import CameraMessage, Channel, Settings
+from drgs_server.render.drgs_renderer import DrgsRenderer
 from tests import pretended_cuda
 from tests.reconstruct.test_build_asset import TINY
 from tests.reconstruct.tiny_capture import FEW_VIEWS, sphere_views, write_nerf_synthetic
@@ -63,6 +65,25 @@ def picture(folder: Path, device: torch.device) -> Frame:
     return resolve_frame(refine_frame(start_frame(pose_scene(asset, parse_edits(EDITS)), next(orbit(asset, SIDE)), settings), 2))
 
 
+def show_as_a_server(folder: Path) -> None:
+    """Every channel of the edited asset, a pick, a still, and all channels as layers of one file."""
+    upright = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
+    camera = CameraMessage(type="camera", world_from_camera=upright, fov_y_degrees=40, width=SIDE, height=SIDE)
+    pose = DrgsRenderer("cuda").load(folder, folder).pose(parse_edits(EDITS), None)
+    seen = None
+    for channel in get_args(Channel):
+        seen = pose.begin(camera, Settings(channel=channel, spp_target=4), SIDE, SIDE, seen)
+        seen.refine()
+        assert seen.resolve().shape == (SIDE, SIDE, 4)
+        if channel == "final" and seen.pick(0.5, 0.5) is None:
+            raise AssertionError("nothing was picked in the middle of the picture")
+    graded = Settings(spp_target=4, background="blurred", tone_curve="agx", exposure_stops=1)
+    for work in (pose.still(camera, graded, SIDE, SIDE, linear=False), pose.layers(camera, Settings(spp_target=4), SIDE, SIDE)):
+        while work.work():
+            pass
+        work.picture()
+
+
 def main(folder: Path) -> None:
     pretended_cuda.enter()
     check_that_mixing_is_refused()
@@ -80,6 +101,7 @@ def main(folder: Path) -> None:
     asset = load_asset(folder / "asset", pretended_cuda.CUDA)
     moving(asset, SIDE, 8, 3, None)
     moving(asset, SIDE, 8, 1, "gaussians")
+    show_as_a_server(folder / "asset")
     simulate(["--particles", "64", "--frames", "1", "--device", "cuda", "--json"])
     carry(["--surfels", "200", "--particles", "64", "--repeats", "1", "--device", "cuda", "--json"])
     there, here = picture(folder / "asset", pretended_cuda.CUDA), picture(folder / "asset", pretended_cuda.CPU)

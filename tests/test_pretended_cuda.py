@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.mark.slow
-def test_a_build_pictures_edits_and_matter_go_through_on_a_pretended_gpu(tmp_path: Path) -> None:
+def test_a_build_pictures_edits_matter_and_a_servers_channels_go_through_on_a_pretended_gpu(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-m", "tests.run_on_pretended_cuda", tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     launched = json.loads(done.stdout.splitlines()[-1])["launched"]

@@ -33,6 +33,7 @@ def draw_surfels(surfels: PosedSurfels, camera: Camera, band: slice | None = Non
         band: rows of the image, from a tile's edge to a tile's edge; None: all.
     """
     count, device = len(surfels.centers), surfels.centers.device
+    camera = camera.to(device)
     normals = torch.nn.functional.normalize(torch.linalg.cross(surfels.tangents[..., 0], surfels.tangents[..., 1]), dim=-1, eps=1e-20)
     towards = torch.nn.functional.normalize(surfels.centers - camera.center_world, dim=-1)
     facing = (normals * towards).sum(-1, keepdim=True).abs()
