@@ -67,7 +67,7 @@ def picture(folder: Path, device: torch.device) -> Frame:
 
 def show_as_a_server(folder: Path) -> None:
     """Every channel of the edited asset, a pick, a still, and all channels as layers of one file."""
-    upright = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
+    upright = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, -4.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     camera = CameraMessage(type="camera", world_from_camera=upright, fov_y_degrees=40, width=SIDE, height=SIDE)
     pose = DrgsRenderer("cuda").load(folder, folder).pose(parse_edits(EDITS), None)
     seen = None
