@@ -28,6 +28,8 @@ from drgs.cli_options import (
     Json,
     LightFrame,
     LightKind,
+    MaskKind,
+    Masks,
     Matching,
     Preset,
     Primary,
@@ -96,6 +98,7 @@ def pose(
         print("\n".join(summary_lines(found)))
 
 
+# Many arguments because each is an option of the command.
 @app.command()
 def build(
     dataset: DatasetPath,
@@ -105,6 +108,7 @@ def build(
         BindingKind, typer.Option(help="Where Gaussians lie: as fitted, or rebuilt on the faces of the mesh.")
     ] = BindingKind.particles,
     light: LightFrame = LightKind.auto,
+    masks: Masks = MaskKind.auto,
     up: UpDirection = (0.0, 0.0, 1.0),
     box: BoxCorners = None,
     strokes: StrokesPath = None,
@@ -127,6 +131,7 @@ def build(
         seed=seed,
         resume=resume,
         light=light.value,
+        masks=masks.value,
         up=up,
         box=None if box is None else BuildBox(box[:3], box[3:]),
         strokes=() if strokes is None else read_strokes(strokes),
@@ -137,6 +142,7 @@ def build(
         except BuildStopped:
             chosen = "" if binding == BindingKind.particles else f" --binding {binding.value}"
             chosen += "" if light == LightKind.auto else f" --light {light.value}"
+            chosen += "" if masks == MaskKind.auto else f" --masks {masks.value}"
             chosen += "" if up == (0.0, 0.0, 1.0) else f" --up {up[0]:g} {up[1]:g} {up[2]:g}"
             chosen += "" if box is None else f" --box {' '.join(f'{value:g}' for value in box)}"
             chosen += "" if strokes is None else f" --strokes {strokes}"

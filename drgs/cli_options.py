@@ -31,6 +31,11 @@ class LightKind(StrEnum):
     camera = "camera"
 
 
+class MaskKind(StrEnum):
+    auto = "auto"
+    given = "given"
+
+
 class DeviceName(StrEnum):
     auto = "auto"
     cpu = "cpu"
@@ -79,6 +84,10 @@ DataFolder = Annotated[
 LightFrame = Annotated[
     LightKind,
     typer.Option(help="What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."),
+]
+Masks = Annotated[
+    MaskKind,
+    typer.Option(help="Where masks end: where the photographs show the object to end, if that is elsewhere (auto), or as given."),
 ]
 UpDirection = Annotated[
     tuple[float, float, float],

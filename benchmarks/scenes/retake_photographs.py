@@ -1,5 +1,6 @@
 """A capture's photographs as another camera would have taken them, and others have cut them out and placed them: through a lens that bends, in several
-sizes, with exposures that differ; with grain and artefacts of JPEG, masks that are a pixel or two off, and cameras a fraction of a pixel off.
+sizes, with exposures that differ; with grain and artefacts of JPEG, masks that are a pixel or two off (beside whole photographs, or cut out by them), and
+cameras a fraction of a pixel off.
 
 In: a scene as the benchmark lays it out (NeRF-synthetic, cameras by camera_angle_x, RGBA pictures). Out: a folder that builds read, with photographs
 alone; what is built of it is scored against the scene itself. Nothing is drawn: pixels are resampled in linear, premultiplied light.
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.scenes.bench_scene import Array, read_rgba
 from drgs.maths.color_numpy import linear_from_srgb, srgb_from_linear
 
-Way = Literal["lens", "sizes", "exposures", "grain", "masks", "poses"]
+Way = Literal["lens", "sizes", "exposures", "grain", "masks", "cutouts", "poses"]
 WAYS: tuple[Way, ...] = get_args(Way)
 K1, K2 = -0.2, 0.05
 """Of the lens: OpenCV's radial coefficients."""
@@ -62,11 +63,14 @@ def retake_photographs(scene: Path, out: Path, way: Way) -> None:
             light = light * np.append(np.full(3, 2 ** stops[number]), 1.0)
         elif way == "grain":
             light = grainy(light, random)
-        elif way == "masks":
+        elif way in ("masks", "cutouts"):
             light = cut_out_roughly(light, random)
         else:
             more = {"transform_matrix": placed_roughly(np.array(frame["transform_matrix"]), random).tolist()}
-        Image.fromarray(bytes_of(light)).save(out / "train" / f"{name}.png")
+        picture = bytes_of(light)
+        if way == "cutouts":
+            picture[picture[..., 3] == 0] = 0
+        Image.fromarray(picture).save(out / "train" / f"{name}.png")
         frames.append(frame | {"file_path": f"./train/{name}"} | more)
     kept = {key: value for key, value in document.items() if key not in ("w", "h")}
     (out / "transforms_train.json").write_text(json.dumps(kept | {"frames": frames}))
@@ -107,14 +111,15 @@ def grainy(light: Array, random: np.random.Generator) -> Array:
 
 
 def cut_out_roughly(light: Array, random: np.random.Generator) -> Array:
-    """Before a plain room, and cut out by a mask that is MASK_WIDE too wide and MASK_OFF off, so that the room is seen along outlines."""
+    """Before a plain room, with a mask that is MASK_WIDE too wide and MASK_OFF off, so that the room is seen along outlines. Its alpha is near 0 or 1."""
     alpha = light[..., 3:]
     room = np.array([0.3, 0.26, 0.22]) * (0.6 + 0.8 * np.linspace(1, 0, len(light))[:, None, None])
     inside = alpha[..., 0] > 0.5
     distance = distance_transform_edt(inside) - distance_transform_edt(~inside)
     wave = gaussian_filter(random.normal(size=inside.shape), MASK_WAVES / 2)
-    mask = (distance + MASK_WIDE + MASK_OFF * wave / wave.std() > 0)[..., None]
-    return np.concatenate([(light[..., :3] + (1 - alpha) * room) * mask, mask.astype(np.float64)], -1)
+    # What is beyond stays to be seen: its alpha is not zero, but becomes so in eight bits.
+    mask = np.where(distance + MASK_WIDE + MASK_OFF * wave / wave.std() > 0, 1, 1e-4)[..., None]
+    return np.concatenate([(light[..., :3] + (1 - alpha) * room) * mask, mask], -1)
 
 
 def placed_roughly(world_from_camera: Array, random: np.random.Generator) -> Array:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import UInt8
@@ -101,6 +101,8 @@ class BuildSettings:
     resume: bool = False
     light: LightChoice = "auto"
     """What the lamps stood still with while the photographs were taken."""
+    masks: Literal["auto", "given"] = "auto"
+    """Where they end: auto: where the photographs show the object to end (sharpen_masks); given: as the capture or the strokes have it."""
     up: Direction = UP
     """Direction of the capture's world that points up. The asset's world is the capture's, turned so that it is z (turn_up.rotation_to_up)."""
     box: BuildBox | None = None
@@ -171,10 +173,7 @@ def build_stages(
         reporter.report("read", 0.0, "reading the capture")
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
         stop = should_stop or (lambda: False)
-        masked_by = _by_strokes(settings.strokes, reporter, stop) if settings.strokes else None
-        found, views, points = open_capture(
-            capture, preset.image_side, preset.points, settings.seed, settings.up, settings.box, masked_by, preset.hull
-        )
+        found, views, points = _opened(capture, settings, preset, reporter, stop)
         photographs = views
         views = with_gains_of_points(views, points)
         identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views, settings.box)}
@@ -215,6 +214,7 @@ def build_stages(
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
     provenance |= poses | found_by | {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
+    provenance |= {"masks_moved_pixels": round(views.masks_moved, 2)} if views.masks_moved else {}
     provenance["light"] = {key: value for key, value in asdict(light).items() if value is not None}
     asset = replace(asset, provenance=provenance, cameras=views.cameras, light_frame=light.frame)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
@@ -238,6 +238,15 @@ def _posed(
     found = pose_source(dataset, place, pose_settings, progress=report, should_stop=should_stop)
     reporter.begun["read"] = POSING_SHARE
     return place, {"poses": provenance_of(found)}
+
+
+def _opened(
+    capture: Path, settings: BuildSettings, preset: Preset, reporter: BuildReporter, should_stop: Callable[[], bool]
+) -> tuple[Capture, Views, InitialPoints]:
+    """open_capture, as the settings say."""
+    masked_by = _by_strokes(settings.strokes, reporter, should_stop) if settings.strokes else None
+    given = (settings.seed, settings.up, settings.box, masked_by, preset.hull)
+    return open_capture(capture, preset.image_side, preset.points, *given, sharpen=settings.masks == "auto")
 
 
 def _by_strokes(strokes: tuple[Stroke, ...], reporter: BuildReporter, should_stop: Callable[[], bool]) -> Callable[[Views], Views]:
@@ -423,6 +432,8 @@ def _check(settings: BuildSettings, out: Path) -> None:
     for name in (settings.preset, settings.materials or settings.preset):
         if name not in PRESETS:
             raise ValueError(f"preset {name!r} is unknown; expected one of {', '.join(PRESETS)}")
+    if settings.masks not in ("auto", "given"):
+        raise ValueError(f"masks {settings.masks!r} is unknown; expected auto or given")
     if settings.light not in LIGHT_CHOICES:
         raise ValueError(f"light {settings.light!r} is unknown; expected one of {', '.join(LIGHT_CHOICES)}")
     if settings.light == "camera" and PRESETS[settings.preset].materials_on == "surfels":

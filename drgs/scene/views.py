@@ -34,3 +34,5 @@ class Views:
     """Of each view, the rotation of directions in the world to those of the light's own table; None: the light stands still in the world."""
     ground: Ground | None = None
     """Without masks, what the object stands on; coverage is then 255 where a picture may show it. None: not known, or masks tell the object."""
+    masks_moved: float = 0.0
+    """By how much sharpen_masks moved the capture's outlines to edges of its photographs, root mean square [pixels]."""

@@ -357,6 +357,7 @@ def test_a_damaged_checkpoint_is_refused_on_resume_and_ignored_without(capture: 
     ("settings", "sentence"),
     [
         (BuildSettings(preset="best"), "preset 'best' is unknown; expected one of draft, fast, full"),
+        (BuildSettings(masks="none"), "masks 'none' is unknown; expected auto or given"),  # type: ignore[arg-type]
         (BuildSettings(binding="ropes"), "binding 'ropes' is unknown; expected one of particles, mesh"),
         (BuildSettings(device="tpu"), "device 'tpu' is unknown"),
     ],

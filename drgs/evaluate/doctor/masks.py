@@ -46,18 +46,7 @@ def masks(capture: Capture, views: Views, points: InitialPoints, mistaken: Seque
     findings = _single_masks(touching, [name for name in empty if name not in mistaken], full, len(names))
     findings += _disagreement(disagreeing, len(names))
     mean = float(share.mean())
-    if mean < SMALL_COVERAGE:
-        findings.append(
-            Finding("warning", f"The object fills {100 * mean:.1f} % of the picture.", "Go nearer, or crop (and shift cx, cy).")
-        )
-    if mean > LARGE_COVERAGE:
-        findings.append(
-            Finding(
-                "warning",
-                f"The masks cover {100 * mean:.0f} % of the picture.",
-                "Check that white means object; inverted masks look like this.",
-            )
-        )
+    findings += _of_all_masks(mean, views.masks_moved)
     parts = _parts_apart(points)
     if len(parts) > 1:
         findings.append(
@@ -75,6 +64,7 @@ def masks(capture: Capture, views: Views, points: InitialPoints, mistaken: Seque
         "agreement": round(float(np.median(agreement)), 4),
         "disagreeing": disagreeing,
         "things_apart": len(parts),
+        "moved_pixels": round(views.masks_moved, 2),
     }
     return summary, findings
 
@@ -116,6 +106,32 @@ def _no_masks(capture: Capture) -> Finding:
         "There are no masks: the build looks for the object itself, and what stands close to it becomes part of it.",
         "Save pictures with an alpha channel, or put masks of the same names (white object, black background) in masks/.",
     )
+
+
+def _of_all_masks(share: float, moved: float) -> list[Finding]:
+    """What is said of their mean `share` of the pictures, and of how far they were `moved` [pixels]."""
+    findings = []
+    if share < SMALL_COVERAGE:
+        findings.append(
+            Finding("warning", f"The object fills {100 * share:.1f} % of the picture.", "Go nearer, or crop (and shift cx, cy).")
+        )
+    if share > LARGE_COVERAGE:
+        findings.append(
+            Finding(
+                "warning",
+                f"The masks cover {100 * share:.0f} % of the picture.",
+                "Check that white means object; inverted masks look like this.",
+            )
+        )
+    if moved:
+        findings.append(
+            Finding(
+                "info",
+                f"Masks end {moved:.1f} pixels from where the photographs show the object to end (root mean square).",
+                "A build moves them there; drgs build --masks given leaves them.",
+            )
+        )
+    return findings
 
 
 def _single_masks(touching: list[str], empty: list[str], full: list[str], count: int) -> list[Finding]:

@@ -19,6 +19,7 @@ from drgs.reconstruct.capture.load_views.capture import Capture, without_masks
 from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.mask_agreement import mask_agreement
+from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
 from drgs.reconstruct.capture.turn_up import UP, Direction, turn_up
 from drgs.reconstruct.capture.visual_hull import HULL, VisualHullSettings, axes_meeting_point
 from drgs.scene.views import Views
@@ -47,6 +48,7 @@ def open_capture(
     box: BuildBox | None = None,
     masked: Callable[[Views], Views] | None = None,
     hull_settings: VisualHullSettings = HULL,
+    sharpen: bool = True,
 ) -> tuple[Capture, Views, InitialPoints]:
     """The capture, its pictures of at most `max_side` pixels a side, and points to begin with.
 
@@ -54,6 +56,7 @@ def open_capture(
         up: the direction of the capture's own world that is to point up: all is given in the world that is turned so.
         box: of that turned world. Masks of the capture's own are cut to what it holds (cut_to_box); without masks it bounds the points alone.
         masked: gives the views other masks than the capture's own, which are not read then, as strokes do.
+        sharpen: masks are moved to where the photographs show the object to end.
 
     Raises:
         ValueError: one sentence why there is nothing to build from; a CaptureFault where what to do about it is known, too.
@@ -66,6 +69,7 @@ def open_capture(
     _check_pictures(views, folder)
     if masked is not None:
         views = masked(views)
+    views = sharpen_masks(views) if sharpen and views.has_masks else views
     if box is not None and views.has_masks:
         views = _cut(views, box, folder)
     points = initial_points(views, point_count, seed, box=box, hull_settings=hull_settings)

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.ndimage import map_coordinates
-from skimage.measure import find_contours
 from torch import Tensor
 
+from drgs.reconstruct.geometry.closed_outlines import closed_outlines
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Hits
@@ -30,8 +29,6 @@ HALVINGS = 6
 """Of the one or two pixels in which rays begin to miss the mesh."""
 MARGIN = 2.0
 """[pixels] to the picture's border, where masks end because the picture does."""
-SMOOTHED = 2
-"""Neighbours on either side over which a mask's normals are averaged: single pixels have staircase normals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,25 +61,11 @@ class OutlineResiduals:
 
 def mask_outline(coverage: Tensor) -> MaskOutline | None:
     """The outline of one mask (height, width) 0..1; None where it has none."""
-    alpha = np.pad(coverage.cpu().numpy().astype(np.float64), 1)
-    points, normals, lengths = [], [], []
-    for contour in find_contours(alpha, 0.5):
-        along = np.diff(contour, axis=0)
-        length = np.linalg.norm(along, axis=1)
-        some = length > 1e-6
-        if some.sum() < 2 * SMOOTHED + 1:
-            continue
-        middle = 0.5 * (contour[1:] + contour[:-1])[some]
-        normal = np.stack([along[some, 1], -along[some, 0]], 1) / length[some, None]
-        outside, inside = (map_coordinates(alpha, (middle + side * normal).T, order=1) for side in (1.0, -1.0))
-        normal[outside > inside] *= -1
-        normal = sum(np.roll(normal, shift, 0) for shift in range(-SMOOTHED, SMOOTHED + 1))
-        points.append(middle[:, ::-1] - 0.5)  # padding moved everything by 1; pixel centres lie at +0.5
-        normals.append((normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9))[:, ::-1])
-        lengths.append(length[some])
-    if not points:
+    outlines = closed_outlines(coverage.cpu().numpy())
+    if not outlines:
         return None
-    return MaskOutline(*(torch.from_numpy(np.concatenate(values)).float() for values in (points, normals, lengths)))
+    together = zip(*((outline.points, outline.normals, outline.lengths) for outline in outlines), strict=True)
+    return MaskOutline(*(torch.from_numpy(np.concatenate(values)).float() for values in together))
 
 
 def mask_outlines(views: Views) -> list[MaskOutline | None]:

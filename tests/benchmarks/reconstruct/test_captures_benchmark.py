@@ -12,7 +12,9 @@ from benchmarks.reconstruct import captures
 from benchmarks.scenes.bench_scene import read_rgba
 from benchmarks.scenes.retake_photographs import MOST_STOPS, WAYS, Way, premultiplied, retake_photographs, through_lens
 from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
 from drgs.scene.lens import pixels_from_plane
+from drgs.scene.views import Views
 from tests.benchmarks.reconstruct.test_draw_scene_benchmark import small_scene
 
 SIDE = 96
@@ -102,6 +104,21 @@ def test_rough_masks_are_wider_and_show_the_room_there(scene: Path, tmp_path: Pa
     assert 0.3 < (after.sum() - before.sum()) / outline < 1.1
     assert rough[after & ~before][:, :3].min() > 0.25
     assert np.abs(plain - rough)[plain[..., 3] == 1][rough[plain[..., 3] == 1][:, 3] == 1].max() < 0.005
+    assert rough[~after & ~before][:, :3].min() > 0.35
+    cut = read_rgba(taken(scene, "cutouts", tmp_path) / "train" / "r_000.png")
+    assert (cut[after] == rough[after]).all() and cut[~after].max() == 0
+
+
+def test_rough_masks_can_be_moved_to_where_the_object_ends_but_not_those_of_cutouts(scene: Path, tmp_path: Path) -> None:
+    true, given, cut = load_views(scene), load_views(taken(scene, "masks", tmp_path)), load_views(taken(scene, "cutouts", tmp_path))
+    moved = sharpen_masks(given)
+
+    def off(views: Views) -> float:
+        pairs = zip(views.coverage, true.coverage, strict=True)
+        return float(np.mean([(mask.float() - right.float()).abs().mean() for mask, right in pairs]))
+
+    assert off(moved) < 0.5 * off(given) and 0.6 < moved.masks_moved < 2
+    assert sharpen_masks(cut) is cut and sharpen_masks(true) is true
 
 
 def figures_of(views: float, relit: float) -> dict:
