@@ -26,6 +26,7 @@ from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
 from drgs.reconstruct.capture.open_capture import open_capture
+from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
 from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
 from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
 from drgs.reconstruct.fit.evidence.photographs_as_taken import PhotographsAsTaken
@@ -198,6 +199,7 @@ def build_stages(
         fit = fit_stage(place, views, points, fit_settings, device)
         if not views.has_masks:
             views = masked_by_surfels(views, gaussians_from_state(fit), points.bounds_radius, settings.box)
+            views = sharpen_masks(views) if settings.masks == "auto" else views
             photographs = views_of(photographs, views)
         views = with_gains_of_fit(views, drawn_object(fit.parameters, points.bounds_radius, fit_settings.sh_degree))
     yield "fit", None

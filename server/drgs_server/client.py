@@ -49,7 +49,16 @@ from drgs_server.client_upload import as_zip, send_in_parts, server_error
 from drgs_server.client_variants import SessionVariants
 from drgs_server.live.messages import EditLog, Settings
 from drgs_server.picture import Picture
-from drgs_worker.jobs.requests import BindingName, ExportRequest, LightName, PoseRequest, RedecoupleRequest, RenderRequest, SimulateRequest
+from drgs_worker.jobs.requests import (
+    BindingName,
+    ExportRequest,
+    LightName,
+    MaskName,
+    PoseRequest,
+    RedecoupleRequest,
+    RenderRequest,
+    SimulateRequest,
+)
 
 Model = TypeVar("Model", bound=BaseModel)
 Preset = Literal["draft", "fast", "full"]
@@ -98,6 +107,7 @@ class Client:
         up: Triple = (0.0, 0.0, 1.0),
         box: tuple[Triple, Triple] | None = None,
         strokes: Sequence[Stroke] = (),
+        masks: MaskName = "auto",
     ) -> JobInfo:
         """Start a build.
 
@@ -109,6 +119,7 @@ class Client:
             up: direction of the capture's world that points up; the asset's world is turned so that it is z.
             box: low and high corner in the asset's world: what lies outside is not built. None: all of the object is.
             strokes: over some pictures, what is the object and what is not: the masks of all follow from them. None: the capture's own count.
+            masks: auto: they are moved to where the photographs show the object to end. given: they stay.
             idempotency_key: the same key gives the same job, however often this is called.
         """
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
@@ -119,6 +130,7 @@ class Client:
             "preset": preset,
             "binding": binding,
             "light": light,
+            "masks": masks,
             "up": up,
             "box": None if box is None else {"low": box[0], "high": box[1]},
             "strokes": plain_strokes(strokes) or None,

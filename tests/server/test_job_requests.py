@@ -44,7 +44,7 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     posing = jobs._job_context(infos[5]["id"])
     assert (posing.dataset, posing.parameters["seed"]) == (service.settings.sample_capture.resolve(), 7)
     box = {"low": [-1, -1, 0], "high": [1, 1, 2]}
-    meshed = service.client.post("/api/jobs", json={"dataset": "sample", "binding": "mesh", "box": box}).json()
+    meshed = service.client.post("/api/jobs", json={"dataset": "sample", "binding": "mesh", "box": box, "masks": "given"}).json()
     service.add_asset(meshed["id"], "meshed")
     again = service.client.post("/api/jobs", json={"kind": "redecouple", "asset": meshed["id"]}).json()
     found = [jobs._RUNS[info["kind"]](jobs._job_context(info["id"])).steps for info in (meshed, again)]
@@ -52,6 +52,7 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     assert jobs._job_context(again["id"]).parameters["box"] == box, "what was cut off is not there to find materials of"
     asked = [jobs._RUNS[info["kind"]](jobs._job_context(info["id"]))._request() for info in (meshed, again, infos[1])]
     assert [request.box for request in asked] == [((-1, -1, 0), (1, 1, 2)), ((-1, -1, 0), (1, 1, 2)), None]
+    assert [request.masks for request in asked] == ["given", "given", "auto"]
     redecoupled = jobs._job_context(infos[1]["id"])
     assert redecoupled.parameters["built_preset"] == "draft" and redecoupled.dataset == service.settings.sample_capture.resolve()
 

@@ -134,6 +134,8 @@ export interface BuildRequest {
   binding?: "particles" | "mesh";
   /** What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures. */
   light?: "auto" | "object" | "camera";
+  /** Where masks end: where the photographs show the object to end, if that is elsewhere (auto), or as given. */
+  masks?: "auto" | "given";
   /** Direction of the capture's world that points up; the asset's world is turned so that it is z. Not of multipart bodies. */
   up?: [number, number, number];
   /**

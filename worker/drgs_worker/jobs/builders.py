@@ -15,7 +15,7 @@ from drgs.reconstruct.progress import Progress
 from drgs.scene.strokes import Stroke
 from drgs_worker.jobs.capture_report import examine_capture
 from drgs_worker.jobs.progress import JobStopped, Tell
-from drgs_worker.jobs.requests import LightName
+from drgs_worker.jobs.requests import LightName, MaskName
 
 Corner = tuple[float, float, float]
 
@@ -45,6 +45,7 @@ class BuildRequest:
     """Low and high corner in the asset's world; None: all of the object is built."""
     strokes: tuple[Stroke, ...] = ()
     """None: the capture's own masks count."""
+    masks: MaskName = "auto"
 
 
 Builder = Callable[[BuildRequest, Tell, Callable[[], bool]], Iterator[str]]
@@ -80,6 +81,7 @@ def build_with_drgs(request: BuildRequest, tell: Tell, should_stop: Callable[[],
         box=None if request.box is None else BuildBox(*request.box),
         strokes=request.strokes,
         materials=request.materials,
+        masks=request.masks,
     )
 
     if request.materials is None:  # else the capture was examined by the build whose geometry this one takes

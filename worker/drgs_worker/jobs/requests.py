@@ -20,6 +20,7 @@ JobKind = Literal["build", "pose", "redecouple", "simulate", "render", "export"]
 PresetName = Literal["draft", "fast", "full"]
 BindingName = Literal["particles", "mesh"]
 LightName = Literal["auto", "object", "camera"]
+MaskName = Literal["auto", "given"]
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.]{0,59}$"
 """Of pictures and variants: they become parts of file names, joined by `-`."""
@@ -102,6 +103,8 @@ class BuildRequest(_Job):
     """particles: surfels lie where they were fitted. mesh: they are rebuilt on the faces of the mesh, one a face."""
     light: LightName = "auto"
     """What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."""
+    masks: MaskName = "auto"
+    """Where masks end: where the photographs show the object to end, if that is elsewhere (auto), or as given."""
     up: Triple = (0.0, 0.0, 1.0)
     """Direction of the capture's world that points up; the asset's world is turned so that it is z. Not of multipart bodies."""
     box: BoxCorners | None = None

@@ -86,6 +86,7 @@ _BODY: dict[str, Any] = {
                         "preset": {"type": "string", "enum": ["draft", "fast", "full"]},
                         "binding": {"type": "string", "enum": ["particles", "mesh"]},
                         "light": {"type": "string", "enum": ["auto", "object", "camera"]},
+                        "masks": {"type": "string", "enum": ["auto", "given"]},
                         "seed": {"type": "integer"},
                     },
                 }
@@ -180,7 +181,7 @@ def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
         row.dataset, row.preset, row.seed = built.dataset, asked.preset, built.seed
         built_preset = built.parameters.get("built_preset", built.preset)
         kept = {"binding": built.parameters.get("binding", "particles"), "light": built.parameters.get("light", "auto")}
-        kept |= {name: built.parameters[name] for name in ("up", "box", "strokes") if name in built.parameters}
+        kept |= {name: built.parameters[name] for name in ("masks", "up", "box", "strokes") if name in built.parameters}
         row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed} | kept
     elif isinstance(asked, SimulateRequest):
         from drgs.deform.matter.simulation_scene import parse_simulation_scene
@@ -212,7 +213,7 @@ def _check_render(context: ServerContext, asked: RenderRequest) -> None:
 async def _receive_capture(request: Request, context: ServerContext, job_id: str) -> tuple[BuildRequest, Path]:
     upload = await receive_upload(request, {".zip"})
     try:
-        fields = {"dataset": "upload", "name": upload.name(), **upload.given("preset", "binding", "light", "seed")}
+        fields = {"dataset": "upload", "name": upload.name(), **upload.given("preset", "binding", "light", "masks", "seed")}
         asked = BuildRequest.model_validate(fields)
         draft, target = context.scratch.folder / job_id, context.directory.uploads / job_id
         await run_in_threadpool(unpack_zip, upload.stream, draft)

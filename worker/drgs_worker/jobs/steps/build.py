@@ -8,7 +8,7 @@ from pathlib import Path
 from drgs.reconstruct.progress import POSED, STAGE_SHARES
 from drgs.scene.strokes import Stroke, parse_strokes
 from drgs_worker.jobs.builders import BuildRequest, Corner
-from drgs_worker.jobs.requests import LightName
+from drgs_worker.jobs.requests import LightName, MaskName
 from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
 from drgs_worker.store.artifacts import fetch_capture, refresh_job
@@ -29,6 +29,7 @@ class BuildRun(AbstractJobRun):
         self._stages: Iterator[str] | None = None
         self._binding: str = job.parameters.get("binding", "particles")
         self._light: LightName = job.parameters.get("light", "auto")
+        self._masks: MaskName = job.parameters.get("masks", "given")  # as in builds of before there was a choice
         x, y, z = job.parameters.get("up", (0.0, 0.0, 1.0))
         self._up: tuple[float, float, float] = (x, y, z)
         self._box = _corners(job.parameters.get("box"))
@@ -68,6 +69,7 @@ class BuildRun(AbstractJobRun):
             up=self._up,
             box=self._box,
             strokes=self._strokes,
+            masks=self._masks,
         )
 
     def _register(self) -> None:
@@ -123,7 +125,18 @@ class RedecoupleRun(BuildRun):
         out = job.folder / "asset"
         preset, seed = given["built_preset"], given["built_seed"]
         return BuildRequest(
-            job.dataset, out, preset, seed, job.device, given["preset"], self._binding, self._light, self._up, self._box, self._strokes
+            job.dataset,
+            out,
+            preset,
+            seed,
+            job.device,
+            given["preset"],
+            self._binding,
+            self._light,
+            self._up,
+            self._box,
+            self._strokes,
+            self._masks,
         )
 
 
