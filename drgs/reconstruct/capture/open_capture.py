@@ -65,11 +65,11 @@ def open_capture(
     _check_cameras(capture, folder)
     if masked is not None:
         capture = without_masks(capture)
-    views = read_pictures(capture, max_side)
+    views = read_pictures(capture, max_side, sharpen)
     _check_pictures(views, folder)
     if masked is not None:
         views = masked(views)
-    views = sharpen_masks(views) if sharpen and views.has_masks else views
+        views = sharpen_masks(views) if sharpen else views
     if box is not None and views.has_masks:
         views = _cut(views, box, folder)
     points = initial_points(views, point_count, seed, box=box, hull_settings=hull_settings)

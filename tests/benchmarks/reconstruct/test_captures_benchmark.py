@@ -11,7 +11,8 @@ from scipy.ndimage import map_coordinates
 from benchmarks.reconstruct import captures
 from benchmarks.scenes.bench_scene import read_rgba
 from benchmarks.scenes.retake_photographs import MOST_STOPS, WAYS, Way, premultiplied, retake_photographs, through_lens
-from drgs.reconstruct.capture.load_views import load_views
+from drgs.reconstruct.capture.load_views import load_views, read_capture
+from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
 from drgs.scene.lens import pixels_from_plane
 from drgs.scene.views import Views
@@ -119,6 +120,16 @@ def test_rough_masks_can_be_moved_to_where_the_object_ends_but_not_those_of_cuto
 
     assert off(moved) < 0.5 * off(given) and 0.6 < moved.masks_moved < 2
     assert sharpen_masks(cut) is cut and sharpen_masks(true) is true
+    capture = read_capture(tmp_path / "masks")
+    smaller, plain = (read_pictures(capture, SIDE // 2, sharpen) for sharpen in (True, False))
+    assert smaller.masks_moved == moved.masks_moved, "before they are shrunk: what is beyond a mask is lost then"
+    exact = read_pictures(read_capture(scene), SIDE // 2, True)
+    assert exact.masks_moved == 0
+    errors = [
+        np.mean([(mask.float() - right.float()).abs().mean() for mask, right in zip(views.coverage, exact.coverage, strict=True)])
+        for views in (smaller, plain)
+    ]
+    assert errors[0] < 0.5 * errors[1]
 
 
 def figures_of(views: float, relit: float) -> dict:

@@ -65,6 +65,16 @@ def test_rough_masks_are_moved_to_the_photographs_edges(distance: ndarray, too_w
     assert 0.6 < moved.masks_moved < 2.5
 
 
+def test_large_photographs_are_looked_at_when_shrunk_and_moved_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    distance = disc_distance()
+    image, covered = photographed(distance)
+    given = rough_mask(distance, 2.0, 2.0)
+    monkeypatch.setattr("drgs.reconstruct.capture.sharpen_masks.LOOK_SIDE", SIDE // 2)
+    moved = sharpen_masks(views_of(image, given)).coverage[0].numpy() / 255
+    before, after = error(given, covered), error(moved, covered)
+    assert after[0] < 0.25 * before[0] and abs(after[1]) < 0.3
+
+
 def test_right_masks_stay_as_they_are() -> None:
     image, covered = photographed(disc_distance())
     views = views_of(image, covered)

@@ -6,6 +6,7 @@ Shrinking averages areas of linear, premultiplied light: colour of the backgroun
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, cam
 from drgs.reconstruct.capture.load_views.checks import damaged
 from drgs.reconstruct.capture.load_views.linear_light import premultiplied, straight
 from drgs.reconstruct.capture.load_views.undistort import undistort
+from drgs.reconstruct.capture.sharpen_masks import LEAST_OFF, MaskLook, outlines_off
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
@@ -30,24 +32,37 @@ NERO_DEPTH_OF_ONE = 15.0
 NERO_BACKGROUND_DEPTH = 14.5
 
 
-def read_pictures(capture: Capture, max_side: int | None) -> Views:
-    """Views of a checked capture, the longer side of each at most `max_side` pixels."""
+def read_pictures(capture: Capture, max_side: int | None, sharpen: bool = False) -> Views:
+    """Views of a checked capture, the longer side of each at most `max_side` pixels.
 
-    def read(photograph: Photograph) -> tuple[Camera, Tensor, Tensor, bool, float | None]:
-        """Camera, colour, coverage, whether there is a mask, and the exposure where the file tells."""
+    Args:
+        sharpen: masks are moved as sharpen_masks does it, before the photographs are undistorted or shrunk.
+    """
+
+    def read(photograph: Photograph, look: MaskLook | None) -> tuple[Camera, Tensor, Tensor, bool, float | None, MaskLook | None]:
+        """Camera, colour, coverage, whether there is a mask, the exposure where the file tells, and how far the mask's outlines are off: those of `look` are moved."""
         pinhole = photograph.pinhole
         scale = min(1.0, max_side / max(pinhole.width, pinhole.height)) if max_side else 1.0
         width, height = max(1, round(pinhole.width * scale)), max(1, round(pinhole.height * scale))
         color, alpha, has_mask, exposure = _decode(photograph)
+        if look is not None:
+            color, alpha = look.moved(color, alpha)
+        elif sharpen and has_mask:
+            look = MaskLook.at(color, alpha)
         if photograph.lens is not None:
             color, alpha = undistort(color, alpha, photograph.lens, pinhole)
         if (height, width) != alpha.shape:
             color, alpha = shrink(color, alpha, width, height)
         camera = camera_of(photograph.camera_from_world, resize_pinhole(pinhole, width, height), photograph.name)
-        return camera, torch.from_numpy(color.copy()), torch.from_numpy(alpha.copy()), has_mask, exposure
+        return camera, torch.from_numpy(color.copy()), torch.from_numpy(alpha.copy()), has_mask, exposure, look
 
     with ThreadPoolExecutor(DECODE_THREADS) as pool:
-        cameras, images, coverage, has_masks, exposures = zip(*pool.map(read, capture.photographs), strict=True)
+        found = list(pool.map(read, capture.photographs, repeat(None)))
+        off = outlines_off([look for *_, look in found])
+        moved = off >= LEAST_OFF
+        if moved:
+            found = list(pool.map(read, capture.photographs, [look for *_, look in found]))
+    cameras, images, coverage, has_masks, exposures, _ = zip(*found, strict=True)
     if any(has_masks) and not all(has_masks):
         lacking = [photograph.image for photograph, has_mask in zip(capture.photographs, has_masks, strict=True) if not has_mask]
         raise ValueError(f"{lacking[0]}: neither alpha nor a mask ({len(lacking)} of {len(cameras)} images), but the others have one.")
@@ -62,6 +77,7 @@ def read_pictures(capture: Capture, max_side: int | None) -> Views:
         source=capture.source,
         lenses=tuple(photograph.lens for photograph in capture.photographs),
         gains=gains_of_files(exposures),
+        masks_moved=off if moved else 0.0,
     )
 
 
