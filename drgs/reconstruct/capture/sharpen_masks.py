@@ -25,7 +25,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d, map_coordin
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from drgs.maths.color_numpy import linear_from_srgb
+from drgs.maths.color_numpy import linear_from_srgb, srgb_from_linear
 from drgs.reconstruct.geometry.closed_outlines import ClosedOutline, closed_outlines
 from drgs.scene.views import Views
 from drgs.warp_torch import by_pool
@@ -118,7 +118,7 @@ class MaskLook:
         scale = max(1.0, max(mask.shape) / LOOK_SIDE)
         if scale > 1:
             size = (round(mask.shape[1] / scale), round(mask.shape[0] / scale))
-            image, mask = (np.asarray(Image.fromarray(values).resize(size, Image.Resampling.BOX)) for values in (image, mask))
+            image, mask = _shrunk(image, size), np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX))
         inside = mask > 127
         reach = float(np.clip(REACH_SHARE * np.sqrt(inside.sum()), LEAST_REACH, MOST_REACH))
         if not inside.any() or _is_cut_out(image, inside, reach):
@@ -143,10 +143,12 @@ class MaskLook:
         pixels = np.argwhere(near)[:, ::-1]
         places = self.scale * (self.points + self.offsets[:, None] * self.normals + 0.5) - 0.5
         distance, place = cKDTree(places).query(pixels)
+        own = distance <= self.scale * (2 * self.reach + MIXED)  # others are of specks, which were not looked at
+        pixels, distance, place = pixels[own], distance[own], place[own]
         outside = np.einsum("ni,ni->n", pixels - places[place], self.normals[place])
         # Beside a corner the nearest place's normal tells the side alone.
         outside = np.where(np.abs(outside) < self.scale, outside, np.sign(outside) * distance)
-        alpha[near] = (255 * np.clip(0.5 - outside, 0, 1) + 0.5).astype(np.uint8)
+        alpha[pixels[:, 1], pixels[:, 0]] = (255 * np.clip(0.5 - outside, 0, 1) + 0.5).astype(np.uint8)
         depth = RIM * self.scale
         rim = (outside > -depth) & (outside < 0.5)
         column, row = pixels[rim].T
@@ -155,6 +157,13 @@ class MaskLook:
         for channel in range(3):
             cleaned[row, column, channel] = map_coordinates(image[..., channel].astype(np.float32), sources, order=1, mode="nearest") + 0.5
         return cleaned, alpha
+
+
+def _shrunk(image: UInt8[ndarray, "rows columns 3"], size: tuple[int, int]) -> UInt8[ndarray, "height width 3"]:
+    """To `size` (columns, rows), by means of light."""
+    light = linear_from_srgb(np.arange(256) / 255).astype(np.float32)[image]
+    channels = [Image.fromarray(light[..., channel]).resize(size, Image.Resampling.BOX) for channel in range(3)]
+    return (255 * srgb_from_linear(np.stack([np.asarray(channel) for channel in channels], -1)) + 0.5).astype(np.uint8)
 
 
 def _is_cut_out(image: UInt8[ndarray, "height width 3"], inside: Bool[ndarray, "height width"], reach: float) -> bool:

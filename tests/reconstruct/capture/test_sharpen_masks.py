@@ -115,6 +115,16 @@ def test_at_the_rim_colours_are_the_objects_own() -> None:
     assert abs(red.mean() - inner.mean()) < 2 and red.max() < inner.max() + 3
 
 
+def test_specks_of_a_mask_stay() -> None:
+    image, covered = photographed(disc_distance())
+    given = rough_mask(disc_distance())
+    given[5:7, 5:7] = 1
+    given[78:80, 80:82] = 0
+    moved = sharpen_masks(views_of(image, given)).coverage[0].numpy() / 255
+    assert (moved[:12, :12] == given[:12, :12]).all() and (moved[70:90, 70:90] == given[70:90, 70:90]).all()
+    assert error(moved, covered)[0] < 0.4 * error(given, covered)[0]
+
+
 def test_outlines_at_a_pictures_border_stay_there() -> None:
     distance = disc_distance((20.0, 80.0))
     image, covered = photographed(distance)
