@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,6 @@ from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, cam
 from drgs.reconstruct.capture.load_views.checks import damaged
 from drgs.reconstruct.capture.load_views.linear_light import premultiplied, straight
 from drgs.reconstruct.capture.load_views.undistort import undistort
-from drgs.reconstruct.capture.sharpen_masks import LEAST_OFF, MaskLook, outlines_off
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
@@ -39,8 +39,11 @@ def read_pictures(capture: Capture, max_side: int | None, sharpen: bool = False)
         sharpen: masks are moved as sharpen_masks does it, before the photographs are undistorted or shrunk.
     """
 
-    def read(photograph: Photograph, look: MaskLook | None) -> tuple[Camera, Tensor, Tensor, bool, float | None, MaskLook | None]:
-        """Camera, colour, coverage, whether there is a mask, the exposure where the file tells, and how far the mask's outlines are off: those of `look` are moved."""
+    if sharpen:  # imported here: reading cameras alone asks for nothing that looks at pictures
+        from drgs.reconstruct.capture.sharpen_masks import LEAST_OFF, MaskLook, outlines_off
+
+    def read(photograph: Photograph, look: Any) -> tuple[Camera, Tensor, Tensor, bool, float | None, Any]:
+        """Camera, colour, coverage, whether there is a mask, the exposure where the file tells, and how far its outlines are off (MaskLook): those of `look` are moved."""
         pinhole = photograph.pinhole
         scale = min(1.0, max_side / max(pinhole.width, pinhole.height)) if max_side else 1.0
         width, height = max(1, round(pinhole.width * scale)), max(1, round(pinhole.height * scale))
@@ -58,8 +61,8 @@ def read_pictures(capture: Capture, max_side: int | None, sharpen: bool = False)
 
     with ThreadPoolExecutor(DECODE_THREADS) as pool:
         found = list(pool.map(read, capture.photographs, repeat(None)))
-        off = outlines_off([look for *_, look in found])
-        moved = off >= LEAST_OFF
+        off = outlines_off([look for *_, look in found]) if sharpen else 0.0
+        moved = sharpen and off >= LEAST_OFF
         if moved:
             found = list(pool.map(read, capture.photographs, [look for *_, look in found]))
     cameras, images, coverage, has_masks, exposures, _ = zip(*found, strict=True)
