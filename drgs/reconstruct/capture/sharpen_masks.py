@@ -61,7 +61,7 @@ LEAST_CONTRAST = 0.003
 LEAST_SURE = 0.75
 """Of the most that two sides can be told apart: from there to all of it a place counts more and more. All but a twentieth of the places of objects before rooms have 0.93
 and more, of four of the tankard's photographs 0.75 and more; the middle half of an outline laid through wood 0.3 to 0.99, through a soft checkerboard 0.55 to 0.95."""
-LEAST_SURE_PLACES = 0.5
+LEAST_SURE_PLACES = 0.6
 """Of a picture's outlines, that count by a quarter at least: where there are fewer, texture is taken for edges (wood 0.39, checkerboard 0.47; edges of objects 0.94 to 1)."""
 UNSURE = 0.03
 """Weight of staying, where the most sure move has 1."""
