@@ -20,6 +20,8 @@ from drgs.cli_options import (
     AssetPath,
     BindingKind,
     BoxCorners,
+    CameraKind,
+    Cameras,
     DataFolder,
     DatasetPath,
     Denoiser,
@@ -109,6 +111,7 @@ def build(
     ] = BindingKind.particles,
     light: LightFrame = LightKind.auto,
     masks: Masks = MaskKind.auto,
+    cameras: Cameras = CameraKind.auto,
     up: UpDirection = (0.0, 0.0, 1.0),
     box: BoxCorners = None,
     strokes: StrokesPath = None,
@@ -132,6 +135,7 @@ def build(
         resume=resume,
         light=light.value,
         masks=masks.value,
+        cameras=cameras.value,
         up=up,
         box=None if box is None else BuildBox(box[:3], box[3:]),
         strokes=() if strokes is None else read_strokes(strokes),
@@ -143,6 +147,7 @@ def build(
             chosen = "" if binding == BindingKind.particles else f" --binding {binding.value}"
             chosen += "" if light == LightKind.auto else f" --light {light.value}"
             chosen += "" if masks == MaskKind.auto else f" --masks {masks.value}"
+            chosen += "" if cameras == CameraKind.auto else f" --cameras {cameras.value}"
             chosen += "" if up == (0.0, 0.0, 1.0) else f" --up {up[0]:g} {up[1]:g} {up[2]:g}"
             chosen += "" if box is None else f" --box {' '.join(f'{value:g}' for value in box)}"
             chosen += "" if strokes is None else f" --strokes {strokes}"

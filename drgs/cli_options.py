@@ -85,9 +85,20 @@ LightFrame = Annotated[
     LightKind,
     typer.Option(help="What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."),
 ]
+
+
+class CameraKind(StrEnum):
+    auto = "auto"
+    given = "given"
+
+
 Masks = Annotated[
     MaskKind,
     typer.Option(help="Where masks end: where the photographs show the object to end, if that is elsewhere (auto), or as given."),
+]
+Cameras = Annotated[
+    CameraKind,
+    typer.Option(help="Where photographs were taken from: where they fit the surface best, if that is elsewhere (auto), or as given."),
 ]
 UpDirection = Annotated[
     tuple[float, float, float],

@@ -30,6 +30,7 @@ from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
 from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
 from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
 from drgs.reconstruct.fit.evidence.photographs_as_taken import PhotographsAsTaken
+from drgs.reconstruct.fit.evidence.register_cameras import moved_pixels, seen_from
 from drgs.reconstruct.fit.evidence.solve_albedo import RINGS, parts_for, solve_albedo
 from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.fit_loop import FitState
@@ -104,6 +105,9 @@ class BuildSettings:
     """What the lamps stood still with while the photographs were taken."""
     masks: Literal["auto", "given"] = "auto"
     """Where they end: auto: where the photographs show the object to end (sharpen_masks); given: as the capture or the strokes have it."""
+    cameras: Literal["auto", "given"] = "auto"
+    """Where photographs were taken from: auto: where they fit the surface best, if the given places are off (register_cameras); given: where the capture, or
+    COLMAP, has them."""
     up: Direction = UP
     """Direction of the capture's world that points up. The asset's world is the capture's, turned so that it is z (turn_up.rotation_to_up)."""
     box: BuildBox | None = None
@@ -212,11 +216,12 @@ def build_stages(
         raise BuildStopped
 
     built = _Built(place, found, views, points, preset, settings, fit, gaussians, mesh, timed)
-    asset, thumbnail = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
+    asset, thumbnail, views = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
     provenance |= poses | found_by | {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
     provenance |= {"masks_moved_pixels": round(views.masks_moved, 2)} if views.masks_moved else {}
+    provenance |= {"cameras_moved_pixels": round(views.cameras_moved, 2)} if views.cameras_moved else {}
     provenance["light"] = {key: value for key, value in asdict(light).items() if value is not None}
     asset = replace(asset, provenance=provenance, cameras=views.cameras, light_frame=light.frame)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
@@ -326,14 +331,18 @@ class _Built:
         return place if self.settings.materials is None else place.of(materials=self.settings.materials)
 
 
-def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, bytes]]:
-    """The mesh becomes the surface that the photographs show, its materials are fitted on it, and surfels are laid on its faces."""
+def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, bytes, Views]]:
+    """The mesh becomes the surface that the photographs show, its materials are fitted on it, and surfels are laid on its faces. The views have their cameras
+    where these were moved to."""
     place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
     with timed("surface"):
         passes = built.preset.surface
         moves = replace(passes.surface.moves, texture_radius=built.radius, box=built.settings.box)
         passes = replace(passes, surface=replace(passes.surface, seed=seed, moves=moves))
+        passes = passes if built.settings.cameras == "auto" else replace(passes, cameras_after=())
         surface = surface_stage(place, views, built.gaussians, built.mesh, built.fit.parameters, built.radius, passes)
+        built = _seen_from(built, surface)
+        views = built.views
         order = order_in_space(surface.mesh)  # before materials move it a little: whoever fits them anew gets the same faces
     yield "surface", None
 
@@ -371,10 +380,24 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         surfels, binding = chosen_surfels(surfels, along), chosen_surfels(binding, along)
         surfels = radiating_surfels(surfels, binding, mesh, environment)
         asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh", certainty=certainty)
-    return asset, surface_preview(decoupled, views.cameras)
+    return asset, surface_preview(decoupled, views.cameras), views
 
 
-def _on_surfels(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, bytes]]:
+def _seen_from(built: _Built, surface: SurfaceFit) -> _Built:
+    """With views and capture from where the surface's fit has their cameras."""
+    if surface.camera_from_world is None:
+        return built
+    views = seen_from(built.views, surface.camera_from_world)
+    views = replace(views, cameras_moved=moved_pixels(built.views, views, surface.mesh.vertices[::100].cpu()))
+    moved = {camera.name: transform for camera, transform in zip(views.cameras, surface.camera_from_world.numpy(), strict=True)}
+    photographs = tuple(
+        replace(photograph, camera_from_world=moved.get(photograph.name, photograph.camera_from_world))
+        for photograph in built.capture.photographs
+    )
+    return replace(built, views=views, capture=replace(built.capture, photographs=photographs))
+
+
+def _on_surfels(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, bytes, Views]]:
     """The paper's way: materials of the surfels, by rays from where they lie; the mesh takes them over."""
     place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
     gaussians, mesh, light, binding = built.gaussians, built.mesh, built.fit.parameters, None
@@ -402,7 +425,7 @@ def _on_surfels(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset,
         bound_to = bind_gaussians(gaussians.centers, baked) if binding is None else binding  # where they were fitted, or on their faces
         environment = Environment(environment_table(materials.parameters).detach())
         asset = Asset(gaussians, baked, bound_to, environment, horizons=_horizons(baked))
-    return asset, stage_two_preview(materials.parameters, views.cameras, built.radius)
+    return asset, stage_two_preview(materials.parameters, views.cameras, built.radius), views
 
 
 def _horizons(mesh: TriangleMesh) -> UInt8[Tensor, "face 8"]:
@@ -436,6 +459,8 @@ def _check(settings: BuildSettings, out: Path) -> None:
             raise ValueError(f"preset {name!r} is unknown; expected one of {', '.join(PRESETS)}")
     if settings.masks not in ("auto", "given"):
         raise ValueError(f"masks {settings.masks!r} is unknown; expected auto or given")
+    if settings.cameras not in ("auto", "given"):
+        raise ValueError(f"cameras {settings.cameras!r} is unknown; expected auto or given")
     if settings.light not in LIGHT_CHOICES:
         raise ValueError(f"light {settings.light!r} is unknown; expected one of {', '.join(LIGHT_CHOICES)}")
     if settings.light == "camera" and PRESETS[settings.preset].materials_on == "surfels":

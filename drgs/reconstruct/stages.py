@@ -276,11 +276,13 @@ def surface_stage(
     kept = _kept(place, path, mesh.vertices.device)
     if kept is not None:
         restore_fit(kept, fit.state)
-        fit.faces, fit.index, fit.divided = kept["faces"], int(kept["pass"]), int(kept["divided"])
+        fit.faces, fit.index, fit.divided, fit.cameras_asked = kept["faces"], *(int(kept[name]) for name in ("pass", "divided", "asked"))
+        fit.camera_from_world = kept["cameras"].cpu() if len(kept["cameras"]) else None
 
     def save() -> None:
-        numbers = {"pass": torch.tensor(fit.index), "divided": torch.tensor(fit.divided)}
-        write_tensors(path, fit_tensors(fit.state) | {"faces": fit.faces} | numbers, place.identity)
+        numbers = {"pass": torch.tensor(fit.index), "divided": torch.tensor(fit.divided), "asked": torch.tensor(fit.cameras_asked)}
+        cameras = torch.zeros(0, 4, 4, dtype=torch.float64) if fit.camera_from_world is None else fit.camera_from_world
+        write_tensors(path, fit_tensors(fit.state) | {"faces": fit.faces, "cameras": cameras} | numbers, place.identity)
 
     def report(r: FitReport) -> None:
         message = "; ".join(filter(None, (f"{_pass_of(fit, settings)}, {len(fit.faces)} faces", fit.doing, fit.remark)))

@@ -36,3 +36,5 @@ class Views:
     """Without masks, what the object stands on; coverage is then 255 where a picture may show it. None: not known, or masks tell the object."""
     masks_moved: float = 0.0
     """By how much sharpen_masks moved the capture's outlines to edges of its photographs, root mean square [pixels]."""
+    cameras_moved: float = 0.0
+    """By how much register_cameras moved what the cameras see, root mean square [pixels]."""

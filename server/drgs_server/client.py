@@ -51,6 +51,7 @@ from drgs_server.live.messages import EditLog, Settings
 from drgs_server.picture import Picture
 from drgs_worker.jobs.requests import (
     BindingName,
+    CameraName,
     ExportRequest,
     LightName,
     MaskName,
@@ -108,6 +109,7 @@ class Client:
         box: tuple[Triple, Triple] | None = None,
         strokes: Sequence[Stroke] = (),
         masks: MaskName = "auto",
+        cameras: CameraName = "auto",
     ) -> JobInfo:
         """Start a build.
 
@@ -120,6 +122,7 @@ class Client:
             box: low and high corner in the asset's world: what lies outside is not built. None: all of the object is.
             strokes: over some pictures, what is the object and what is not: the masks of all follow from them. None: the capture's own count.
             masks: auto: they are moved to where the photographs show the object to end. given: they stay.
+            cameras: auto: they are moved to where their photographs fit the surface best, if they are off. given: they stay.
             idempotency_key: the same key gives the same job, however often this is called.
         """
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
@@ -131,6 +134,7 @@ class Client:
             "binding": binding,
             "light": light,
             "masks": masks,
+            "cameras": cameras,
             "up": up,
             "box": None if box is None else {"low": box[0], "high": box[1]},
             "strokes": plain_strokes(strokes) or None,

@@ -17,10 +17,12 @@ from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photo
 from drgs.reconstruct import report_progress
 from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, Progress, build_asset, calibrations, kept_photographs
 from drgs.reconstruct.capture.find_hollows import HollowSettings
+from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.capture.open_vessels import VesselSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
+from drgs.reconstruct.fit.evidence import register_cameras
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings
@@ -238,6 +240,28 @@ def test_a_build_stopped_in_every_stage_leaves_checkpoints_and_resumes_to_the_sa
 
 
 @pytest.mark.slow
+def test_cameras_that_the_surface_moved_are_those_of_the_asset_and_stay_where_they_are_given(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    small = replace(WITHOUT_HOLLOWS, surface=replace(TINY.surface, cameras_after=(1,)))
+    monkeypatch.setitem(PRESETS, "tiny", small)
+    monkeypatch.setattr(register_cameras, "LEAST_AGREED", -1.0)
+    monkeypatch.setattr(register_cameras, "OVER_NOISE", -1.0)
+    told: list[Progress] = []
+    with pytest.raises(BuildStopped):
+        build_asset(capture, tmp_path / "moved", SETTINGS, told.append, stop_when("surface", told, 5))
+    moved = build_asset(capture, tmp_path / "moved", replace(SETTINGS, resume=True))
+    at_once = build_asset(capture, tmp_path / "at_once", SETTINGS)
+    given = build_asset(capture, tmp_path / "given", replace(SETTINGS, cameras="given"))
+    assert moved.provenance["cameras_moved_pixels"] > 0 and "cameras_moved_pixels" not in given.provenance
+    for one, other, before, view in zip(moved.cameras, at_once.cameras, given.cameras, load_views(capture).cameras, strict=True):
+        assert torch.equal(one.camera_from_world, other.camera_from_world) and torch.equal(before.camera_from_world, view.camera_from_world)
+        assert not torch.equal(one.camera_from_world, before.camera_from_world)
+        assert float((one.camera_from_world - before.camera_from_world).abs().max()) < 0.1
+    assert torch.equal(moved.mesh.vertices, at_once.mesh.vertices)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("binding", ["particles", "mesh"])
 def test_materials_can_be_fitted_on_surfels_as_in_the_paper(build: Build, capture: Path, tmp_path: Path, binding: str):
     out = tmp_path / "sphere"
@@ -358,6 +382,7 @@ def test_a_damaged_checkpoint_is_refused_on_resume_and_ignored_without(capture: 
     [
         (BuildSettings(preset="best"), "preset 'best' is unknown; expected one of draft, fast, full"),
         (BuildSettings(masks="none"), "masks 'none' is unknown; expected auto or given"),  # type: ignore[arg-type]
+        (BuildSettings(cameras="none"), "cameras 'none' is unknown; expected auto or given"),  # type: ignore[arg-type]
         (BuildSettings(binding="ropes"), "binding 'ropes' is unknown; expected one of particles, mesh"),
         (BuildSettings(device="tpu"), "device 'tpu' is unknown"),
     ],

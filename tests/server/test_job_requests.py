@@ -53,6 +53,7 @@ def test_every_kind_of_job_that_the_api_takes_can_be_begun_by_a_worker(service: 
     asked = [jobs._RUNS[info["kind"]](jobs._job_context(info["id"]))._request() for info in (meshed, again, infos[1])]
     assert [request.box for request in asked] == [((-1, -1, 0), (1, 1, 2)), ((-1, -1, 0), (1, 1, 2)), None]
     assert [request.masks for request in asked] == ["given", "given", "auto"]
+    assert [request.cameras for request in asked] == ["auto", "auto", "auto"]
     redecoupled = jobs._job_context(infos[1]["id"])
     assert redecoupled.parameters["built_preset"] == "draft" and redecoupled.dataset == service.settings.sample_capture.resolve()
 

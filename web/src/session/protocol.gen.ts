@@ -136,6 +136,8 @@ export interface BuildRequest {
   light?: "auto" | "object" | "camera";
   /** Where masks end: where the photographs show the object to end, if that is elsewhere (auto), or as given. */
   masks?: "auto" | "given";
+  /** Where photographs were taken from: where they fit the surface best, if that is elsewhere (auto), or as given. */
+  cameras?: "auto" | "given";
   /** Direction of the capture's world that points up; the asset's world is turned so that it is z. Not of multipart bodies. */
   up?: [number, number, number];
   /**

@@ -15,7 +15,7 @@ from drgs.reconstruct.progress import Progress
 from drgs.scene.strokes import Stroke
 from drgs_worker.jobs.capture_report import examine_capture
 from drgs_worker.jobs.progress import JobStopped, Tell
-from drgs_worker.jobs.requests import LightName, MaskName
+from drgs_worker.jobs.requests import CameraName, LightName, MaskName
 
 Corner = tuple[float, float, float]
 
@@ -46,6 +46,7 @@ class BuildRequest:
     strokes: tuple[Stroke, ...] = ()
     """None: the capture's own masks count."""
     masks: MaskName = "auto"
+    cameras: CameraName = "auto"
 
 
 Builder = Callable[[BuildRequest, Tell, Callable[[], bool]], Iterator[str]]
@@ -82,6 +83,7 @@ def build_with_drgs(request: BuildRequest, tell: Tell, should_stop: Callable[[],
         strokes=request.strokes,
         materials=request.materials,
         masks=request.masks,
+        cameras=request.cameras,
     )
 
     if request.materials is None:  # else the capture was examined by the build whose geometry this one takes

@@ -21,6 +21,7 @@ PresetName = Literal["draft", "fast", "full"]
 BindingName = Literal["particles", "mesh"]
 LightName = Literal["auto", "object", "camera"]
 MaskName = Literal["auto", "given"]
+CameraName = Literal["auto", "given"]
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.]{0,59}$"
 """Of pictures and variants: they become parts of file names, joined by `-`."""
@@ -105,6 +106,8 @@ class BuildRequest(_Job):
     """What the lamps stood still with: the object, or (on a turntable) the camera; auto: asked of the pictures."""
     masks: MaskName = "auto"
     """Where masks end: where the photographs show the object to end, if that is elsewhere (auto), or as given."""
+    cameras: CameraName = "auto"
+    """Where photographs were taken from: where they fit the surface best, if that is elsewhere (auto), or as given."""
     up: Triple = (0.0, 0.0, 1.0)
     """Direction of the capture's world that points up; the asset's world is turned so that it is z. Not of multipart bodies."""
     box: BoxCorners | None = None

@@ -11,13 +11,17 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float64, Int
 from torch import Tensor
 
 from drgs.reconstruct.fit.evidence.carve_hollows import CarveSettings, carved_depths
+from drgs.reconstruct.fit.evidence.register_cameras import register_cameras, seen_from
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings, fit_surface
-from drgs.reconstruct.fit.surface.moving_surface import mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.shade_surface import packed_surface
 from drgs.reconstruct.fit.surface.try_depths import TrialSettings, try_depths
 from drgs.reconstruct.fit.surface.try_kinds import iterations as iterations_of_kinds
 from drgs.reconstruct.fit.surface.try_kinds import try_kinds
@@ -26,6 +30,7 @@ from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces, divisions, undivided_faces
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
+from drgs.reconstruct.geometry.mask_outlines import mask_outlines
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.remesh import NothingEnclosed, remesh
 from drgs.render.intersect.trace_rays import build_tracer
@@ -62,6 +67,8 @@ class PassSettings:
     """How fine faces are divided after the last pass."""
     relief_steps: int = 70
     """On divided faces: of normals, materials and light, while the surface stays where it is."""
+    cameras_after: tuple[int, ...] = ()
+    """Passes, counted from 1, after which cameras are moved to where their photographs fit the surface, where they are off (register_cameras)."""
     carve_after: tuple[int, ...] = (3,)
     """Passes, counted from 1, after which hollows are looked for: once, two fifths of the way. Each time right places sink as well, by chance; earlier,
     normals and materials are not what carving asks, and later too few passes are left to smooth what was carved (figures in docs/decisions/0003)."""
@@ -79,6 +86,10 @@ class SurfaceFit:
     """Of the pass under way."""
     divided: int = 0
     """How often each face was divided, after the passes; the index is then their number."""
+    camera_from_world: Float64[Tensor, "view 4 4"] | None = None
+    """As cameras were moved; None: they are where the views have them."""
+    cameras_asked: int = 0
+    """Pass, counted from 1, after which it was last asked whether cameras are right."""
     doing: str = ""
     """What is under way besides the pass, in words."""
     remark: str = ""
@@ -196,6 +207,22 @@ def empty_tried_hollows(
     return True
 
 
+@torch.no_grad()
+def move_cameras(fit: SurfaceFit, views: Views, settings: PassSettings) -> Views:
+    """The views from where the photographs fit the surface as it is; the very views where their cameras are right."""
+    surface, targets = MovingSurface(views, fit.faces, fit.state), view_targets(views, 1.0, fit.faces.device)
+    surface.tracer = surface.tracer.with_materials(fit.mesh)
+    parameters = fit.state.parameters
+    light_of = surface.light_of(filter_environment(environment_table(parameters)))
+    outlines = mask_outlines(views) if views.has_masks else [None] * len(targets)
+    seed = settings.surface.seed + 7919 * (fit.index + 1)
+    found = register_cameras(surface.tracer, targets, outlines, light_of, packed_surface(parameters), seed)
+    if found.camera_from_world is None:
+        return views
+    fit.camera_from_world = found.camera_from_world
+    return seen_from(views, found.camera_from_world)
+
+
 def begin_as_either_kind(
     fit: SurfaceFit,
     views: Views,
@@ -303,6 +330,8 @@ def fit_surface_in_passes(
         if report is not None:
             report(replace(r, iteration=done + r.iteration, iterations=total))
 
+    if fit.camera_from_world is not None:
+        views = seen_from(views, fit.camera_from_world)
     while fit.index < settings.passes:
         number = fit.index + 1
         done = fit.index * steps + sum(more for after, more in between if after < number)
@@ -315,6 +344,10 @@ def fit_surface_in_passes(
                 return True
             start_relief(fit, times, settings, radius)
             break
+        if number in settings.cameras_after and fit.cameras_asked < number:
+            fit.doing = "looking whether cameras are right"
+            views, fit.cameras_asked = move_cameras(fit, views, settings), number
+            fit.doing = ""
         if turns and number == KINDS_AFTER and not begin_as_either_kind(fit, views, settings, partial(tell, done + steps), should_stop):
             return False
         if number in settings.try_after and not move_to_tried_depths(

@@ -87,6 +87,7 @@ _BODY: dict[str, Any] = {
                         "binding": {"type": "string", "enum": ["particles", "mesh"]},
                         "light": {"type": "string", "enum": ["auto", "object", "camera"]},
                         "masks": {"type": "string", "enum": ["auto", "given"]},
+                        "cameras": {"type": "string", "enum": ["auto", "given"]},
                         "seed": {"type": "integer"},
                     },
                 }
@@ -181,7 +182,7 @@ def _row_of(context: ServerContext, job_id: str, asked: JobRequest) -> JobRow:
         row.dataset, row.preset, row.seed = built.dataset, asked.preset, built.seed
         built_preset = built.parameters.get("built_preset", built.preset)
         kept = {"binding": built.parameters.get("binding", "particles"), "light": built.parameters.get("light", "auto")}
-        kept |= {name: built.parameters[name] for name in ("masks", "up", "box", "strokes") if name in built.parameters}
+        kept |= {name: built.parameters[name] for name in ("masks", "cameras", "up", "box", "strokes") if name in built.parameters}
         row.parameters = row.parameters | {"built_preset": built_preset, "built_seed": built.seed} | kept
     elif isinstance(asked, SimulateRequest):
         from drgs.deform.matter.simulation_scene import parse_simulation_scene
@@ -213,7 +214,7 @@ def _check_render(context: ServerContext, asked: RenderRequest) -> None:
 async def _receive_capture(request: Request, context: ServerContext, job_id: str) -> tuple[BuildRequest, Path]:
     upload = await receive_upload(request, {".zip"})
     try:
-        fields = {"dataset": "upload", "name": upload.name(), **upload.given("preset", "binding", "light", "masks", "seed")}
+        fields = {"dataset": "upload", "name": upload.name(), **upload.given("preset", "binding", "light", "masks", "cameras", "seed")}
         asked = BuildRequest.model_validate(fields)
         draft, target = context.scratch.folder / job_id, context.directory.uploads / job_id
         await run_in_threadpool(unpack_zip, upload.stream, draft)

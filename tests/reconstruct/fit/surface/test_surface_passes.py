@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 import torch
 
+from drgs.reconstruct.fit.evidence.register_cameras import CamerasFound
 from drgs.reconstruct.fit.fit_loop import FitReport
 from drgs.reconstruct.fit.surface import surface_passes
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, start_surface
@@ -140,6 +141,56 @@ def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tm
     total = 4 + settings.trials.iterations
     assert told == [(3, total), (total - 1, total), (total, total)]
     assert float(homes[0][0].norm()) == 0 and float(homes[0][1:].norm(dim=1).min()) > 0
+
+
+@pytest.mark.slow
+def test_the_fit_goes_on_from_where_cameras_were_moved_to_and_asks_once_a_pass(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    settings = PassSettings(
+        3,
+        SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)),
+        MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
+        carve_after=(),
+        try_after=(1,),
+        cameras_after=(1, 2),
+        relief_steps=0,
+    )
+    asked: list[int] = []
+    seen: list[torch.Tensor] = []
+
+    def registered(tracer, targets, outlines, light_of, surface, seed):
+        asked.append(seed)
+        assert len(surface) == len(tracer.mesh.vertices) and len(outlines) == len(targets)
+        assert light_of(targets[0]).open_share.shape == tracer.mesh.vertices.shape
+        if len(asked) == 2:
+            return CamerasFound(None, 0.02, 0.03)
+        moved = torch.stack([target.camera.camera_from_world.double() for target in targets])
+        moved[:, 0, 3] += 1e-3
+        return CamerasFound(moved, 0.3, 0.05)
+
+    def tried(views, parameters, faces, trials, radius, seed, report, should_stop):
+        return None  # stopped there, the first time and each time after
+
+    monkeypatch.setattr(surface_passes, "register_cameras", registered)
+    monkeypatch.setattr(surface_passes, "try_depths", tried)
+    fitted = surface_passes.fit_surface
+
+    def fit_seeing(views, *given):
+        seen.append(views.cameras[0].camera_from_world)
+        return fitted(views, *given)
+
+    monkeypatch.setattr(surface_passes, "fit_surface", fit_seeing)
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    begun, views = placed_sphere(), painted_views(tmp_path)
+    fit = SurfaceFit(start_surface(surfels, begun, grey_light(), settings.surface, SPHERE_RADIUS), begun.faces)
+    assert not fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS)
+    assert not fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS)
+    assert (fit.index, fit.cameras_asked, len(asked)) == (0, 1, 1), "cameras that were moved are not moved again when trials go on"
+    assert fit_surface_in_passes(views, fit, replace(settings, try_after=()), SPHERE_RADIUS)
+    assert (fit.cameras_asked, len(asked), len(set(asked))) == (2, 2, 2)
+    given = views.cameras[0].camera_from_world
+    assert torch.equal(seen[0], given)
+    for at in seen[1:]:
+        torch.testing.assert_close(at - given, 1e-3 * torch.eye(4)[:, :1] * torch.eye(4)[3], rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow

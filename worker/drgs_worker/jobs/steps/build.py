@@ -8,7 +8,7 @@ from pathlib import Path
 from drgs.reconstruct.progress import POSED, STAGE_SHARES
 from drgs.scene.strokes import Stroke, parse_strokes
 from drgs_worker.jobs.builders import BuildRequest, Corner
-from drgs_worker.jobs.requests import LightName, MaskName
+from drgs_worker.jobs.requests import CameraName, LightName, MaskName
 from drgs_worker.jobs.retry_while_unavailable import retry_while_unavailable
 from drgs_worker.jobs.steps.job_run import AbstractJobRun, JobContext
 from drgs_worker.store.artifacts import fetch_capture, refresh_job
@@ -30,6 +30,7 @@ class BuildRun(AbstractJobRun):
         self._binding: str = job.parameters.get("binding", "particles")
         self._light: LightName = job.parameters.get("light", "auto")
         self._masks: MaskName = job.parameters.get("masks", "given")  # as in builds of before there was a choice
+        self._cameras: CameraName = job.parameters.get("cameras", "given")
         x, y, z = job.parameters.get("up", (0.0, 0.0, 1.0))
         self._up: tuple[float, float, float] = (x, y, z)
         self._box = _corners(job.parameters.get("box"))
@@ -70,6 +71,7 @@ class BuildRun(AbstractJobRun):
             box=self._box,
             strokes=self._strokes,
             masks=self._masks,
+            cameras=self._cameras,
         )
 
     def _register(self) -> None:
@@ -137,6 +139,7 @@ class RedecoupleRun(BuildRun):
             self._box,
             self._strokes,
             self._masks,
+            self._cameras,
         )
 
 

@@ -1,0 +1,341 @@
+"""Cameras moved to where the fitted surface looks most like their photographs.
+
+Cameras of photographs are a part of a pixel off: structure from motion knows them by a few hundred points, and a turntable by its steps. A surface fitted
+to all of them is the mean of what they say, sharp where they agree; against it each camera can be held alone. A small motion of a camera moves all that it
+sees, and how depends on depth; so six numbers a view follow by least squares from what is left between the photograph and its prediction (split sum,
+as the surface is fitted), times the gradient of both, and from how far the mesh's outlines lie from the mask's. A robust weight leaves out what the
+surface does not explain.
+
+Right cameras would be made worse by a twentieth of a pixel, and what a surface has wrong looks like motion, too. So two halves of each picture, squares in
+turns, find their motions apart: what both say is the camera's, what only one says is noise. Where the views' halves agree on less than LEAST_AGREED,
+all cameras stay. What all views have in common is no camera's error but the world's own place and size, and is left out.
+Sources: small motions as a linear least squares of images: lucas1981; docs/sources.md.
+
+In: the mesh through its tracer, its normals and materials, photographs, outlines of masks. Out: moved cameras, or that they are right.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from numpy import ndarray
+from scipy.ndimage import binary_erosion, gaussian_filter
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from drgs.reconstruct.capture.turning_light import with_light_of_camera
+from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, at_corners
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, seen_places, shade_places, steep_enough
+from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.reconstruct.geometry.mask_outlines import MaskOutline, outline_rays, outline_residuals
+from drgs.render.intersect.tracer import AbstractTracer
+from drgs.scene.camera import Camera
+from drgs.scene.views import Views
+from drgs.warp_torch import by_pool
+
+LEAST_AGREED = 0.1
+"""[pixels] Root mean square of the motion on which halves agree, below which cameras stay."""
+OVER_NOISE = 2.0
+"""Times the motion on which halves do not agree: what cameras move by is more than that."""
+FIRST_LOOK = 16
+"""Views, evenly among all, that say first whether cameras are right."""
+PRIOR = 0.5
+"""[pixels] Standard deviation of each of a camera's six numbers, by what it moves at the middle of the picture."""
+BLUR = 0.7
+"""[pixels] Standard deviation of the smoothing of both pictures before they are compared."""
+RIM = 3
+"""[pixels] from where nothing is compared inwards: smoothing brings it along."""
+SQUARE = 1 / 6
+"""Side of the squares in which pixels belong to one half, of the picture's larger side."""
+MOST_PIXELS = 16_000
+"""Of a picture that are compared, evenly among all."""
+DRAWS = 2
+"""Of what mirrors see."""
+ALIKE = 0.1
+"""Of a residual's information: neighbours err alike."""
+ROUNDS = 6
+"""Of the robust weights."""
+LEAST_DEVIATION = 0.004, 0.03
+"""Of residuals: of colours [sRGB, 0..1] and of outlines [pixels]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CamerasFound:
+    """What photographs say of their cameras."""
+
+    camera_from_world: Float64[Tensor, "view 4 4"] | None
+    """Moved; None: they are right, as far as can be told."""
+    agreed: float
+    """[pixels] Root mean square of the motion on which the two halves of the pictures that were looked at agree; 0 where they contradict each other."""
+    noise: float
+    """[pixels] Root mean square of what is not known of it."""
+
+
+@torch.no_grad()
+def register_cameras(
+    tracer: AbstractTracer,
+    targets: Sequence[ViewTarget],
+    outlines: Sequence[MaskOutline | None],
+    light_of: LightOf,
+    surface: Float[Tensor, "vertex 8"],
+    seed: int,
+) -> CamerasFound:
+    """The cameras of the targets, moved; their intrinsics stay.
+
+    Args:
+        tracer: its mesh has the materials that mirrors see. outlines: of the targets' masks. surface: of packed_surface.
+    """
+
+    def looks_at(numbers: Sequence[int]) -> list[_Motion]:
+        def look(k: int, _: int) -> _Motion:
+            number = numbers[k]
+            generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
+            target = targets[number]
+            return _motion_of(target, outlines[number], tracer, light_of(target), surface, generator)
+
+        return by_pool(look, range(len(numbers) + 1), surface.device)
+
+    count = len(targets)
+    some = sorted({round(k) for k in np.linspace(0, count - 1, min(FIRST_LOOK, count))})
+    motions = dict(zip(some, looks_at(some), strict=True))
+    agreed, noise = agreement([motions[number] for number in some])
+    if agreed < max(LEAST_AGREED, OVER_NOISE * noise):
+        return CamerasFound(None, agreed, noise)
+    others = [number for number in range(count) if number not in motions]
+    motions |= dict(zip(others, looks_at(others), strict=True))
+    every = [motions[number] for number in range(count)]
+    twists = without_common([motion.world(motion.both) for motion in every], [motion.center for motion in every])
+    moved = [motion.camera_from_world @ _rigid(twist) for motion, twist in zip(every, twists, strict=True)]
+    agreed, noise = agreement(every)
+    return CamerasFound(torch.from_numpy(np.stack(moved)), agreed, noise)
+
+
+def seen_from(views: Views, camera_from_world: Float64[Tensor, "view 4 4"]) -> Views:
+    """The views with their cameras there; light that turns with cameras turns with these."""
+    transforms = camera_from_world.cpu()
+    cameras = tuple(
+        replace(camera, camera_from_world=transform.float()) for camera, transform in zip(views.cameras, transforms, strict=True)
+    )
+    seen = replace(views, cameras=cameras)
+    return seen if views.light_from_world is None else with_light_of_camera(seen)
+
+
+def moved_pixels(before: Views, after: Views, places: Float[Tensor, "place 3"]) -> float:
+    """[pixels] Root mean square by which places of the world [world units] moved in the pictures."""
+    squares = []
+    for one, other in zip(before.cameras, after.cameras, strict=True):
+        pixels = []
+        for camera in (one, other):
+            transform, intrinsics = camera.camera_from_world.double(), camera.intrinsics.double()
+            seen = (places.double() @ transform[:3, :3].T + transform[:3, 3]) @ intrinsics.T
+            pixels.append(seen[:, :2] / seen[:, 2:])
+        squares.append((pixels[0] - pixels[1]).square().sum(1).mean())
+    return float(torch.stack(squares).mean().sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Of one camera: by which its picture fits the photograph better. Motions are twists (rotation vector, translation) of what the camera sees, in its
+    frame [radians, world units]."""
+
+    camera_from_world: Float64[ndarray, "4 4"]
+    halves: tuple[Float64[ndarray, "6"], Float64[ndarray, "6"]]
+    both: Float64[ndarray, "6"]
+    metric: Float64[ndarray, "6 6"]
+    """Mean square [pixels^2] by which a twist moves what the camera sees."""
+
+    @property
+    def center(self) -> Float64[ndarray, "3"]:
+        return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+
+    def world(self, twist: Float64[ndarray, "6"]) -> Float64[ndarray, "6"]:
+        """The same motion as one of the world before it is seen."""
+        rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
+        return np.concatenate([rotation.T @ twist[:3], rotation.T @ (np.cross(twist[:3], translation) + twist[3:])])
+
+    def of_camera(self, twist: Float64[ndarray, "6"]) -> Float64[ndarray, "6"]:
+        """Of `world`, back."""
+        rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
+        turn = rotation @ twist[:3]
+        return np.concatenate([turn, rotation @ twist[3:] - np.cross(turn, translation)])
+
+
+def agreement(motions: Sequence[_Motion]) -> tuple[float, float]:
+    """[pixels] Root mean squares of what the halves agree on, and of the noise of their mean, without what all views have in common."""
+    centers = [motion.center for motion in motions]
+    halves = []
+    for half in range(2):
+        twists = without_common([motion.world(motion.halves[half]) for motion in motions], centers)
+        halves.append([motion.of_camera(twist) for motion, twist in zip(motions, twists, strict=True)])
+    metrics = [motion.metric for motion in motions]
+    agreed = np.mean([a @ metric @ b for a, b, metric in zip(*halves, metrics, strict=True)])
+    noise = np.mean([(a - b) @ metric @ (a - b) for a, b, metric in zip(*halves, metrics, strict=True)]) / 4
+    return float(np.sqrt(max(agreed, 0.0))), float(np.sqrt(noise))
+
+
+def without_common(twists: Sequence[Float64[ndarray, "6"]], centers: Sequence[Float64[ndarray, "3"]]) -> list[Float64[ndarray, "6"]]:
+    """Small motions of the world, one a camera, without the similarity nearest to them all: its place, its orientation and its size are no camera's error.
+
+    A world that grows by a small share looks to a camera at c like one that moved by minus that share of c, and kept its size.
+    """
+    turns, moves = (np.stack(part) for part in zip(*((twist[:3], twist[3:]) for twist in twists), strict=True))
+    turns = turns - turns.mean(0)
+    away = np.stack(centers)
+    away, moves = away - away.mean(0), moves - moves.mean(0)
+    spread = np.square(away).sum()
+    moves = moves - away * ((moves * away).sum() / spread if spread > 0 else 0.0)
+    return list(np.concatenate([turns, moves], 1))
+
+
+def _motion_of(
+    target: ViewTarget,
+    outline: MaskOutline | None,
+    tracer: AbstractTracer,
+    light: MeshLight,
+    surface: Float[Tensor, "vertex 8"],
+    generator: torch.Generator,
+) -> _Motion:
+    parts = [
+        _of_colors(target, tracer, light, surface, generator),
+        *([_of_outline(target.camera, outline, tracer)] if outline is not None else []),
+    ]
+    camera_from_world = _float64(target.camera.camera_from_world)
+    places = np.concatenate([part.places for part in parts])
+    if len(places) == 0:
+        return _Motion(camera_from_world, (np.zeros(6), np.zeros(6)), np.zeros(6), np.zeros((6, 6)))
+    # In pixels, so that one prior holds for all six.
+    focal = float(target.camera.intrinsics[0, 0])
+    scale = np.repeat([1 / focal, float(np.median(places[:, 2])) / focal], 3)
+    flows = _flows(places, _float64(target.camera.intrinsics)) * scale
+    metric = np.einsum("pka,pkb->ab", flows, flows) / len(places)
+    side = max(8.0, SQUARE * max(target.camera.width, target.camera.height))
+    prior = np.eye(6) / PRIOR**2
+    normal, right = prior, np.zeros(6)
+    halves = []
+    for half in range(2):
+        chosen = [part.of_half(half, side, scale) for part in parts]
+        own_normal, own_right = _robust(chosen, prior)
+        halves.append(np.linalg.solve(own_normal, own_right) * scale)
+        normal, right = normal + own_normal - prior, right + own_right
+    both = np.linalg.solve(normal, right) * scale
+    return _Motion(camera_from_world, (halves[0], halves[1]), both, metric / np.outer(scale, scale))
+
+
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """What motion should explain."""
+
+    pixels: Float64[ndarray, "place 2"]
+    """Column and row."""
+    places: Float64[ndarray, "place 3"]
+    """In the camera's frame [world units]."""
+    values: Float64[ndarray, "place k"]
+    slopes: Float64[ndarray, "place k 3"]
+    """Derivative of what is predicted by the place, moving in the camera's frame."""
+    least_deviation: float
+
+    def of_half(self, half: int, side: float, scale: Float64[ndarray, "6"]) -> tuple[ndarray, ndarray, float]:
+        """Rows (row, 6) by the scaled twist, values (row,), and the least deviation."""
+        squares = np.floor(self.pixels / side).astype(np.int64).sum(1)
+        chosen = squares % 2 == half
+        slopes = self.slopes[chosen].reshape(-1, 3)
+        places = np.repeat(self.places[chosen], self.values.shape[1], axis=0)
+        rows = np.concatenate([np.cross(places, slopes), slopes], 1) * scale
+        return rows, self.values[chosen].reshape(-1), self.least_deviation
+
+
+def _robust(parts: list[tuple[ndarray, ndarray, float]], prior: Float64[ndarray, "6 6"]) -> tuple[ndarray, ndarray]:
+    """Normal equations (6, 6) and (6,), weights of a Cauchy distribution of each part's own width."""
+    found = np.zeros(6)
+    normal, right = prior, np.zeros(6)
+    for _ in range(ROUNDS):
+        normal, right = prior.copy(), np.zeros(6)
+        for rows, values, least in parts:
+            if len(values) == 0:
+                continue
+            left = values - rows @ found
+            deviation = 1.48 * float(np.median(np.abs(left))) + least
+            weighted = rows * (ALIKE / (deviation**2 * (1 + np.square(left / (2 * deviation)))))[:, None]
+            normal += weighted.T @ rows
+            right += weighted.T @ values
+        found = np.linalg.solve(normal, right)
+    return normal, right
+
+
+def _of_colors(
+    target: ViewTarget, tracer: AbstractTracer, light: MeshLight, surface: Float[Tensor, "vertex 8"], generator: torch.Generator
+) -> _Residuals:
+    """Of pixels that mask and mesh fill."""
+    camera, (height, width) = target.camera, target.mask.shape
+    seen = seen_places(target, (target.mask.flatten() > SOLID).nonzero().squeeze(1), tracer)
+    seen = seen[steep_enough(seen, surface[:, :3].contiguous())]
+    predicted = torch.stack([shade_places(seen, target, tracer, surface, light, generator) for _ in range(DRAWS)]).mean(0)
+    photo = target.saturation.reshape(-1, 3)[seen.pixels]
+    world = at_corners(tracer.mesh.vertices, seen.corners, seen.weights)
+    in_camera = world @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    pixels = seen.pixels.cpu().numpy()
+
+    def map_of(values: Tensor) -> Float[ndarray, "height width *rest"]:
+        whole = np.zeros((height * width, *values.shape[1:]), np.float32)
+        whole[pixels] = values.cpu().numpy()
+        return whole.reshape(height, width, *values.shape[1:])[target.rows, target.columns]
+
+    valid: Bool[ndarray, "rows columns"] = map_of(torch.ones(len(pixels), dtype=torch.bool)) > 0
+    pictures = [gaussian_filter(map_of(values), (BLUR, BLUR, 0)) for values in (photo, predicted)]
+    if min(valid.shape) < 2:
+        return _Residuals(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), LEAST_DEVIATION[0])
+    down, across = np.gradient((pictures[0] + pictures[1]) / 2, axis=(0, 1))
+    row, column = binary_erosion(valid, iterations=RIM).nonzero()
+    stride = max(1, -(-len(row) // MOST_PIXELS))
+    row, column = row[stride // 2 :: stride], column[stride // 2 :: stride]
+    places = map_of(in_camera)[row, column].astype(np.float64)
+    # A picture that moves by a flow shows at a place what was that far before it.
+    by_pixel = -np.stack([across, down], -1)[row, column].astype(np.float64)
+    slopes = by_pixel @ _flow_by_place(places, _float64(camera.intrinsics))
+    values = (pictures[0] - pictures[1])[row, column].astype(np.float64)
+    at = np.stack([column + target.columns.start, row + target.rows.start], 1) + 0.5
+    return _Residuals(at, places, values, slopes, LEAST_DEVIATION[0])
+
+
+def _of_outline(camera: Camera, outline: MaskOutline, tracer: AbstractTracer) -> _Residuals:
+    """Of places where the mask ends."""
+    device = tracer.mesh.vertices.device
+    found = outline_residuals(tracer, outline_rays((camera,), [outline], device))
+    world = at_corners(tracer.mesh.vertices, found.corners, found.weights)
+    rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+    places, slopes = _float64(world @ rotation.T + translation), _float64(found.gradient @ rotation.T)
+    homogeneous = places @ _float64(camera.intrinsics).T
+    at = homogeneous[:, :2] / homogeneous[:, 2:]
+    return _Residuals(at, places, -_float64(found.distance)[:, None], slopes[:, None], LEAST_DEVIATION[1])
+
+
+def _flow_by_place(places: Float64[ndarray, "place 3"], intrinsics: Float64[ndarray, "3 3"]) -> Float64[ndarray, "place 2 3"]:
+    """Derivative of the pixel by the place in the camera's frame."""
+    x, y, z = places.T
+    zero, (focal_x, focal_y) = np.zeros_like(z), np.diagonal(intrinsics)[:2]
+    return np.stack(
+        [
+            np.stack([focal_x / z, zero, -focal_x * x / z**2], -1),
+            np.stack([zero, focal_y / z, -focal_y * y / z**2], -1),
+        ],
+        1,
+    )
+
+
+def _flows(places: Float64[ndarray, "place 3"], intrinsics: Float64[ndarray, "3 3"]) -> Float64[ndarray, "place 2 6"]:
+    """Derivative of the pixel by a twist."""
+    by_place = _flow_by_place(places, intrinsics)
+    return np.concatenate([np.cross(places[:, None], by_place), by_place], -1)
+
+
+def _rigid(twist: Float64[ndarray, "6"]) -> Float64[ndarray, "4 4"]:
+    """The transform of a small twist."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = Rotation.from_rotvec(twist[:3]).as_matrix(), twist[3:]
+    return transform
+
+
+def _float64(values: Tensor) -> Float64[ndarray, "*shape"]:
+    return values.detach().double().cpu().numpy()
