@@ -106,8 +106,8 @@ def register_cameras(
     others = [number for number in range(count) if number not in motions]
     motions |= dict(zip(others, looks_at(others), strict=True))
     every = [motions[number] for number in range(count)]
-    twists = without_common([motion.world(motion.both) for motion in every], [motion.center for motion in every])
-    moved = [motion.camera_from_world @ _rigid(twist) for motion, twist in zip(every, twists, strict=True)]
+    twists = without_common(every, [motion.both for motion in every])
+    moved = [_rigid(twist) @ motion.camera_from_world for motion, twist in zip(every, twists, strict=True)]
     agreed, noise = agreement(every)
     return CamerasFound(torch.from_numpy(np.stack(moved)), agreed, noise)
 
@@ -150,13 +150,8 @@ class _Motion:
     def center(self) -> Float64[ndarray, "3"]:
         return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
 
-    def world(self, twist: Float64[ndarray, "6"]) -> Float64[ndarray, "6"]:
-        """The same motion as one of the world before it is seen."""
-        rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
-        return np.concatenate([rotation.T @ twist[:3], rotation.T @ (np.cross(twist[:3], translation) + twist[3:])])
-
     def of_camera(self, twist: Float64[ndarray, "6"]) -> Float64[ndarray, "6"]:
-        """Of `world`, back."""
+        """A twist of the world before it is seen, as one of what the camera sees."""
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         turn = rotation @ twist[:3]
         return np.concatenate([turn, rotation @ twist[3:] - np.cross(turn, translation)])
@@ -164,29 +159,28 @@ class _Motion:
 
 def agreement(motions: Sequence[_Motion]) -> tuple[float, float]:
     """[pixels] Root mean squares of what the halves agree on, and of the noise of their mean, without what all views have in common."""
-    centers = [motion.center for motion in motions]
-    halves = []
-    for half in range(2):
-        twists = without_common([motion.world(motion.halves[half]) for motion in motions], centers)
-        halves.append([motion.of_camera(twist) for motion, twist in zip(motions, twists, strict=True)])
-    metrics = [motion.metric for motion in motions]
-    agreed = np.mean([a @ metric @ b for a, b, metric in zip(*halves, metrics, strict=True)])
-    noise = np.mean([(a - b) @ metric @ (a - b) for a, b, metric in zip(*halves, metrics, strict=True)]) / 4
+    first, second = (without_common(motions, [motion.halves[half] for motion in motions]) for half in range(2))
+    every = list(zip(first, second, (motion.metric for motion in motions), strict=True))
+    agreed = np.mean([a @ metric @ b for a, b, metric in every])
+    noise = np.mean([(a - b) @ metric @ (a - b) for a, b, metric in every]) / 4
     return float(np.sqrt(max(agreed, 0.0))), float(np.sqrt(noise))
 
 
-def without_common(twists: Sequence[Float64[ndarray, "6"]], centers: Sequence[Float64[ndarray, "3"]]) -> list[Float64[ndarray, "6"]]:
-    """Small motions of the world, one a camera, without the similarity nearest to them all: its place, its orientation and its size are no camera's error.
+def without_common(motions: Sequence[_Motion], twists: Sequence[Float64[ndarray, "6"]]) -> list[Float64[ndarray, "6"]]:
+    """Twists, one a camera in its frame, without the similarity of the world that comes nearest to them all in the pictures: the world's place, orientation and
+    size are no camera's error.
 
-    A world that grows by a small share looks to a camera at c like one that moved by minus that share of c, and kept its size.
+    A world that grows by a small share looks to a camera at c like one that moved by that share of c, and kept its size.
     """
-    turns, moves = (np.stack(part) for part in zip(*((twist[:3], twist[3:]) for twist in twists), strict=True))
-    turns = turns - turns.mean(0)
-    away = np.stack(centers)
-    away, moves = away - away.mean(0), moves - moves.mean(0)
-    spread = np.square(away).sum()
-    moves = moves - away * ((moves * away).sum() / spread if spread > 0 else 0.0)
-    return list(np.concatenate([turns, moves], 1))
+    bases = []
+    for motion in motions:
+        growing = motion.of_camera(np.concatenate([np.zeros(3), motion.center]))
+        bases.append(np.stack([*(motion.of_camera(axis) for axis in np.eye(6)), growing], 1))
+    every = list(zip(bases, (motion.metric for motion in motions), twists, strict=True))
+    normal = np.sum([basis.T @ metric @ basis for basis, metric, _ in every], 0)
+    right = np.sum([basis.T @ metric @ twist for basis, metric, twist in every], 0)
+    common = np.linalg.lstsq(normal, right, rcond=None)[0]
+    return [twist - basis @ common for basis, _, twist in every]
 
 
 def _motion_of(

@@ -12,7 +12,6 @@ from drgs.reconstruct.fit.evidence import register_cameras as module
 from drgs.reconstruct.fit.evidence.register_cameras import (
     CamerasFound,
     agreement,
-    moved_pixels,
     register_cameras,
     seen_from,
     without_common,
@@ -66,17 +65,19 @@ def registered(mesh: TriangleMesh, targets: Sequence[ViewTarget], outlines: list
     return register_cameras(build_tracer(mesh), targets, outlines, open_light(mesh, filter_environment(light())), surface, 0)
 
 
-def off_by(true: Sequence[ViewTarget], views: Views, places: torch.Tensor) -> float:
+def off_by(true: Sequence[ViewTarget], views: Views) -> float:
     """[pixels] Without what all cameras have in common, which nothing tells."""
-    turns = []
+    motions, twists = [], []
     for target, camera in zip(true, views.cameras, strict=True):
-        step = torch.linalg.inv(target.camera.camera_from_world.double()) @ camera.camera_from_world.double()
-        turns.append(np.concatenate([Rotation.from_matrix(step[:3, :3].numpy()).as_rotvec(), step[:3, 3].numpy()]))
-    centers = [target.camera.center_world.double().numpy() for target in true]
-    own = torch.from_numpy(np.stack([rigid(twist) for twist in without_common(turns, centers)]))
-    given = views_of(true)
-    at = torch.stack([camera.camera_from_world.double() for camera in given.cameras]) @ own
-    return moved_pixels(given, seen_from(given, at), places)
+        pose = target.camera.camera_from_world.double().numpy()
+        step = camera.camera_from_world.double().numpy() @ np.linalg.inv(pose)
+        twists.append(np.concatenate([Rotation.from_matrix(step[:3, :3]).as_rotvec(), step[:3, 3]]))
+        places = sphere_mesh(subdivisions=2).vertices.double().numpy() @ pose[:3, :3].T + pose[:3, 3]
+        flows = module._flows(places, target.camera.intrinsics.double().numpy())
+        metric = np.einsum("pka,pkb->ab", flows, flows) / len(places)
+        motions.append(module._Motion(pose, (np.zeros(6), np.zeros(6)), np.zeros(6), metric))
+    own = without_common(motions, twists)
+    return float(np.sqrt(np.mean([twist @ motion.metric @ twist for twist, motion in zip(own, motions, strict=True)])))
 
 
 @pytest.mark.parametrize("asks", ["colours and outlines", "colours", "outlines"])
@@ -89,8 +90,7 @@ def test_cameras_that_are_off_come_back(asks: str):
     outlines = [mask_outline(target.mask) if "outlines" in asks else None for target in true]
     found = registered(mesh, given, outlines)
     assert found.camera_from_world is not None
-    before = off_by(true, views_of(given), mesh.vertices)
-    left = off_by(true, seen_from(views_of(given), found.camera_from_world), mesh.vertices)
+    before, left = off_by(true, views_of(given)), off_by(true, seen_from(views_of(given), found.camera_from_world))
     # A ball's outline does not tell which way it is turned, its waves do; of its depth neither says much.
     assert before > 0.3 and left < (0.3 if asks == "outlines" else 0.1) * before, (before, left)
     assert found.agreed == pytest.approx(before, rel=0.2) and found.noise < 0.3 * found.agreed
@@ -143,8 +143,7 @@ def test_motions_of_the_world_are_those_of_the_camera_and_flows_are_their_deriva
     camera_from_world = rigid(random.normal(size=6))
     motion = module._Motion(camera_from_world, (np.zeros(6), np.zeros(6)), np.zeros(6), np.eye(6))
     twist = 1e-6 * random.normal(size=6)
-    np.testing.assert_allclose(motion.of_camera(motion.world(twist)), twist, atol=1e-15)
-    np.testing.assert_allclose(camera_from_world @ rigid(motion.world(twist)), rigid(twist) @ camera_from_world, atol=1e-11)
+    np.testing.assert_allclose(rigid(motion.of_camera(twist)) @ camera_from_world, camera_from_world @ rigid(twist), atol=1e-11)
     intrinsics = np.array([[90.0, 0, 38], [0, 84, 26], [0, 0, 1]])
     places = random.normal(size=(5, 3)) + np.array([0, 0, 4])
 
@@ -157,21 +156,37 @@ def test_motions_of_the_world_are_those_of_the_camera_and_flows_are_their_deriva
     np.testing.assert_allclose(flows @ twist, pixels(moved) - pixels(places), rtol=1e-4, atol=1e-9)
 
 
+def motions_of(random: np.random.Generator, halves: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[module._Motion]:
+    motions = []
+    for half in halves:
+        spread = random.normal(size=(6, 6))
+        motions.append(module._Motion(rigid(2 * random.normal(size=6)), half, half[0], spread @ spread.T + np.eye(6)))
+    return motions
+
+
 def test_a_world_that_is_elsewhere_turned_and_larger_is_no_camera_s_error():
     random = np.random.default_rng(0)
-    centers = list(random.normal(size=(7, 3)) * 3)
-    turn, move, grow = 1e-3 * random.normal(size=3), 1e-3 * random.normal(size=3), 1e-3
-    common = [np.concatenate([turn, move - grow * center]) for center in centers]
-    np.testing.assert_allclose(without_common(common, centers), 0, atol=1e-12)
-    own = without_common(list(1e-3 * random.normal(size=(7, 6))), centers)
-    np.testing.assert_allclose(without_common([a + b for a, b in zip(own, common, strict=True)], centers), own, atol=1e-12)
+    motions = motions_of(random, [(np.zeros(6), np.zeros(6))] * 7)
+    moved, grown = 1e-3 * random.normal(size=6), 1e-3
+    common = [motion.of_camera(moved + grown * np.concatenate([np.zeros(3), motion.center])) for motion in motions]
+    np.testing.assert_allclose(without_common(motions, common), 0, atol=1e-12)
+    twists = list(1e-3 * random.normal(size=(7, 6)))
+    own = without_common(motions, twists)
+    np.testing.assert_allclose(without_common(motions, [a + b for a, b in zip(twists, common, strict=True)]), own, atol=1e-12)
+    # No other similarity leaves less to be seen.
+    seen, other = (sum(t @ m.metric @ t for m, t in zip(motions, some, strict=True)) for some in (own, np.add(own, 0.1 * np.array(common))))
+    assert seen < other
+    point = np.array([0.3, -0.2, 0.5, 1.0])
+    for motion in motions:
+        larger = motion.camera_from_world @ np.append((1 + grown) * point[:3], 1.0)
+        nearer = rigid(motion.of_camera(grown * np.concatenate([np.zeros(3), motion.center]))) @ motion.camera_from_world @ point
+        np.testing.assert_allclose(nearer[:2] / nearer[2], larger[:2] / larger[2], rtol=1e-5)
 
 
 def test_halves_that_contradict_each_other_agree_on_nothing():
     random = np.random.default_rng(0)
     twists = [1e-3 * random.normal(size=6) for _ in range(9)]
-    poses = [rigid(random.normal(size=6)) for _ in twists]
-    against = [module._Motion(pose, (twist, -twist), 0 * twist, np.eye(6)) for pose, twist in zip(poses, twists, strict=True)]
-    assert agreement(against)[0] == 0 and agreement(against)[1] > 0
-    alike = [module._Motion(pose, (twist, twist), twist, np.eye(6)) for pose, twist in zip(poses, twists, strict=True)]
-    assert agreement(alike)[0] > 0 and agreement(alike)[1] == pytest.approx(0, abs=1e-12)
+    agreed, noise = agreement(motions_of(random, [(twist, -twist) for twist in twists]))
+    assert agreed == 0 and noise > 0
+    agreed, noise = agreement(motions_of(random, [(twist, twist) for twist in twists]))
+    assert agreed > 0 and noise == pytest.approx(0, abs=1e-12)
