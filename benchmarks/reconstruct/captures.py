@@ -1,7 +1,7 @@
-"""What builds make of captures that were taken otherwise: through a lens that bends, in several sizes, exposed differently, with grain, masks and cameras
+"""What builds make of captures that were taken otherwise: through a lens that bends, in several sizes, exposed differently, or balanced, with grain, masks and cameras
 that are a little off, on a turntable.
 
-    python -m benchmarks captures OUT --scenes SCENE ... [--ways lens sizes exposures grain masks cutouts poses turned] [--preset draft] [--spp 32] [--every 1] [--side 256]
+    python -m benchmarks captures OUT --scenes SCENE ... [--ways lens sizes exposures white grain masks cutouts poses turned] [--preset draft] [--spp 32] [--every 1] [--side 256]
 
 All but the last change a scene's photographs (scenes/retake_photographs.py) and are held against a build of the scene as it is. For the last, both the
 plain and the turned capture are drawn by us, from the scene's mesh and materials under its light (draw_scene), for nobody photographed the scene so.

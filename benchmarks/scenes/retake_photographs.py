@@ -1,6 +1,6 @@
 """A capture's photographs as another camera would have taken them, and others have cut them out and placed them: through a lens that bends, in several
-sizes, with exposures that differ; with grain and artefacts of JPEG, masks that are a pixel or two off (beside whole photographs, or cut out by them), and
-cameras a fraction of a pixel off.
+sizes, with exposures or white balances that differ; with grain and artefacts of JPEG, masks that are a pixel or two off (beside whole photographs, or cut
+out by them), and cameras a fraction of a pixel off.
 
 In: a scene as the benchmark lays it out (NeRF-synthetic, cameras by camera_angle_x, RGBA pictures). Out: a folder that builds read, with photographs
 alone; what is built of it is scored against the scene itself. Nothing is drawn: pixels are resampled in linear, premultiplied light.
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.scenes.bench_scene import Array, read_rgba
 from drgs.maths.color_numpy import linear_from_srgb, srgb_from_linear
 
-Way = Literal["lens", "sizes", "exposures", "grain", "masks", "cutouts", "poses"]
+Way = Literal["lens", "sizes", "exposures", "white", "grain", "masks", "cutouts", "poses"]
 WAYS: tuple[Way, ...] = get_args(Way)
 K1, K2 = -0.2, 0.05
 """Of the lens: OpenCV's radial coefficients."""
@@ -28,6 +28,8 @@ SIZES = (1.0, 0.75, 0.5)
 """Of the photographs in turn, of the scene's."""
 MOST_STOPS = 1.0
 """By which exposures differ from the scene's, either way, evenly by chance."""
+TINT = 0.06
+"""Of red and of blue, by a white balance that is found anew for each photograph: standard deviation of the logarithm over green."""
 GRAIN, JPEG_QUALITY = 0.01, 88
 """Of the sensor, standard deviation of linear light that is white at 1, times its square root; and of the file."""
 MASK_WIDE, MASK_OFF, MASK_WAVES = 0.7, 1.0, 12.0
@@ -61,6 +63,9 @@ def retake_photographs(scene: Path, out: Path, way: Way) -> None:
             light = shrunk(light, SIZES[number % len(SIZES)])
         elif way == "exposures":
             light = light * np.append(np.full(3, 2 ** stops[number]), 1.0)
+        elif way == "white":
+            red, blue = np.exp(random.normal(scale=TINT, size=2))
+            light = light * np.array([red, 1.0, blue, 1.0])
         elif way == "grain":
             light = grainy(light, random)
         elif way in ("masks", "cutouts"):

@@ -495,8 +495,12 @@ def calibrations(views: Views) -> dict[str, Any]:
 
 
 def _exposures(views: Views) -> dict[str, Any]:
-    """Of each photograph, by how many stops it was exposed more than the mean; nothing where all are alike."""
-    return {} if views.gains is None else {"exposure_stops": [round(math.log2(gain), 3) for gain in views.gains]}
+    """Of each photograph, by how many stops it was exposed more than the mean, and how much more of red and blue it keeps; nothing where all are alike."""
+    stops = {} if views.gains is None else {"exposure_stops": [round(math.log2(gain), 3) for gain in views.gains]}
+    tints = (
+        {} if views.tints is None else {"white_balance": [{"red": round(red, 3), "blue": round(blue, 3)} for red, _, blue in views.tints]}
+    )
+    return stops | tints
 
 
 def kept_photographs(views: Views) -> bytes:

@@ -30,6 +30,9 @@ class Views:
     """As the photographs on disc were calibrated, one a view: None where it was a pinhole already. The images here are undistorted."""
     gains: tuple[float, ...] | None = None
     """Of each view, how much more of the light its exposure keeps than the mean one (mean of logarithms 0); None: all alike."""
+    tints: tuple[tuple[float, float, float], ...] | None = None
+    """Of each view, how much more of red, green and blue its white balance keeps than the mean one, beside its gain; green 1, means of logarithms 0. None: all
+    alike."""
     light_from_world: tuple[Float[Tensor, "3 3"], ...] | None = None
     """Of each view, the rotation of directions in the world to those of the light's own table; None: the light stands still in the world."""
     ground: Ground | None = None

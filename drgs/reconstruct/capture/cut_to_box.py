@@ -104,6 +104,7 @@ def chosen_views(views: Views, kept: list[int]) -> Views:
         coverage=of(views.coverage),
         lenses=of(views.lenses) if views.lenses else (),
         gains=None if views.gains is None else of(views.gains),
+        tints=None if views.tints is None else of(views.tints),
         light_from_world=None if views.light_from_world is None else of(views.light_from_world),
     )
 

@@ -1,11 +1,13 @@
-"""By how much each photograph was exposed more than the others: a camera that measures light anew for each picture makes one surface bright here
-and dark there, which a fit would explain by light or paint.
+"""By how much each photograph was exposed more than the others, and how much redder or bluer its white balance made it: a camera that measures light anew for
+each picture makes one surface bright here and dark there, which a fit would explain by light or paint.
 
 Three sources, the first that knows wins: what the camera wrote into the files (exposure_gains.py); points of the object that several photographs show,
 before anything is fitted; the surfels of stage 1, which know what depends on the view, afterwards. Gains are relative: their logarithms have
 the mean 0. Where they differ by less than chance would make them, there are none, and nothing changes.
 
-In: Views. Out: Views with `gains`, or the very same.
+White balances only the surfels tell, for points that mirror coloured things differ as much.
+
+In: Views. Out: Views with `gains`, or `tints`, or the very same.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,6 +29,8 @@ VARIED_STOPS = 0.2
 """From which exposures must differ, of `jumps`: shine and shadow make up to 0.12 of it on public scenes."""
 LEFT_STOPS = 0.1
 """The same after stage 1, which explains what depends on the view."""
+LEFT_TINT_STOPS = 0.08
+"""Of red or blue over green, after stage 1. Public scenes have at most 0.04 (the blue of gold), a wooden tankard's photographs 0.06."""
 NEIGHBOURS = 4
 SOLID = 0.9
 """Least coverage and mask of a pixel that is compared."""
@@ -79,20 +83,25 @@ def with_gains_of_points(views: Views, points: InitialPoints) -> Views:
 
 
 def with_gains_of_fit(views: Views, drawn: Callable[[ViewTarget], tuple[Tensor, Tensor]]) -> Views:
-    """Gains by what a fit draws of the object, at half size; those that are known already are made better.
+    """Gains and tints by what a fit draws of the object, at half size; those that are known already are made better.
 
     Args:
         drawn: linear radiance (height, width, 3) that a view's camera sees by the fit, and coverage (height, width).
     """
-    left = [_stops_left(target, *drawn(target)) for target in view_targets(views, 0.5, torch.device("cpu"))]
+    left = np.array([_stops_left(target, *drawn(target)) for target in view_targets(views, 0.5, torch.device("cpu"))])
     gains = np.ones(len(left)) if views.gains is None else np.array(views.gains)
-    if views.gains is None and jumps(left, views) <= LEFT_STOPS:
+    tints = np.ones((len(left), 3)) if views.tints is None else np.array(views.tints)
+    if views.tints is not None or max(jumps(left[:, channel], views) for channel in (1, 2)) > LEFT_TINT_STOPS:
+        red, blue = (gains_of_stops(np.log2(tints[:, channel]) + left[:, k]) for channel, k in ((0, 1), (2, 2)))
+        views = replace(views, tints=tuple((r, 1.0, b) for r, b in zip(red, blue, strict=True)))
+    if views.gains is None and jumps(left[:, 0], views) <= LEFT_STOPS:
         return views
-    return with_gains(views, np.log2(gains) + np.array(left))
+    return with_gains(views, np.log2(gains) + left[:, 0])
 
 
-def _stops_left(target: ViewTarget, radiance: Tensor, coverage: Tensor) -> float:
-    """Median by which the photograph is brighter than what was drawn; nan where too little can be compared."""
+def _stops_left(target: ViewTarget, radiance: Tensor, coverage: Tensor) -> tuple[float, float, float]:
+    """Medians by which the photograph is brighter than what was drawn, and by which its red and its blue are, more than its green; nan where too little
+    can be compared."""
     radiance, coverage = radiance.cpu(), coverage.cpu()
     shown = luminance(radiance)
     photo = luminance(linear_from_srgb(target.saturation))
@@ -100,8 +109,11 @@ def _stops_left(target: ViewTarget, radiance: Tensor, coverage: Tensor) -> float
     within = (target.saturation > DARKEST * target.ceiling) & (target.saturation < BRIGHTEST * target.ceiling)
     compared &= within.all(-1)
     if int(compared.sum()) < FEWEST_PIXELS:
-        return float("nan")
-    return float((photo[compared] / shown[compared]).log2().median())
+        return float("nan"), float("nan"), float("nan")
+    brighter = (photo[compared] / shown[compared]).log2().median()
+    channels = (linear_from_srgb(target.saturation[compared]) / radiance[compared].clamp(min=1e-6)).log2()
+    red, blue = ((channels[:, channel] - channels[:, 1]).median() for channel in (0, 2))
+    return float(brighter), float(red), float(blue)
 
 
 def jumps(stops: Sequence[float] | Float[ndarray, "view"], views: Views) -> float:

@@ -27,7 +27,7 @@ class ViewTarget:
     photo: Float[Tensor, "height width 3"]
     """SRGB times mask."""
     saturation: Float[Tensor, "height width 3"]
-    """SRGB as stored; of views with gains, as the mean exposure would have stored it, above 1 where that clips."""
+    """SRGB as stored; of views with gains or tints, as the mean exposure and white balance would have stored it, above 1 where that clips."""
     mask: Float[Tensor, "height width"]
     rows: slice
     columns: slice
@@ -52,14 +52,19 @@ class ViewTarget:
 
 
 def view_targets(views: Views, factor: float, device: torch.device) -> list[ViewTarget]:
-    """Photos at `factor` times their size, of one exposure, premultiplied by their masks."""
+    """Photos at `factor` times their size, of one exposure and white balance, premultiplied by their masks."""
     targets = []
     gains = views.gains or (1.0,) * len(views.cameras)
     turns = views.light_from_world or (None,) * len(views.cameras)
-    for camera, image, mask, gain, turn in zip(views.cameras, views.images_srgb, views.coverage, gains, turns, strict=True):
+    tints = views.tints or ((1.0, 1.0, 1.0),) * len(views.cameras)
+    seen = zip(views.cameras, views.images_srgb, views.coverage, gains, tints, turns, strict=True)
+    for camera, image, mask, gain, tint, turn in seen:
         photo, alpha, ceiling = image.float() / 255, mask.float() / 255, 1.0
-        if gain != 1:
-            photo, ceiling = srgb_from_linear(linear_from_srgb(photo) / gain), float(srgb_from_linear(torch.tensor(1 / gain)))
+        if gain != 1 or tint != (1.0, 1.0, 1.0):
+            kept = gain * torch.tensor(tint)
+            # Of all channels from where the first clips: a colour of which one is cut off says no more than that it is as bright.
+            ceiling = float(srgb_from_linear(1 / kept.max()))
+            photo = srgb_from_linear(linear_from_srgb(photo) / kept).clamp(max=ceiling)
         small = scaled_camera(camera, factor)
         if factor != 1:
             stacked = torch.cat([photo * alpha[..., None], alpha[..., None], photo], -1).permute(2, 0, 1)[None]

@@ -80,6 +80,18 @@ def test_exposures_differ_by_a_stop_at_most_and_in_linear_light(scene: Path, tmp
     assert max(np.abs(stops)) < MOST_STOPS + 0.1 and max(stops) - min(stops) > 0.2
 
 
+def test_white_balances_change_red_and_blue_by_a_factor_a_picture(scene: Path, tmp_path: Path) -> None:
+    out, factors = taken(scene, "white", tmp_path), []
+    for k in range(3):
+        plain, taken_so = (premultiplied(read_rgba(folder / "train" / f"r_00{k}.png")) for folder in (scene, out))
+        inside = plain[..., 3] == 1
+        ratio = taken_so[inside][:, :3] / plain[inside][:, :3]
+        assert np.abs(ratio / np.median(ratio, 0) - 1).max() < 0.1
+        factors.append(np.median(ratio, 0))
+    logs = np.log(factors)
+    assert np.abs(logs[:, 1]).max() < 1e-3 and 0.01 < np.abs(logs[:, [0, 2]]).max() < 0.3 and np.ptp(logs[:, 0]) > 0.01
+
+
 def test_all_ways_are_captures_of_the_same_cameras(scene: Path, tmp_path: Path) -> None:
     first = load_views(scene).cameras
     for way in WAYS:

@@ -86,9 +86,11 @@ def test_a_box_beside_the_object_is_refused_with_where_the_object_is(ball: Views
 
 def test_views_in_which_the_rest_hides_the_content_are_left_out(ball: Views) -> None:
     cut = [CutMask(mask, 0.5 if index % 3 == 0 else 0.0) for index, mask in enumerate(ball.coverage)]
-    left = shown_views(replace(ball, gains=tuple(map(float, range(len(cut))))), cut, ALL)
+    numbers = tuple(map(float, range(len(cut))))
+    left = shown_views(replace(ball, gains=numbers, tints=tuple((number, 1.0, 1.0) for number in numbers)), cut, ALL)
     assert [camera.name for camera in left.cameras] == [camera.name for k, camera in enumerate(ball.cameras) if k % 3]
     assert left.gains == tuple(float(k) for k in range(len(cut)) if k % 3)
+    assert left.tints == tuple((float(k), 1.0, 1.0) for k in range(len(cut)) if k % 3)
     assert [camera.name for camera in views_of(ball, left).cameras] == [camera.name for camera in left.cameras]
     with pytest.raises(CaptureFault, match="in 20 of 24 pictures something outside the box"):
         shown_views(ball, [replace(mask, hidden_share=0.5 * (k >= 4)) for k, mask in enumerate(cut)], ALL)

@@ -72,6 +72,40 @@ def test_a_fit_tells_exposures_to_a_hundredth_of_a_stop(even: Views) -> None:
     assert with_gains_of_fit(even, lambda target: true_picture(even, target)) is even
 
 
+def balanced(views: Views, tints: np.ndarray) -> Views:
+    """As a camera would have stored them whose white balance keeps that much more of each channel."""
+    images = []
+    for image, tint in zip(views.images_srgb, tints, strict=True):
+        linear = linear_from_srgb(image.double() / 255) * torch.from_numpy(tint)
+        images.append((255 * srgb_from_linear(linear).clamp(0, 1)).round().to(torch.uint8))
+    return replace(views, images_srgb=tuple(images))
+
+
+@pytest.mark.slow
+def test_a_fit_tells_white_balances_and_fits_see_pictures_of_one(even: Views) -> None:
+    random = np.random.default_rng(2)
+    logs = random.normal(scale=0.1, size=(len(even.cameras), 3)) * [1, 0, 1]
+    tints = np.exp(logs - logs.mean(0))
+    varied = balanced(even, tints)
+    found = with_gains_of_fit(varied, lambda target: true_picture(even, target))
+    assert found.gains is None and found.tints is not None
+    assert float(np.abs(np.log(found.tints) - np.log(tints)).max()) < 0.02
+    again = with_gains_of_fit(found, lambda target: true_picture(even, target))
+    assert again.tints is not None and float(np.abs(np.log(again.tints) - np.log(tints)).max()) < 0.01
+    for target, true in zip(view_targets(again, 1.0, CPU), view_targets(even, 1.0, CPU), strict=True):
+        inside = (true.mask > 0.99)[..., None] & (true.saturation < 0.85)
+        assert float((target.saturation - true.saturation)[inside.expand_as(true.saturation)].abs().max()) < 0.02
+        assert float(target.saturation.max()) <= target.ceiling <= 1.2
+
+
+def test_a_channel_that_is_cut_off_bounds_all(even: Views) -> None:
+    image = torch.full_like(even.images_srgb[0], 255)
+    white = replace(even, images_srgb=(image,) * len(even.cameras), tints=((1.2, 1.0, 0.8),) * len(even.cameras))
+    target = view_targets(white, 1.0, CPU)[0]
+    assert target.ceiling == pytest.approx(float(srgb_from_linear(torch.tensor(1 / 1.2))))
+    assert torch.equal(target.saturation, torch.full_like(target.saturation, target.ceiling))
+
+
 def test_what_cannot_be_compared_has_the_mean_exposure(even: Views) -> None:
     varied = exposed(even, some_stops(len(even.cameras)))
 

@@ -53,4 +53,5 @@ class PhotographsAsTaken:
         coverage = self._views.coverage[number][None, None].float()
         mask = torch.nn.functional.interpolate(coverage, size, mode="bilinear", align_corners=False)[0, 0].round().to(torch.uint8)
         gains = None if self._views.gains is None else (self._views.gains[number],)
-        return view_targets(replace(large, coverage=(mask,), gains=gains), 1.0, small.mask.device)[0]
+        tints = None if self._views.tints is None else (self._views.tints[number],)
+        return view_targets(replace(large, coverage=(mask,), gains=gains, tints=tints), 1.0, small.mask.device)[0]

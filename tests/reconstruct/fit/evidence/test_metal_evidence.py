@@ -1,6 +1,7 @@
 """Metal told from paint by pictures of both, drawn by the very formula that is inverted."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
-from drgs.scene.camera import pixel_rays_world
+from drgs.scene.camera import Camera, pixel_rays_world
 from drgs.scene.mesh import TriangleMesh
 from tests.reconstruct.geometry.test_integrate_normals import views_of_a_unit_sphere
 from tests.render.closed_form_scenes import sphere_mesh
@@ -38,14 +39,14 @@ def open_light(mesh: TriangleMesh, tables: torch.Tensor) -> LightOf:
     return light_of_views(tables, torch.ones_like(mesh.vertices), mesh.albedo, None)
 
 
-def pictures(mesh: TriangleMesh, tables: torch.Tensor, turned: bool = False) -> list[ViewTarget]:
+def pictures(mesh: TriangleMesh, tables: torch.Tensor, turned: bool = False, cameras: Sequence[Camera] = ()) -> list[ViewTarget]:
     """Of the sphere, all around.
 
     Args:
-        turned: the light stands still with the camera.
+        turned: the light stands still with the camera. cameras: other ones.
     """
     tracer, targets = build_tracer(mesh), []
-    for camera in views_of_a_unit_sphere()[0]:
+    for camera in cameras or views_of_a_unit_sphere()[0]:
         turn = camera.camera_from_world[:3, :3] if turned else None
         origin, directions = pixel_rays_world(camera)
         flat = directions.reshape(-1, 3)

@@ -80,20 +80,33 @@ def off_by(true: Sequence[ViewTarget], views: Views) -> float:
     return float(np.sqrt(np.mean([twist @ motion.metric @ twist for twist, motion in zip(own, motions, strict=True)])))
 
 
-@pytest.mark.parametrize("asks", ["colours and outlines", "colours", "outlines"])
-def test_cameras_that_are_off_come_back(asks: str):
+def test_cameras_that_are_off_come_back():
     mesh = spotted_ball()
     true = pictures(mesh, filter_environment(light()))
     given = by_chance(true)
-    if asks == "outlines":
-        given = [dataclasses.replace(target, saturation=torch.full_like(target.photo, 0.5)) for target in given]
-    outlines = [mask_outline(target.mask) if "outlines" in asks else None for target in true]
-    found = registered(mesh, given, outlines)
+    found = registered(mesh, given, [mask_outline(target.mask) for target in true])
     assert found.camera_from_world is not None
     before, left = off_by(true, views_of(given)), off_by(true, seen_from(views_of(given), found.camera_from_world))
-    # A ball's outline does not tell which way it is turned, its waves do; of its depth neither says much.
-    assert before > 0.3 and left < (0.3 if asks == "outlines" else 0.1) * before, (before, left)
-    assert found.agreed == pytest.approx(before, rel=0.2) and found.noise < 0.3 * found.agreed
+    assert before > 0.3 and left < 0.1 * before, (before, left)
+    # Of a ball outlines do not tell which way it is turned.
+    assert 0.5 * before < found.agreed < 1.1 * before and found.noise < 0.5 * found.agreed
+
+
+@pytest.mark.parametrize("says", ["colours", "outlines"])
+def test_what_one_witness_says_alone_moves_nothing(says: str):
+    """Gloss that moves with the light, or masks drawn by hand, are no camera's error."""
+    mesh = spotted_ball()
+    true = pictures(mesh, filter_environment(light()))
+    given = by_chance(true)
+    outlines = [mask_outline(target.mask) for target in true]
+    drawn = pictures(mesh, filter_environment(light()), cameras=[target.camera for target in given])
+    if says == "colours":
+        found = registered(mesh, given, [mask_outline(target.mask) for target in drawn])
+    else:
+        seen = [dataclasses.replace(off, saturation=right.saturation, mask=right.mask) for off, right in zip(given, drawn, strict=True)]
+        found = registered(mesh, seen, outlines)
+    assert found.camera_from_world is None and found.noise > 0.05, (found.agreed, found.noise)
+    assert registered(mesh, given, [None] * len(given)).camera_from_world is None
 
 
 def test_right_cameras_stay_and_so_do_those_of_which_nothing_is_seen():
@@ -111,9 +124,8 @@ def test_what_a_surface_has_wrong_is_no_motion():
     mesh = spotted_ball()
     true = pictures(mesh, filter_environment(light()))
     random = torch.Generator().manual_seed(1)
-    # Broad ones do look like motion in each view; such a surface is not what passes leave.
-    lumps = torch.stack([(mesh.vertices @ (12 * torch.randn(3, 1, generator=random))).sin() for _ in range(20)]).mean(0)
-    lumpy = dataclasses.replace(mesh, vertices=mesh.vertices * (1 + 0.03 * lumps))
+    lumps = torch.stack([(mesh.vertices @ (3 * torch.randn(3, 1, generator=random))).sin() for _ in range(20)]).mean(0)
+    lumpy = dataclasses.replace(mesh, vertices=mesh.vertices * (1 + 0.02 * lumps))
     found = registered(lumpy, true, [mask_outline(target.mask) for target in true])
     assert found.camera_from_world is None and found.noise > 0.01, (found.agreed, found.noise)
 
@@ -156,11 +168,11 @@ def test_motions_of_the_world_are_those_of_the_camera_and_flows_are_their_deriva
     np.testing.assert_allclose(flows @ twist, pixels(moved) - pixels(places), rtol=1e-4, atol=1e-9)
 
 
-def motions_of(random: np.random.Generator, halves: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[module._Motion]:
+def motions_of(random: np.random.Generator, said: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[module._Motion]:
     motions = []
-    for half in halves:
+    for apart in said:
         spread = random.normal(size=(6, 6))
-        motions.append(module._Motion(rigid(2 * random.normal(size=6)), half, half[0], spread @ spread.T + np.eye(6)))
+        motions.append(module._Motion(rigid(2 * random.normal(size=6)), apart, apart[0], spread @ spread.T + np.eye(6)))
     return motions
 
 
@@ -183,7 +195,7 @@ def test_a_world_that_is_elsewhere_turned_and_larger_is_no_camera_s_error():
         np.testing.assert_allclose(nearer[:2] / nearer[2], larger[:2] / larger[2], rtol=1e-5)
 
 
-def test_halves_that_contradict_each_other_agree_on_nothing():
+def test_witnesses_that_contradict_each_other_agree_on_nothing():
     random = np.random.default_rng(0)
     twists = [1e-3 * random.normal(size=6) for _ in range(9)]
     agreed, noise = agreement(motions_of(random, [(twist, -twist) for twist in twists]))
