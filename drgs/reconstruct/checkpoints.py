@@ -55,6 +55,8 @@ def fit_tensors(state: FitState) -> dict[str, Tensor]:
     tensors |= {"generator": state.generator.get_state(), "iteration": torch.tensor(state.iteration)}
     if state.screen_gradients is not None:
         tensors |= {"screen_gradients.total": state.screen_gradients.total, "screen_gradients.seen": state.screen_gradients.seen}
+    if state.exposures is not None:
+        tensors["exposures"] = state.exposures
     for group in state.optimizer.param_groups:
         moments = state.optimizer.state.get(group["params"][0])
         if moments:
@@ -84,5 +86,6 @@ def restore_fit(tensors: dict[str, Tensor], state: FitState) -> None:
             state.optimizer.state[value] = moments
     state.generator.set_state(tensors["generator"].cpu())
     state.iteration = int(tensors["iteration"])
+    state.exposures = tensors["exposures"].cpu() if "exposures" in tensors else None
     if state.screen_gradients is not None:
         state.screen_gradients = ScreenGradientStats(tensors["screen_gradients.total"].clone(), tensors["screen_gradients.seen"].clone())

@@ -82,11 +82,12 @@ def with_gains_of_points(views: Views, points: InitialPoints) -> Views:
     return with_gains(views, stops) if jumps(stops, views) > VARIED_STOPS else views
 
 
-def with_gains_of_fit(views: Views, drawn: Callable[[ViewTarget], tuple[Tensor, Tensor]]) -> Views:
+def with_gains_of_fit(views: Views, drawn: Callable[[ViewTarget], tuple[Tensor, Tensor]], finds_gains: bool = True) -> Views:
     """Gains and tints by what a fit draws of the object, at half size; those that are known already are made better.
 
     Args:
-        drawn: linear radiance (height, width, 3) that a view's camera sees by the fit, and coverage (height, width).
+        drawn: linear radiance (height, width, 3) that a view's camera sees by the fit, and coverage (height, width). finds_gains: False: where none are known
+            none are looked for.
     """
     left = np.array([_stops_left(target, *drawn(target)) for target in view_targets(views, 0.5, torch.device("cpu"))])
     gains = np.ones(len(left)) if views.gains is None else np.array(views.gains)
@@ -94,7 +95,7 @@ def with_gains_of_fit(views: Views, drawn: Callable[[ViewTarget], tuple[Tensor, 
     if views.tints is not None or max(jumps(left[:, channel], views) for channel in (1, 2)) > LEFT_TINT_STOPS:
         red, blue = (gains_of_stops(np.log2(tints[:, channel]) + left[:, k]) for channel, k in ((0, 1), (2, 2)))
         views = replace(views, tints=tuple((r, 1.0, b) for r, b in zip(red, blue, strict=True)))
-    if views.gains is None and jumps(left[:, 0], views) <= LEFT_STOPS:
+    if views.gains is None and not (finds_gains and jumps(left[:, 0], views) > LEFT_STOPS):
         return views
     return with_gains(views, np.log2(gains) + left[:, 0])
 

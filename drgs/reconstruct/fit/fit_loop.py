@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float64
 from torch import Tensor
 
 from drgs.reconstruct.fit.adam import Adam
@@ -31,6 +32,8 @@ class FitState:
     """Steps done."""
     screen_gradients: ScreenGradientStats | None = None
     """Of surfels that are divided (stage 1); None elsewhere."""
+    exposures: Float64[Tensor, "view 4"] | None = None
+    """Of each view its gain and its tints, as the fit found them half way (stage 1); None before, and elsewhere."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from drgs.reconstruct.capture.exposures import with_gains_of_fit
@@ -121,7 +121,7 @@ class _Steps:
     """Final. Stage 1's part of the fit loop."""
 
     def __init__(self, views: Views, state: FitState, settings: FitSettings, radius: float) -> None:
-        self.views, self.state, self.radius = views, state, radius
+        self.views, self.state, self.radius = views if state.exposures is None else _exposed(views, state.exposures), state, radius
         on_ground = replace(settings, weight_coverage=settings.weight_coverage_on_ground)
         self.settings = settings if views.ground is None else on_ground
         self.targets: list[ViewTarget] = []
@@ -168,22 +168,32 @@ class _Steps:
         half_size = iteration < int(self.settings.half_size_share * self.settings.iterations)
         factor = (0.5 if half_size else 1.0) * size_factor(self.views.cameras, self.settings.most_pixels)
         if factor != self.target_factor:
-            if iteration and not half_size:
+            if iteration and not half_size and self.state.exposures is None:
                 self._look_at_exposures()
             self.targets = [windowed(target) for target in view_targets(self.views, factor, self.state.parameters["centers"].device)]
             self.target_factor = factor
         return self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
 
     def _look_at_exposures(self) -> None:
-        """Better gains for the second half, before radiance may depend on the view and explain exposures as well."""
-        if self.views.gains is not None:
-            degree = self._sh_degree(self._progress(self.state.iteration))
-            self.views = with_gains_of_fit(self.views, drawn_object(self.state.parameters, self.radius, degree))
+        """Tints, and better gains, for the second half, before radiance may depend on the view and explain them as well."""
+        degree = self._sh_degree(self._progress(self.state.iteration))
+        found = with_gains_of_fit(self.views, drawn_object(self.state.parameters, self.radius, degree), finds_gains=False)
+        count = len(found.cameras)
+        gains = torch.tensor(found.gains or (1.0,) * count, dtype=torch.float64)
+        tints = torch.tensor(found.tints or ((1.0, 1.0, 1.0),) * count, dtype=torch.float64)
+        self.state.exposures = torch.cat([gains[:, None], tints], 1)
+        self.views = _exposed(self.views, self.state.exposures)
 
     def _sh_degree(self, progress: float) -> int:
         if progress < self.settings.sh_start:
             return 0
         return min(self.settings.sh_degree, int((progress - self.settings.sh_start) * 10) + 1)
+
+
+def _exposed(views: Views, exposures: Float64[Tensor, "view 4"]) -> Views:
+    """With the gains and tints that a fit found."""
+    gains, *tints = (tuple(column) for column in exposures.T.tolist())
+    return replace(views, gains=gains, tints=tuple(zip(*tints, strict=True)))
 
 
 def drawn_object(

@@ -27,7 +27,7 @@ from drgs.reconstruct.fit.surfels.fit_gaussians import (
 from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.scene.views import Views
 from tests.one_torch_thread import one_torch_thread  # noqa: F401
-from tests.reconstruct.capture.test_exposures import exposed, some_stops
+from tests.reconstruct.capture.test_exposures import balanced, exposed, some_stops
 from tests.reconstruct.tiny_capture import SPHERE_CENTER, SPHERE_RADIUS, write_nerf_synthetic
 
 CPU = torch.device("cpu")
@@ -176,3 +176,17 @@ def test_exposures_that_are_known_roughly_are_known_well_after_the_fit(views: Vi
     assert found.gains is not None
     off = np.abs(np.log2(found.gains) - stops)
     assert float(np.sqrt((off**2).mean())) < 0.5 * float(np.sqrt(((guess - guess.mean() - stops) ** 2).mean()))
+
+
+@pytest.mark.slow
+def test_white_balances_are_found_half_way_and_a_fit_that_goes_on_keeps_them(views: Views, points: InitialPoints) -> None:
+    logs = np.random.default_rng(3).normal(scale=0.12, size=(len(views.cameras), 3)) * [1, 0, 1]
+    tints = np.exp(logs - logs.mean(0))
+    settings = dataclasses.replace(SHORT, iterations=90, half_size_share=0.6)
+    varied, state = balanced(views, tints), start_fit(points, settings, CPU)
+    fit_gaussians(varied, state, settings, points.bounds_radius, should_stop=lambda: state.iteration == 70)
+    assert state.exposures is not None and float((state.exposures[:, 0] - 1).abs().max()) == 0
+    kept = state.exposures.clone()
+    assert float(np.abs(kept[:, 1:].numpy() - 1).max()) > 0.1
+    fit_gaussians(varied, state, settings, points.bounds_radius)
+    assert torch.equal(state.exposures, kept)
