@@ -8,6 +8,7 @@ In: an empty folder. Out: an asset in it, and of each part what it launched how 
 import json
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -95,7 +96,7 @@ def main(folder: Path) -> None:
         return launch(kernel, *args, device=device, **kwargs)
 
     wp.launch = count_launches
-    PRESETS["tiny"] = TINY
+    PRESETS["tiny"] = replace(TINY, surface=replace(TINY.surface, cameras_after=(1,)))
     capture = write_nerf_synthetic(folder / "capture", sphere_views(FEW_VIEWS, square=True))
     build_asset(capture, folder / "asset", BuildSettings(preset="tiny", device="cuda"))
     asset = load_asset(folder / "asset", pretended_cuda.CUDA)
