@@ -45,6 +45,8 @@ FIRST_LOOK = 16
 """Views, evenly among all, that say first whether cameras are right."""
 PRIOR = 0.5
 """[pixels] Standard deviation of each of a camera's six numbers, by what it moves at the middle of the picture."""
+FARTHEST = 2.0
+"""[pixels] Root mean square by which one camera moves at once: farther away pictures are no longer straight in it, so it is asked again after the next pass."""
 BLUR = 0.7
 """[pixels] Standard deviation of the smoothing of both pictures before they are compared."""
 RIM = 3
@@ -106,7 +108,7 @@ def register_cameras(
     others = [number for number in range(count) if number not in motions]
     motions |= dict(zip(others, looks_at(others), strict=True))
     every = [motions[number] for number in range(count)]
-    twists = without_common(every, [motion.both for motion in every])
+    twists = without_common(every, [motion.both * min(1.0, FARTHEST / max(motion.pixels(motion.both), 1e-9)) for motion in every])
     moved = [_rigid(twist) @ motion.camera_from_world for motion, twist in zip(every, twists, strict=True)]
     agreed, noise = agreement(every)
     return CamerasFound(torch.from_numpy(np.stack(moved)), agreed, noise)
@@ -151,6 +153,10 @@ class _Motion:
     @property
     def center(self) -> Float64[ndarray, "3"]:
         return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+
+    def pixels(self, twist: Float64[ndarray, "6"]) -> float:
+        """Root mean square by which a twist moves what the camera sees."""
+        return float(np.sqrt(twist @ self.metric @ twist))
 
     def of_camera(self, twist: Float64[ndarray, "6"]) -> Float64[ndarray, "6"]:
         """A twist of the world before it is seen, as one of what the camera sees."""

@@ -12,6 +12,7 @@ from drgs.reconstruct.fit.evidence import register_cameras as module
 from drgs.reconstruct.fit.evidence.register_cameras import (
     CamerasFound,
     agreement,
+    moved_pixels,
     register_cameras,
     seen_from,
     without_common,
@@ -90,6 +91,18 @@ def test_cameras_that_are_off_come_back():
     assert before > 0.3 and left < 0.1 * before, (before, left)
     # Of a ball outlines do not tell which way it is turned.
     assert 0.5 * before < found.agreed < 1.1 * before and found.noise < 0.5 * found.agreed
+
+
+def test_a_camera_that_is_far_off_comes_nearer_step_by_step(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "FARTHEST", 0.1)
+    mesh = spotted_ball()
+    true = pictures(mesh, filter_environment(light()))
+    given = by_chance(true)
+    found = registered(mesh, given, [mask_outline(target.mask) for target in true])
+    assert found.camera_from_world is not None
+    moved = seen_from(views_of(given), found.camera_from_world)
+    assert moved_pixels(views_of(given), moved, mesh.vertices) < 0.12
+    assert off_by(true, moved) < off_by(true, views_of(given)) - 0.05
 
 
 @pytest.mark.parametrize("says", ["colours", "outlines"])
