@@ -3,9 +3,7 @@
 Reads like the method: each step is a function of its own file, each stage with what it keeps in `stages.py`; here they meet. Checkpoints live in OUT.build/ beside the asset; a build that was stopped or killed goes on from the last one.
 """
 
-import math
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -29,6 +27,7 @@ from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
 from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
 from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
+from drgs.reconstruct.facts_of_views import facts_of_views
 from drgs.reconstruct.fit.evidence.photographs_as_taken import PhotographsAsTaken
 from drgs.reconstruct.fit.evidence.register_cameras import moved_pixels, seen_from
 from drgs.reconstruct.fit.evidence.solve_albedo import RINGS, parts_for, solve_albedo
@@ -219,9 +218,7 @@ def build_stages(
     asset, thumbnail, views = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
-    provenance |= poses | found_by | {"outline_agreement": round(agreement, 4)} | calibrations(views) | _exposures(views)
-    provenance |= {"masks_moved_pixels": round(views.masks_moved, 2)} if views.masks_moved else {}
-    provenance |= {"cameras_moved_pixels": round(views.cameras_moved, 2)} if views.cameras_moved else {}
+    provenance |= poses | found_by | {"outline_agreement": round(agreement, 4)} | facts_of_views(views)
     provenance["light"] = {key: value for key, value in asdict(light).items() if value is not None}
     asset = replace(asset, provenance=provenance, cameras=views.cameras, light_frame=light.frame)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
@@ -486,21 +483,6 @@ def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMes
         "mesh": asdict(mesh_report(mesh.vertices, mesh.faces)),
         "seconds": seconds,
     }
-
-
-def calibrations(views: Views) -> dict[str, Any]:
-    """The lenses of the photographs before they were undistorted, which cameras.json no longer tells; empty where there were none."""
-    counts = Counter(lens for lens in views.lenses if lens is not None)
-    return {"lenses": [asdict(lens) | {"pictures": count} for lens, count in counts.items()]} if counts else {}
-
-
-def _exposures(views: Views) -> dict[str, Any]:
-    """Of each photograph, by how many stops it was exposed more than the mean, and how much more of red and blue it keeps; nothing where all are alike."""
-    stops = {} if views.gains is None else {"exposure_stops": [round(math.log2(gain), 3) for gain in views.gains]}
-    tints = (
-        {} if views.tints is None else {"white_balance": [{"red": round(red, 3), "blue": round(blue, 3)} for red, _, blue in views.tints]}
-    )
-    return stops | tints
 
 
 def kept_photographs(views: Views) -> bytes:

@@ -15,12 +15,13 @@ from PIL import Image
 
 from drgs.exchange.photographs import PHOTOGRAPHS, check_photographs, read_photograph
 from drgs.reconstruct import report_progress
-from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, Progress, build_asset, calibrations, kept_photographs
+from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, Progress, build_asset, kept_photographs
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.load_views import load_views
 from drgs.reconstruct.capture.open_vessels import VesselSettings
 from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings
+from drgs.reconstruct.facts_of_views import calibrations, facts_of_views
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.evidence import register_cameras
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
@@ -200,6 +201,16 @@ def test_provenance_keeps_each_lens_once_with_the_number_of_its_pictures():
         {"model": "SIMPLE_RADIAL", "parameters": [50.0, 32.0, 24.0, -0.1], "width": 64, "height": 48, "pictures": 2},
         {"model": "SIMPLE_FISHEYE", "parameters": [20.0, 32.0, 24.0], "width": 64, "height": 48, "pictures": 1},
     ]
+
+
+def test_provenance_tells_of_views_what_was_changed_and_nothing_else(capture: Path):
+    views = load_views(capture)
+    assert facts_of_views(views) == {}
+    count = len(views.cameras)
+    changed = replace(views, gains=(2.0,) * count, tints=((1.1, 1.0, 0.9),) * count, masks_moved=0.704, cameras_moved=0.218)
+    found = json.loads(json.dumps(facts_of_views(changed)))
+    assert found["exposure_stops"] == [1.0] * count and found["white_balance"] == [{"red": 1.1, "blue": 0.9}] * count
+    assert (found["masks_moved_pixels"], found["cameras_moved_pixels"]) == (0.7, 0.22)
 
 
 @pytest.mark.slow

@@ -103,7 +103,7 @@ def register_cameras(
     some = sorted({round(k) for k in np.linspace(0, count - 1, min(FIRST_LOOK, count))})
     motions = dict(zip(some, looks_at(some), strict=True))
     agreed, noise = agreement([motions[number] for number in some])
-    if agreed < max(LEAST_AGREED, OVER_NOISE * noise):
+    if not agreed >= max(LEAST_AGREED, OVER_NOISE * noise):
         return CamerasFound(None, agreed, noise)
     others = [number for number in range(count) if number not in motions]
     motions |= dict(zip(others, looks_at(others), strict=True))
@@ -125,16 +125,19 @@ def seen_from(views: Views, camera_from_world: Float64[Tensor, "view 4 4"]) -> V
 
 
 def moved_pixels(before: Views, after: Views, places: Float[Tensor, "place 3"]) -> float:
-    """[pixels] Root mean square by which places of the world [world units] moved in the pictures."""
+    """[pixels] Root mean square by which places of the world [world units] moved in the pictures; those behind a camera, or beside its picture, do not count."""
     squares = []
     for one, other in zip(before.cameras, after.cameras, strict=True):
-        pixels = []
+        pixels, within = [], torch.ones(len(places), dtype=torch.bool)
         for camera in (one, other):
             transform, intrinsics = camera.camera_from_world.double(), camera.intrinsics.double()
             seen = (places.double() @ transform[:3, :3].T + transform[:3, 3]) @ intrinsics.T
-            pixels.append(seen[:, :2] / seen[:, 2:])
-        squares.append((pixels[0] - pixels[1]).square().sum(1).mean())
-    return float(torch.stack(squares).mean().sqrt())
+            at = seen[:, :2] / seen[:, 2:].clamp(min=1e-9)
+            within &= (seen[:, 2] > 1e-9) & ((at >= 0) & (at <= torch.tensor([camera.width, camera.height]))).all(1)
+            pixels.append(at)
+        squares.append((pixels[0] - pixels[1])[within].square().sum(1))
+    every = torch.cat(squares)
+    return float(every.mean().sqrt()) if len(every) else 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -181,6 +181,17 @@ def test_motions_of_the_world_are_those_of_the_camera_and_flows_are_their_deriva
     np.testing.assert_allclose(flows @ twist, pixels(moved) - pixels(places), rtol=1e-4, atol=1e-9)
 
 
+def test_places_that_no_camera_sees_do_not_count_as_moved():
+    mesh = spotted_ball()
+    given = by_chance(true := pictures(mesh, filter_environment(light())))
+    before, after = views_of(true), views_of(given)
+    camera = before.cameras[0]
+    behind = camera.center_world + 3 * (camera.center_world - mesh.vertices.mean(0))
+    one = [dataclasses.replace(views, cameras=views.cameras[:1]) for views in (before, after)]
+    assert moved_pixels(*one, behind[None]) == 0
+    assert moved_pixels(*one, torch.cat([mesh.vertices, behind[None]])) == pytest.approx(moved_pixels(*one, mesh.vertices))
+
+
 def motions_of(random: np.random.Generator, said: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[module._Motion]:
     motions = []
     for apart in said:

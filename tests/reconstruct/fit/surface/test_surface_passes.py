@@ -30,6 +30,13 @@ from tests.reconstruct.surfel_spheres import surfel_sphere
 from tests.reconstruct.tiny_capture import SPHERE_RADIUS
 
 SHRUNK = 0.93
+SHORT = PassSettings(
+    2,
+    SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)),
+    MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
+    relief_steps=0,
+)
+"""Of which only is asked that they go through, stop and go on."""
 
 
 def test_weights_go_on_where_the_pass_before_ended_and_rates_fall():
@@ -102,14 +109,7 @@ def test_relief_is_fitted_on_divided_faces_while_the_surface_stays_and_goes_on_w
 
 @pytest.mark.slow
 def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    settings = PassSettings(
-        2,
-        SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)),
-        MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
-        carve_after=(),
-        try_after=(1,),
-        relief_steps=0,
-    )
+    settings = replace(SHORT, carve_after=(), try_after=(1,))
     asked: list[int] = []
     homes: list[torch.Tensor] = []
 
@@ -145,15 +145,7 @@ def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tm
 
 @pytest.mark.slow
 def test_the_fit_goes_on_from_where_cameras_were_moved_to_and_asks_once_a_pass(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    settings = PassSettings(
-        3,
-        SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)),
-        MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
-        carve_after=(),
-        try_after=(1,),
-        cameras_after=(1, 2),
-        relief_steps=0,
-    )
+    settings = replace(SHORT, passes=3, carve_after=(), try_after=(1,), cameras_after=(1, 2))
     asked: list[int] = []
     seen: list[torch.Tensor] = []
 
@@ -195,12 +187,7 @@ def test_the_fit_goes_on_from_where_cameras_were_moved_to_and_asks_once_a_pass(t
 
 @pytest.mark.slow
 def test_where_light_turns_both_kinds_are_tried_after_the_first_pass_and_elsewhere_not(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    settings = PassSettings(
-        2,
-        SurfaceSettings(rounds=1, steps_a_round=2, moves=MoveSettings(share_rays=4)),
-        MeshSettings(resolution=40, face_limit=1500, smoothing_passes=0),
-        relief_steps=0,
-    )
+    settings = SHORT
     asked: list[int] = []
     kept: list[float] = []
 
