@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
-from scipy.ndimage import distance_transform_edt, gaussian_filter1d, map_coordinates, median_filter, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, map_coordinates, median_filter, uniform_filter1d
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -139,8 +139,8 @@ class MaskLook:
     ) -> tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "height width"]]:
         """The photograph and its mask, whose outline is moved."""
         alpha, inside = mask.copy(), mask > 127
-        near = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside)) <= self.scale * (self.reach + MIXED)
-        pixels = np.argwhere(near)[:, ::-1]
+        most = self.scale * (self.reach + MIXED)
+        pixels = np.argwhere(np.where(inside, _squared_distance(~inside, most), _squared_distance(inside, most)) <= most**2)[:, ::-1]
         places = self.scale * (self.points + self.offsets[:, None] * self.normals + 0.5) - 0.5
         distance, place = cKDTree(places).query(pixels)
         own = distance <= self.scale * (2 * self.reach + MIXED)  # others are of specks, which were not looked at
@@ -168,11 +168,26 @@ def _shrunk(image: UInt8[ndarray, "rows columns 3"], size: tuple[int, int]) -> U
 
 def _is_cut_out(image: UInt8[ndarray, "height width 3"], inside: Bool[ndarray, "height width"], reach: float) -> bool:
     """Whether all around the object has one colour, as pictures have that were cut out."""
-    away = distance_transform_edt(~inside)
-    around = image[(away > 2) & (away <= reach + BAND)]
+    away = _squared_distance(inside, reach + BAND)
+    around = image[(away > 4) & (away <= (reach + BAND) ** 2)]
     if len(around) == 0:
         return True
     return bool((around == np.median(around, axis=0).astype(np.uint8)).all(1).mean() > CUT_OUT)
+
+
+def _squared_distance(there: Bool[ndarray, "height width"], most: float) -> UInt16[ndarray, "height width"]:
+    """To the nearest pixel that is `there` [pixels^2]; more than most^2 where it is farther. A distance transform, which knows all distances, takes six times as long."""
+    cap = int(most) + 1
+    along = np.where(there, 0, cap).astype(np.uint8)
+    for _ in range(cap):
+        np.minimum(along[:, 1:], along[:, :-1] + np.uint8(1), out=along[:, 1:])
+        np.minimum(along[:, :-1], along[:, 1:] + np.uint8(1), out=along[:, :-1])
+    squared = np.square(along.astype(np.uint16))
+    nearest = squared.copy()
+    for rows in range(1, cap):
+        np.minimum(nearest[rows:], squared[:-rows] + np.uint16(rows * rows), out=nearest[rows:])
+        np.minimum(nearest[:-rows], squared[rows:] + np.uint16(rows * rows), out=nearest[:-rows])
+    return nearest
 
 
 def _smooth_outlines(mask: UInt8[ndarray, "height width"]) -> Iterator[ClosedOutline]:
@@ -257,7 +272,7 @@ class _Profiles:
         spread = _along(some.swapaxes(1, 2) @ self.colors) / share[:, None, None] - mean[:, :, None] * mean[:, None]
         spread = spread.astype(np.float64) + DEVIATION**2 * np.eye(3)
         away = (self.colors - mean[:, None]).astype(np.float64)
-        squared = ((away @ np.linalg.inv(spread)) * away).sum(-1)
+        squared = np.einsum("pki,pki->pk", away @ np.linalg.inv(spread), away)
         return -0.5 * (squared + np.linalg.slogdet(spread)[1][:, None] + 3 * np.log(2 * np.pi))
 
     def mixed_at(self, offsets: Float[ndarray, "point"]) -> Float[ndarray, "point"]:

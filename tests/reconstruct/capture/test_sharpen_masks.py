@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from numpy import ndarray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from drgs.maths.color_numpy import srgb_from_linear
-from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
+from drgs.reconstruct.capture.sharpen_masks import _squared_distance, sharpen_masks
 from drgs.reference.rasterize_gbuffer import look_at_camera
 from drgs.scene.views import Views
 
@@ -141,3 +141,12 @@ def test_views_without_an_outline_stay_beside_those_with_one() -> None:
     moved = sharpen_masks(both)
     assert torch.equal(moved.coverage[1], empty) and torch.equal(moved.images_srgb[1], both.images_srgb[1])
     assert error(moved.coverage[0].numpy() / 255, covered)[0] < 0.3 * error(rough.coverage[0].numpy() / 255, covered)[0]
+
+
+@pytest.mark.parametrize("most", [3.0, 7.5, 40.0])
+def test_distances_that_matter_are_those_of_a_distance_transform(most: float) -> None:
+    there = np.random.default_rng(0).random((30, 47)) > 0.985
+    exact = np.rint(distance_transform_edt(~there) ** 2)
+    found = _squared_distance(there, most)
+    near = exact <= most**2
+    assert (found[near] == exact[near]).all() and (found[~near] > most**2).all()

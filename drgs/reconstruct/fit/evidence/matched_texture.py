@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from drgs.reconstruct.fit.evidence.patch_kernels import PackedPictures, patterns_of_patches
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix, rings_as_wide_as
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.render.intersect.trace_rays import trace_rays
@@ -131,9 +132,10 @@ class _Search:
         device = normals.device
         factors = [min(1.0, SIDE / max(camera.width, camera.height)) for camera in views.cameras]
         self.cameras = [scaled_camera(camera.to(device), factor) for camera, factor in zip(views.cameras, factors, strict=True)]
-        self.pictures = [
+        grey = [
             _resized(image.to(device).float().mean(-1) / 255, camera) for image, camera in zip(views.images_srgb, self.cameras, strict=True)
         ]
+        self.pictures = PackedPictures(self.cameras, grey)
         self.coverage = [_resized(mask.to(device).float(), camera) for mask, camera in zip(views.coverage, self.cameras, strict=True)]
         centers = torch.stack([camera.center_world for camera in self.cameras])
         middle = self.vertices.mean(0)
@@ -149,14 +151,17 @@ class _Search:
         self.patch = SPACING * self.pixel * torch.cartesian_prod(axis, axis)
 
     def scores(self, index: Int[Tensor, "asked"]) -> _Scores:
-        parts = [self._scores_of(some) for some in index.split(VERTICES_AT_ONCE)]
+        facing = self._facing(index).split(VERTICES_AT_ONCE)
+        parts = [self._scores_of(some, own) for some, own in zip(index.split(VERTICES_AT_ONCE), facing, strict=True)]
         return _Scores(torch.cat([part.score for part in parts]), torch.cat([part.seen for part in parts]))
 
-    def _scores_of(self, index: Int[Tensor, "asked"]) -> _Scores:
+    def _scores_of(self, index: Int[Tensor, "asked"], facing: Float[Tensor, "asked view"]) -> _Scores:
         across, whole = self._across(index)
-        facing = self._facing(index) * whole[:, None]
+        facing = facing * whole[:, None]
         facing, view = facing.topk(min(VIEWS, len(self.cameras)), dim=1)
-        patterns = self._patterns(index, across, view, facing > 0)
+        patterns = patterns_of_patches(
+            self.vertices[index], self.normals[index], self.depths, across, view, facing > 0, self.pictures, FAINT * PATCH
+        )
         one, other = torch.triu_indices(view.shape[1], view.shape[1], 1, device=index.device)
         towards = self.towards[index[:, None], view]
         apart = (towards[:, one] * towards[:, other]).sum(-1).clamp(-1, 1).acos()
@@ -198,30 +203,6 @@ class _Search:
         found = (hits.hit & (hits.distance < 2 * above)).view(flat.shape[:2])
         relief = torch.where(found, above - hits.distance.view(found.shape), 0.0)
         return flat + relief[..., None] * normal[:, None], found.all(1)
-
-    def _patterns(
-        self,
-        index: Int[Tensor, "asked"],
-        across: Float[Tensor, "asked sample 3"],
-        view: Int[Tensor, "asked chosen"],
-        counts: Bool[Tensor, "asked chosen"],
-    ) -> Float[Tensor, "asked depth chosen sample"]:
-        """Patches of mean 0 and length 1, at each depth and in each of the chosen views."""
-        normal = self.normals[index]
-        patterns = normal.new_zeros(len(index), len(self.depths), view.shape[1], len(self.patch))
-        for number, (camera, picture) in enumerate(zip(self.cameras, self.pictures, strict=True)):
-            vertex, slot = ((view == number) & counts).nonzero().unbind(1)
-            if len(vertex) == 0:
-                continue
-            at = self.vertices[index[vertex]][:, None] + self.depths[:, None] * normal[vertex][:, None]
-            place, _ = _pixels(camera, at[:, :, None] + across[vertex][:, None])
-            grid = 2 * place / place.new_tensor([camera.width, camera.height]) - 1
-            looked_up = torch.nn.functional.grid_sample(
-                picture[None, None], grid.reshape(1, -1, 1, 2), padding_mode="border", align_corners=False
-            ).reshape(grid.shape[:-1])
-            looked_up = looked_up - looked_up.mean(-1, keepdim=True)
-            patterns[vertex, :, slot] = looked_up / (looked_up.norm(dim=-1, keepdim=True) + FAINT * PATCH)
-        return patterns
 
 
 def _resized(picture: Float[Tensor, "_height _width"], camera: Camera) -> Float[Tensor, "_rows _columns"]:

@@ -21,14 +21,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from drgs.maths.brdf import f0_from_base
-from drgs.maths.color import linear_from_srgb
 from drgs.maths.frames import tangents_from_normal
-from drgs.reconstruct.fit.evidence.metal_evidence import DARK
-from drgs.reconstruct.fit.evidence.seen_vertices import SATURATED, SOLID, SeenVertices, mirrored_radiance, seen_vertices
+from drgs.reconstruct.fit.evidence.albedo_kernels import add_photograph
+from drgs.reconstruct.fit.evidence.seen_vertices import SeenVertices, mirrored_radiance, seen_vertices
 from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight
 from drgs.reconstruct.fit.light.split_sum import shade_split_sum
 from drgs.reconstruct.fit.view_targets import ViewTarget
@@ -155,46 +154,28 @@ def _sums_by_side(
     """Both sums of the least squares, for photographs from each of SIDES sides of the surface's normal."""
     mesh, count = tracer.mesh, len(samples.corners)
     explained, weight = (torch.zeros(SIDES, count, 3, device=mesh.albedo.device) for _ in range(2))
-    nearest = samples.nearest
     for number, target in enumerate(targets):
         seen = seen_vertices(tracer, target)
         if len(seen.index) == 0:
             continue
-        black, slope = _linear_in_albedo(tracer, seen, light_of(target))
         normal = mesh.normals[seen.index]
-        known = torch.zeros(len(mesh.vertices), 7, device=mesh.albedo.device)
-        known[seen.index] = torch.cat([black, slope, (normal * seen.wo).sum(-1, keepdim=True)], 1)
-        side = torch.full((len(mesh.vertices),), -1, device=mesh.albedo.device)
+        side = torch.full_like(mesh.roughness, -1, dtype=torch.int32)
         side[seen.index] = _side_of_view(normal, seen.wo)
-        shown = samples.between(side >= 0).nonzero().squeeze(1)
-        photo, usable = _photograph_at(as_taken(number), samples[shown].at(mesh.vertices))
-        shown = shown[usable]
-        black, slope, cosine = samples[shown].at(known).split([3, 3, 1], dim=1)
-        trust = (cosine / (photo + DARK)) ** 2
-        place = side[nearest[shown]] * count + shown
-        explained.flatten(0, 1).index_add_(0, place, trust * slope * (photo - black))
-        weight.flatten(0, 1).index_add_(0, place, trust * slope * slope)
+        found = (*_linear_in_albedo(tracer, seen, light_of(target)), (normal * seen.wo).sum(-1))
+        black, slope, cosine = (_at_vertices(values, seen.index, len(mesh.vertices)) for values in found)
+        add_photograph(as_taken(number), samples, mesh.vertices, side, black, slope, cosine, explained, weight)
     return explained, weight
 
 
-def _side_of_view(normal: Float[Tensor, "seen 3"], wo: Float[Tensor, "seen 3"]) -> Int[Tensor, "seen"]:
+def _at_vertices(values: Float[Tensor, "seen *rest"], index: Int[Tensor, "seen"], count: int) -> Float[Tensor, "{count} *rest"]:
+    """0 at those that are not seen."""
+    return values.new_zeros(count, *values.shape[1:]).index_copy_(0, index, values)
+
+
+def _side_of_view(normal: Float[Tensor, "seen 3"], wo: Float[Tensor, "seen 3"]) -> Int32[Tensor, "seen"]:
     """Of SIDES, from which places with these normals are seen."""
     right, ahead = ((wo * tangent).sum(-1) > 0 for tangent in tangents_from_normal(normal))
-    return 2 * right.long() + ahead.long()
-
-
-def _photograph_at(target: ViewTarget, places: Float[Tensor, "sample 3"]) -> tuple[Float[Tensor, "usable 3"], Int[Tensor, "usable"]]:
-    """Linear radiance that the photograph has at these places, and which of them it shows whole and not overexposed."""
-    camera = target.camera
-    at = (places @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]) @ camera.intrinsics.T
-    place, size = at[:, :2] / at[:, 2:], torch.tensor([camera.width, camera.height], device=places.device)
-    inside = ((place > 1) & (place < size - 1)).all(1).nonzero().squeeze(1)
-    column, row = place[inside].long().unbind(1)
-    solid = (target.mask[row, column] > SOLID) & (target.saturation[row, column].amax(-1) < SATURATED * target.ceiling)
-    usable = inside[solid]
-    grid = (2 * place[usable] / size - 1)[None, None]
-    sampled = torch.nn.functional.grid_sample(target.saturation.permute(2, 0, 1)[None], grid, mode="bilinear", align_corners=False)
-    return linear_from_srgb(sampled[0, :, 0].T), usable
+    return 2 * right.int() + ahead.int()
 
 
 def _linear_in_albedo(tracer: AbstractTracer, seen: SeenVertices, light: MeshLight) -> tuple[Tensor, Tensor]:

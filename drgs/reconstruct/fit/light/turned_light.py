@@ -12,7 +12,8 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+import warp as wp
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from drgs.reconstruct.fit.light.mesh_light import BRIGHTEST_SHARE, SHARE_LIFT, LightOf, MeshLight, corner_weights
@@ -22,6 +23,9 @@ from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.environment import Environment, environment_radiance
 from drgs.scene.mesh import vertex_normals
+from drgs.warp_torch import launch, warp_argument, warp_device
+
+wp.set_module_options({"enable_backward": False})
 
 DIRECTIONS = 192
 """Over the sphere: 15 degrees from one to the next."""
@@ -38,15 +42,16 @@ class SeenSky:
 
     directions: Float[Tensor, "direction 3"]
     """Unit, world."""
-    cosine: Float[Tensor, "vertex direction"]
-    """To the vertex's normal; 0 below the horizon."""
-    open: Bool[Tensor, "vertex direction"]
-    """Nothing is met."""
-    receiver: Int[Tensor, "met"]
-    sender: Int[Tensor, "met"]
-    """Vertices: the first sees the second, or a face at its corner."""
+    cosine: Float[Tensor, "direction vertex"]
+    """To the vertex's normal; 0 below the horizon. In this order a product with three columns takes half the time."""
+    first_met: Int[Tensor, "vertex_and_end"]
+    """Where in what follows, which is in the order of vertices, that of each vertex begins."""
+    met_direction: UInt8[Tensor, "met"]
+    """In which something is met."""
     met_cosine: Float[Tensor, "met"]
-    """At the receiver."""
+    """At the vertex that meets it."""
+    sender: Int[Tensor, "met"]
+    """Vertex that is met: of a face the nearest corner."""
 
 
 def even_directions(count: int) -> Float[Tensor, "{count} 3"]:
@@ -64,21 +69,61 @@ def seen_sky(tracer: AbstractTracer) -> SeenSky:
     mesh = tracer.mesh
     normals = vertex_normals(mesh.vertices, mesh.faces)
     directions = even_directions(DIRECTIONS).to(normals)
-    cosine = (normals @ directions.T).clamp(min=0)
-    open_ = torch.zeros_like(cosine, dtype=torch.bool)
-    vertex, direction = (cosine > 0).nonzero().unbind(1)
-    receiver, sender = [], []
+    cosine = (directions @ normals.T).clamp(min=0)
+    vertex, direction = (cosine.T > 0).nonzero().unbind(1)
+    counts = torch.zeros(len(normals), dtype=torch.int64, device=vertex.device)
+    met_direction, met_cosine, sender = [], [], []
     for some in torch.arange(len(vertex), device=vertex.device).split(TRACED_AT_ONCE):
         at = vertex[some]
         origins = mesh.vertices[at] + SHARE_LIFT * tracer.lift * normals[at]
         hits = trace_rays(origins, directions[direction[some]], tracer)
-        open_[at[~hits.hit], direction[some][~hits.hit]] = True
         met = hits.hit.nonzero().squeeze(1)
         nearest = corner_weights(hits.barycentric[met]).argmax(1, keepdim=True)
-        receiver.append(some[met])
-        sender.append(mesh.faces[hits.face[met].long()].long().gather(1, nearest).squeeze(1))
-    met = torch.cat(receiver)
-    return SeenSky(directions, cosine, open_, vertex[met], torch.cat(sender), cosine[vertex[met], direction[met]])
+        counts += torch.bincount(at[met], minlength=len(normals))
+        met_direction.append(direction[some[met]].to(torch.uint8))
+        met_cosine.append(cosine[direction[some[met]], at[met]])
+        sender.append(mesh.faces[hits.face[met].long()].gather(1, nearest).squeeze(1).to(torch.int32))
+    first_met = torch.cat([counts[:1] * 0, counts.cumsum(0)]).to(torch.int32)
+    return SeenSky(directions, cosine, first_met, *(torch.cat(parts) for parts in (met_direction, met_cosine, sender)))
+
+
+@wp.kernel
+def direct_kernel(
+    first: int,
+    first_met: wp.array[int],
+    met_direction: wp.array[wp.uint8],
+    met_cosine: wp.array[float],
+    radiance: wp.array[wp.vec3],
+    unhidden: wp.array[wp.vec3],
+    # outputs
+    direct: wp.array[wp.vec3],
+):
+    """What arrives from the sky: all of it, less what is hidden."""
+    i = first + wp.tid()
+    hidden = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(first_met[i], first_met[i + 1]):
+        hidden += met_cosine[k] * radiance[int(met_direction[k])]
+    left = unhidden[i] - hidden
+    direct[i] = wp.vec3(wp.max(left[0], 0.0), wp.max(left[1], 0.0), wp.max(left[2], 0.0))
+
+
+@wp.kernel
+def bounce_kernel(
+    first: int,
+    first_met: wp.array[int],
+    met_cosine: wp.array[float],
+    sender: wp.array[int],
+    sent: wp.array[wp.vec3],
+    direct: wp.array[wp.vec3],
+    # outputs
+    arriving: wp.array[wp.vec3],
+):
+    """What arrives from the sky and from what is met."""
+    i = first + wp.tid()
+    found = direct[i]
+    for k in range(first_met[i], first_met[i + 1]):
+        found += met_cosine[k] * sent[sender[k]]
+    arriving[i] = found
 
 
 @torch.no_grad()
@@ -91,14 +136,18 @@ def arriving_share(
         albedo: (vertex, 3) base colour of what sends light back; of metal it stands for what it mirrors. tables: of filter_environment.
     """
     softened = Environment(level_table(tables, LOBE))
-    radiance = environment_radiance(softened, sky.directions @ light_from_world.T)
-    unhidden = sky.cosine @ radiance
-    direct = (sky.cosine * sky.open) @ radiance
+    radiance = environment_radiance(softened, sky.directions @ light_from_world.T).contiguous()
+    unhidden = (radiance.T @ sky.cosine).T.contiguous()
+    count, device, direct = len(unhidden), warp_device(unhidden), torch.empty_like(unhidden)
+    first_met, met_cosine = warp_argument(sky.first_met), warp_argument(sky.met_cosine)
+    *inputs, output = (warp_argument(x, wp.vec3) for x in (radiance, unhidden, direct))
+    launch(direct_kernel, count, [first_met, warp_argument(sky.met_direction), met_cosine, *inputs], [output], device)
     arriving = direct
     for _ in range(BOUNCES):
         # A direction stands for 4 pi / DIRECTIONS; irradiance over pi times albedo is what is sent.
-        sent = albedo * arriving * (4 / DIRECTIONS)
-        arriving = direct.index_add(0, sky.receiver, sky.met_cosine[:, None] * sent[sky.sender])
+        sent, arriving = albedo * arriving * (4 / DIRECTIONS), torch.empty_like(direct)
+        sending = [first_met, met_cosine, warp_argument(sky.sender), warp_argument(sent, wp.vec3), output]
+        launch(bounce_kernel, count, sending, [warp_argument(arriving, wp.vec3)], device)
     return (arriving / unhidden.clamp(min=1e-6)).clamp(0, BRIGHTEST_SHARE)
 
 

@@ -136,13 +136,14 @@ def fit_surface(
     settings: SurfaceSettings,
     report: Callable[[FitReport], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    same_place: MovingSurface | None = None,
 ) -> FitState:
     """Run (or go on with) the surface's fit; see run_fit.
 
     Args:
-        mesh: whose faces the state's vertices have.
+        mesh: whose faces the state's vertices have. same_place: of MovingSurface.
     """
-    steps = _Steps(views, mesh.faces, state, settings)
+    steps = _Steps(views, mesh.faces, state, settings, same_place)
 
     def rates(iteration: int) -> dict[str, float]:
         late = max(0.0, (iteration / settings.iterations - settings.fall_from) / max(1 - settings.fall_from, 1e-9))
@@ -157,10 +158,12 @@ def fit_surface(
 class _Steps:
     """Final. The surface's part of the fit loop."""
 
-    def __init__(self, views: Views, faces: Tensor, state: FitState, settings: SurfaceSettings) -> None:
+    def __init__(
+        self, views: Views, faces: Tensor, state: FitState, settings: SurfaceSettings, same_place: MovingSurface | None = None
+    ) -> None:
         self.state, self.settings, self.faces = state, settings, faces
         self.targets = view_targets(views, 1.0, faces.device)
-        self.surface = MovingSurface(views, faces, state)
+        self.surface = MovingSurface(views, faces, state, same_place)
 
     def end_round(self, done: int) -> None:
         if not self.settings.still and done % self.settings.steps_a_round == 0:

@@ -14,12 +14,12 @@ from torch import Tensor
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
 from drgs.reconstruct.fit.evidence.light_from_paint import PaintLightSettings, light_from_paint
 from drgs.reconstruct.fit.evidence.matched_texture import matched_texture
-from drgs.reconstruct.fit.evidence.metal_evidence import light_scale, metal_evidence, view_sums
+from drgs.reconstruct.fit.evidence.metal_evidence import ViewSums, light_scale, metal_evidence, view_sums
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import ENVIRONMENT_PYRAMID, environment_table, upsampled
 from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, irradiance_share
 from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
-from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
+from drgs.reconstruct.fit.light.turned_light import SeenSky, light_of_views, seen_sky
 from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.alike_systems import AlikeSystems
@@ -61,18 +61,33 @@ class MoveSettings:
 class MovingSurface:
     """Final. The mesh of a fit, with the tracer of where it is now."""
 
-    def __init__(self, views: Views, faces: Tensor, state: FitState) -> None:
+    def __init__(self, views: Views, faces: Tensor, state: FitState, same_place: "MovingSurface | None" = None) -> None:
+        """
+        Args:
+            same_place: a surface whose vertices lie where the state's do, and whose faces these are: what rays find there need not be found anew.
+        """
         self._state, self.faces = state, faces
         self._cameras = tuple(camera.to(faces.device) for camera in views.cameras)
         self._views = views
-        self.edges = mesh_edges(faces)
-        self.tracer = self._tracer()
-        self._sky = None if views.light_from_world is None else seen_sky(self.tracer)
+        self._light_turns = views.light_from_world is not None
+        self._seen_sky: SeenSky | None = None
+        if same_place is None:
+            self.edges, self.tracer = mesh_edges(faces), self._tracer()
+        else:
+            self.edges, self._seen_sky = same_place.edges, same_place._sky
+            self.tracer = same_place.tracer.with_materials(mesh_from_surface_fit(state, faces))
 
     @cached_property
     def _outlines(self) -> OutlineRays:
         outlines = mask_outlines(self._views) if self._views.has_masks else []
         return outline_rays(self._cameras if outlines else (), outlines, self.faces.device)
+
+    @property
+    def _sky(self) -> SeenSky | None:
+        """What the vertices see, where the light turns: traced when it is first asked for after relight, as fits do many times between two moves."""
+        if self._light_turns and self._seen_sky is None:
+            self._seen_sky = seen_sky(self.tracer)
+        return self._seen_sky
 
     def _tracer(self) -> AbstractTracer:
         tracer = build_tracer(mesh_from_surface_fit(self._state, self.faces))
@@ -129,8 +144,8 @@ class MovingSurface:
         """
         parameters = self._state.parameters
         self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
-        if self._sky is not None:
-            self._sky = seen_sky(self.tracer)
+        self._seen_sky = None
+        if self._light_turns:
             return
         radiance = environment_table(parameters)
         light = MeshLight(filter_environment(radiance), parameters["open_share"])
@@ -149,7 +164,7 @@ class MovingSurface:
     @torch.no_grad()
     def look_for_light(self, settings: MoveSettings) -> None:
         """The light under which paint is alike on all sides, and the paint's albedo under it. Light that turns with the camera shows paint from all sides already."""
-        if self._sky is not None:
+        if self._light_turns:
             return
         parameters = self._state.parameters
         radiance = environment_table(parameters)
@@ -187,17 +202,24 @@ class MovingSurface:
         return light_of_views(tables, parameters["open_share"], torch.sigmoid(parameters["albedo_logits"].detach()), self._sky)
 
     @torch.no_grad()
-    def look_for_metal(self, targets: list[ViewTarget], settings: MoveSettings) -> None:
-        """What the photographs say now of which places are metal, and of how bright the light is."""
+    def look_for_metal(self, targets: list[ViewTarget], settings: MoveSettings) -> ViewSums:
+        """What the photographs say now of which places are metal, and of how bright the light is. Returns by what they say it, under the light as it is afterwards."""
+        sums = self.sums(targets)
         parameters = self._state.parameters
-        tables = filter_environment(environment_table(parameters))
-        sums = view_sums(self.tracer, targets, self.light_of(tables))
         scale = light_scale(sums)
-        parameters["metal"].copy_(metal_evidence(sums, self.edges, self._sky is not None, scale))
+        parameters["metal"].copy_(metal_evidence(sums, self.edges, self._light_turns, scale))
         if scale != 1:
             parameters[f"environment_{ENVIRONMENT_PYRAMID[0]}"] += math.log(scale)
             parameters["albedo_logits"].copy_(logits_of_shares(torch.sigmoid(parameters["albedo_logits"]) / scale))
             self.relight(settings.share_rays)
+            return self.sums(targets)
+        return sums
+
+    @torch.no_grad()
+    def sums(self, targets: list[ViewTarget]) -> ViewSums:
+        """What the photographs say of each vertex, under the light as it is."""
+        tables = filter_environment(environment_table(self._state.parameters))
+        return view_sums(self.tracer, targets, self.light_of(tables))
 
 
 def mesh_from_surface_fit(state: FitState, faces: Tensor) -> TriangleMesh:

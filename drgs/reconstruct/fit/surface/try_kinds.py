@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.maths.constants import F0
-from drgs.reconstruct.fit.evidence.metal_evidence import FEWEST_VIEWS, ViewSums, view_sums
+from drgs.reconstruct.fit.evidence.metal_evidence import FEWEST_VIEWS, ViewSums
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
@@ -39,6 +39,8 @@ BEGUN = 0.95
 """What metallic begins with, of its kind: at the very ends there is no gradient."""
 SURE = 0.5
 """Of evidence, -1..1."""
+PIXELS = 16_384
+"""Of each photograph, at most, by which errors are compared: of a million in all their mean is known to a thousandth."""
 ALBEDO = (0.05, 0.95)
 """That a place may begin with."""
 
@@ -68,24 +70,30 @@ def try_kinds(
     """
     own = replace(settings, rounds=1, steps_a_round=_half(settings), still=True, fall_from=1.0)
     targets = view_targets(views, 1.0, faces.device)
+    given = {name: value.detach() for name, value in parameters.items()}
+    here = MovingSurface(views, faces, _state(given, own))  # nothing moves
+    sums = here.sums(targets)
+
+    def surface_of(state: FitState) -> MovingSurface:
+        return MovingSurface(views, faces, state, here)
+
     ends: list[tuple[dict[str, Tensor], float]] = []
     for number, kind in enumerate(KINDS):
-        state = _state({name: value.detach() for name, value in parameters.items()}, own)
-        state = _state(begun_as(kind, _sums(views, state, faces, targets), state.parameters), own)
+        state = _state(begun_as(kind, sums, given), own)
         for half in range(2):
             if half:
-                MovingSurface(views, faces, state).look_for_metal(targets, own.moves)
-                state = _state(as_evidence_says(_sums(views, state, faces, targets), state.parameters), own)
+                found = surface_of(state).look_for_metal(targets, own.moves)
+                state = _state(as_evidence_says(found, state.parameters), own)
             before = (2 * number + half) * own.iterations
 
             def tell(r: FitReport, before: int = before) -> None:
                 if report is not None:
                     report(replace(r, iteration=before + r.iteration, iterations=iterations(settings)))
 
-            fit_surface(views, mesh_from_surface_fit(state, faces), state, own, tell, should_stop)
+            fit_surface(views, mesh_from_surface_fit(state, faces), state, own, tell, should_stop, here)
             if state.iteration < own.iterations:
                 return None
-        ends.append(({name: value.detach() for name, value in state.parameters.items()}, _error(views, state, faces, targets, own)))
+        ends.append(({name: value.detach() for name, value in state.parameters.items()}, _error(surface_of(state), state, targets, own)))
     metal, paint = ends
     return TriedKinds((metal if metal[1] < CLEARLY * paint[1] else paint)[0], (metal[1], paint[1]))
 
@@ -144,15 +152,9 @@ def _state(parameters: dict[str, Tensor], settings: SurfaceSettings) -> FitState
 
 
 @torch.no_grad()
-def _sums(views: Views, state: FitState, faces: Tensor, targets: list[ViewTarget]) -> ViewSums:
-    surface = MovingSurface(views, faces, state)
-    return view_sums(surface.tracer, targets, surface.light_of(filter_environment(environment_table(state.parameters))))
-
-
-@torch.no_grad()
-def _error(views: Views, state: FitState, faces: Tensor, targets: list[ViewTarget], settings: SurfaceSettings) -> float:
+def _error(surface: MovingSurface, state: FitState, targets: list[ViewTarget], settings: SurfaceSettings) -> float:
     """Mean squared error (display values) over the pixels that mask and mesh fill, without the noise of mirrored rays."""
-    surface, parameters = MovingSurface(views, faces, state), state.parameters
+    parameters = state.parameters
     packed = packed_surface(parameters)
     normals = packed[:, :3]
     light_of = surface.light_of(filter_environment(environment_table(parameters)))
@@ -160,7 +162,7 @@ def _error(views: Views, state: FitState, faces: Tensor, targets: list[ViewTarge
     total, count = 0.0, 0
     for target in targets:
         solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
-        solid = solid[:: max(1, len(solid) // settings.pixels_a_step)]
+        solid = solid[:: max(1, len(solid) // PIXELS)]
         twice = seen_twice(target, solid, surface.tracer, generator)
         steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
         light = light_of(target)

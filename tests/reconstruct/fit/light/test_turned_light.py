@@ -8,12 +8,21 @@ import torch
 
 from drgs.maths.frames import rotation_from_quat_wxyz
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, irradiance_share
-from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, filter_environment, shade_split_sum, texel_directions
-from drgs.reconstruct.fit.light.turned_light import arriving_share, even_directions, light_of_views, seen_sky
+from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, filter_environment, level_table, shade_split_sum, texel_directions
+from drgs.reconstruct.fit.light.turned_light import (
+    BOUNCES,
+    DIRECTIONS,
+    LOBE,
+    SeenSky,
+    arriving_share,
+    even_directions,
+    light_of_views,
+    seen_sky,
+)
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.camera import Camera
-from drgs.scene.environment import Environment, turned_environment
+from drgs.scene.environment import Environment, environment_radiance, turned_environment
 from drgs.scene.mesh import TriangleMesh
 from tests.reconstruct.fit.light.test_mesh_light import black_spheres
 
@@ -48,6 +57,30 @@ def test_shares_are_those_that_are_sampled_for_the_light_as_it_is_turned(albedo:
     assert int(hidden.sum()) > 15
     assert float((found - sampled).abs()[hidden].mean()) < 0.03
     assert float((found - sampled).abs().mean()) < 0.015
+
+
+def share_twin(sky: SeenSky, albedo: torch.Tensor, tables: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+    """The specification, by whole matrices: what is sent from vertex to vertex, and which directions are open."""
+    radiance = environment_radiance(Environment(level_table(tables, LOBE)), sky.directions @ turn.T).double()
+    cosine, count = sky.cosine.T.double(), len(albedo)
+    receiver = torch.repeat_interleave(torch.arange(count), sky.first_met.diff().long())
+    open_, sends = cosine > 0, torch.zeros(count, count, dtype=torch.float64)
+    open_[receiver, sky.met_direction.long()] = False
+    sends.index_put_((receiver, sky.sender.long()), cosine[receiver, sky.met_direction.long()], accumulate=True)
+    direct = (cosine * open_) @ radiance
+    arriving = direct
+    for _ in range(BOUNCES):
+        arriving = direct + sends @ (albedo.double() * arriving) * (4 / DIRECTIONS)
+    return arriving / (cosine @ radiance)
+
+
+def test_shares_are_those_of_whole_matrices() -> None:
+    mesh = spheres(0.8)
+    albedo = mesh.albedo * torch.linspace(0.2, 1.0, len(mesh.vertices))[:, None]
+    sky, tables = seen_sky(build_tracer(mesh)), filter_environment(smooth_sky().radiance)
+    assert int(sky.first_met[-1]) == len(sky.sender) > 1000
+    found = arriving_share(sky, albedo, tables, TURN)
+    torch.testing.assert_close(found.double(), share_twin(sky, albedo, tables, TURN), atol=2e-6, rtol=0)
 
 
 def test_without_a_turn_an_open_vertex_has_all_of_the_sky() -> None:
