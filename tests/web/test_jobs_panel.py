@@ -105,14 +105,16 @@ def test_every_state_offers_what_can_be_done(viewer: Viewer, jobs: Jobs) -> None
         expect(card.get_by_text("Nothing about this capture stands in the way.")).to_be_visible()
 
 
-def test_where_gaussians_lie_is_chosen_with_the_build(viewer: Viewer, jobs: Jobs) -> None:
+def test_where_gaussians_lie_and_what_stays_as_given_is_chosen_with_the_build(viewer: Viewer, jobs: Jobs) -> None:
     page = viewer.page
     page.reload()
     page.get_by_text("Advanced").click()
     page.get_by_role("radio", name="On the mesh").check()
+    page.get_by_role("group", name="Cameras stand").get_by_role("radio", name="As given").check()
     with page.expect_request(lambda request: request.url.endswith("/api/jobs") and request.method == "POST") as sent:
         page.get_by_role("button", name="Build the sample").click()
-    assert sent.value.post_data_json == {"dataset": "sample", "preset": "fast", "binding": "mesh", "light": "auto"}
+    found = {"light": "auto", "masks": "auto", "cameras": "given"}
+    assert sent.value.post_data_json == {"dataset": "sample", "preset": "fast", "binding": "mesh"} | found
 
 
 def test_the_page_logged_no_errors(viewer: Viewer) -> None:

@@ -112,7 +112,7 @@ async function follow(started: Promise<JobInfo>): Promise<JobInfo | null> {
 }
 
 /** How a capture becomes an asset. */
-export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding' | 'light'>>;
+export type BuildChoice = Required<Pick<BuildRequest, 'preset' | 'binding' | 'light' | 'masks' | 'cameras'>>;
 
 export const buildSample = (choice: BuildChoice) => follow(api.startJob({ dataset: 'sample', ...choice }));
 /** `up`: direction of the capture's world that points up. `box`: of the world that is turned so; null: all of the object. `strokes`: null: the capture's own masks count. */

@@ -4,7 +4,7 @@ import { signal } from '@preact/signals';
 import type { BuildChoice } from '../../session/jobs';
 import { Choice } from '../fields';
 
-export const build = signal<BuildChoice>({ preset: 'fast', binding: 'particles', light: 'auto' });
+export const build = signal<BuildChoice>({ preset: 'fast', binding: 'particles', light: 'auto', masks: 'auto', cameras: 'auto' });
 
 export function BuildChoices() {
   return (
@@ -39,6 +39,24 @@ export function BuildChoices() {
             { value: 'camera', text: 'The camera', title: 'The object stood on a turntable' },
           ]}
           onChange={(light) => (build.value = { ...build.value, light })}
+        />
+        <Choice
+          label="Masks end"
+          value={build.value.masks}
+          options={[
+            { value: 'auto', text: 'At edges', title: 'Where the pictures show the object to end, if the masks are a pixel or two off' },
+            { value: 'given', text: 'As given', title: 'Where the capture has them' },
+          ]}
+          onChange={(masks) => (build.value = { ...build.value, masks })}
+        />
+        <Choice
+          label="Cameras stand"
+          value={build.value.cameras}
+          options={[
+            { value: 'auto', text: 'As they fit', title: 'Moved by parts of a pixel while the object is fitted, if they are off' },
+            { value: 'given', text: 'As given', title: 'Where the capture has them' },
+          ]}
+          onChange={(cameras) => (build.value = { ...build.value, cameras })}
         />
       </details>
     </>
