@@ -140,7 +140,9 @@ class MaskLook:
         """The photograph and its mask, whose outline is moved."""
         alpha, inside = mask.copy(), mask > 127
         most = self.scale * (self.reach + MIXED)
-        pixels = np.argwhere(np.where(inside, _squared_distance(~inside, most), _squared_distance(inside, most)) <= most**2)[:, ::-1]
+        box = _box_around(inside, most)
+        near = np.where(inside[box], _squared_distance(~inside[box], most), _squared_distance(inside[box], most)) <= most**2
+        pixels = (np.argwhere(near) + [side.start for side in box])[:, ::-1]
         places = self.scale * (self.points + self.offsets[:, None] * self.normals + 0.5) - 0.5
         distance, place = cKDTree(places).query(pixels)
         own = distance <= self.scale * (2 * self.reach + MIXED)  # others are of specks, which were not looked at
@@ -168,11 +170,19 @@ def _shrunk(image: UInt8[ndarray, "rows columns 3"], size: tuple[int, int]) -> U
 
 def _is_cut_out(image: UInt8[ndarray, "height width 3"], inside: Bool[ndarray, "height width"], reach: float) -> bool:
     """Whether all around the object has one colour, as pictures have that were cut out."""
-    away = _squared_distance(inside, reach + BAND)
-    around = image[(away > 4) & (away <= (reach + BAND) ** 2)]
+    box = _box_around(inside, reach + BAND)
+    away = _squared_distance(inside[box], reach + BAND)
+    around = image[box][(away > 4) & (away <= (reach + BAND) ** 2)]
     if len(around) == 0:
         return True
     return bool((around == np.median(around, axis=0).astype(np.uint8)).all(1).mean() > CUT_OUT)
+
+
+def _box_around(inside: Bool[ndarray, "height width"], most: float) -> tuple[slice, slice]:
+    """Rows and columns of all pixels that are at most so far from some inside [pixels], of which there are any."""
+    margin = int(most) + 1
+    ends = [np.flatnonzero(inside.any(axis))[[0, -1]] for axis in (1, 0)]
+    return slice(max(0, ends[0][0] - margin), ends[0][1] + margin + 1), slice(max(0, ends[1][0] - margin), ends[1][1] + margin + 1)
 
 
 def _squared_distance(there: Bool[ndarray, "height width"], most: float) -> UInt16[ndarray, "height width"]:

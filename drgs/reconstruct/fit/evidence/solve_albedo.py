@@ -17,7 +17,8 @@ In: the mesh through its tracer, photographs, light. Out: albedo of the vertices
 of a mean by its halves (docs/sources.md: spearman1910); ours.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
@@ -154,7 +155,7 @@ def _sums_by_side(
     """Both sums of the least squares, for photographs from each of SIDES sides of the surface's normal."""
     mesh, count = tracer.mesh, len(samples.corners)
     explained, weight = (torch.zeros(SIDES, count, 3, device=mesh.albedo.device) for _ in range(2))
-    for number, target in enumerate(targets):
+    for target, large in zip(targets, _one_ahead(as_taken, len(targets)), strict=True):
         seen = seen_vertices(tracer, target)
         if len(seen.index) == 0:
             continue
@@ -163,8 +164,19 @@ def _sums_by_side(
         side[seen.index] = _side_of_view(normal, seen.wo)
         found = (*_linear_in_albedo(tracer, seen, light_of(target)), (normal * seen.wo).sum(-1))
         black, slope, cosine = (_at_vertices(values, seen.index, len(mesh.vertices)) for values in found)
-        add_photograph(as_taken(number), samples, mesh.vertices, side, black, slope, cosine, explained, weight)
+        add_photograph(large, samples, mesh.vertices, side, black, slope, cosine, explained, weight)
     return explained, weight
+
+
+def _one_ahead(as_taken: Callable[[int], ViewTarget], count: int) -> Iterator[ViewTarget]:
+    """All of them in turn; the next one is read meanwhile, for large files take as long as what is done with them."""
+    with ThreadPoolExecutor(1, thread_name_prefix="photographs") as reader:
+        coming = [reader.submit(as_taken, number) for number in range(min(1, count))]
+        for number in range(count):
+            photograph = coming.pop().result()
+            if number + 1 < count:
+                coming.append(reader.submit(as_taken, number + 1))
+            yield photograph
 
 
 def _at_vertices(values: Float[Tensor, "seen *rest"], index: Int[Tensor, "seen"], count: int) -> Float[Tensor, "{count} *rest"]:

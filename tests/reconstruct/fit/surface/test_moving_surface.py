@@ -6,13 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 
+from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, irradiance_share
 from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.light.turned_light import seen_sky
+from drgs.reconstruct.fit.surface import moving_surface
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer
+from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.environment import Environment
 from tests.reconstruct.fit.painted_sphere import grey_light, painted_views
@@ -73,6 +77,28 @@ def test_a_surface_that_moved_is_lit_anew_where_it_is_shaded_next_and_met_where_
     assert not torch.equal(state.parameters["vertices"], before)
     torch.testing.assert_close(surface.tracer.mesh.vertices, state.parameters["vertices"])
     assert bool((state.parameters["open_share"] != 1).any()) == relight
+
+
+def test_what_is_seen_of_a_turning_sky_is_traced_once_for_a_place_and_anew_after_a_move(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    traced = []
+    monkeypatch.setattr(moving_surface, "seen_sky", lambda tracer: traced.append(seen_sky(tracer)) or traced[-1])
+    state, faces = two_spheres()
+    views = with_light_of_camera(replace(painted_views(tmp_path, count=3), has_masks=False))
+    target = view_targets(views, 1.0, torch.device("cpu"))[1]
+    surface = MovingSurface(views, faces, state)
+
+    def share(of: MovingSurface) -> torch.Tensor:
+        return of.light_of(filter_environment(environment_table(state.parameters).detach()))(target).open_share
+
+    assert not traced
+    before = share(surface)
+    assert torch.equal(share(MovingSurface(views, faces, state, surface)), before) and len(traced) == 1
+    surface.move(MoveSettings(solves=1))
+    after = share(surface)
+    assert len(traced) == 2 and not torch.equal(before, after)
+    assert torch.equal(after, share(MovingSurface(views, faces, state)))
 
 
 @pytest.mark.slow
