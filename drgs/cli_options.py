@@ -64,7 +64,10 @@ EXPORT_HELP = "; ".join(
 )
 AssetPath = Annotated[Path, typer.Argument(metavar="ASSET", help="Asset folder, or the same zipped.")]
 DatasetPath = Annotated[
-    Path, typer.Argument(metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP, Metashape or NeRO folder; pictures or a film.")
+    Path,
+    typer.Argument(
+        metavar="DATASET", help="NeRF-synthetic, nerfstudio, COLMAP, Metashape, RealityCapture or NeRO folder; pictures or a film."
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 StrokesPath = Annotated[

@@ -25,7 +25,7 @@ class Views:
     has_masks: bool
     """False when the capture has neither alpha nor masks: coverage is then 255 everywhere."""
     source: str
-    """Which reader recognised the folder: nerf-synthetic, nerfstudio, colmap, metashape, nero."""
+    """Which reader recognised the folder: nerf-synthetic, nerfstudio, colmap, metashape, realitycapture, nero."""
     lenses: tuple[Lens | None, ...] = ()
     """As the photographs on disc were calibrated, one a view: None where it was a pinhole already. The images here are undistorted."""
     gains: tuple[float, ...] | None = None

@@ -27,7 +27,7 @@ EXAMINED_SIDE = 400
 EXAMINED_POINTS = 20_000
 WHAT_IS_READ = (
     "Mend that first. A capture is a folder with transforms_train.json (NeRF-synthetic), transforms.json (nerfstudio), "
-    "sparse/ and images/ (COLMAP), Metashape's *.xml or NeRO's cameras, and with all pictures that these name."
+    "sparse/ and images/ (COLMAP), Metashape's *.xml, RealityCapture's *.csv or NeRO's cameras, and with all pictures that these name."
 )
 WHAT_TO_TAKE = (
     "Take 40 to 100 sharp pictures from all around and at two or three heights, each overlapping the next by two thirds, the object and what stands "

@@ -12,6 +12,7 @@ from drgs.reconstruct.capture.camera_files import check_readers, is_photograph, 
 from drgs.reconstruct.capture.load_views.checks import find_masks, is_folder, refuse_asset
 from drgs.reconstruct.capture.load_views.colmap import find_model
 from drgs.reconstruct.capture.load_views.metashape import find_cameras_file
+from drgs.reconstruct.capture.load_views.realitycapture import find_cameras_table
 
 FEWEST_PHOTOS = 8
 """With fewer, hardly anything is seen from enough sides, whatever their poses."""
@@ -65,7 +66,10 @@ def _refuse_posed(folder: Path) -> None:
     """A folder that has cameras already is a capture, and so is the one around its images/."""
     for place in (folder, folder.resolve().parent) if folder.name == "images" else (folder,):
         found = (
-            next((path for pattern in CAMERA_FILES for path in place.glob(pattern)), None) or find_model(place) or find_cameras_file(place)
+            next((path for pattern in CAMERA_FILES for path in place.glob(pattern)), None)
+            or find_model(place)
+            or find_cameras_file(place)
+            or find_cameras_table(place)
         )
         if found is not None:
             raise ValueError(

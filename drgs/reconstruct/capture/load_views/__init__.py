@@ -1,9 +1,10 @@
-"""Read posed photographs of an object, in the five layouts people have them in, into Views.
+"""Read posed photographs of an object, in the six layouts people have them in, into Views.
 
     NeRF-synthetic   transforms_train.json, RGBA pictures
     nerfstudio       transforms.json
     COLMAP           sparse/0 or sparse (bin or txt), images/
     Metashape        *.xml of its cameras, images/ or pictures beside it
+    RealityCapture   *.csv of its cameras ("Internal/External camera parameters"), images/ or pictures beside it
     NeRO             K.png, K-depth.png, K-camera.pkl
 
 Masks come from alpha, from `mask_path` or from a masks/ folder; black is background. Pictures through a lens that bends straight lines are
@@ -21,6 +22,7 @@ from drgs.reconstruct.capture.load_views.nerf_synthetic import read_nerf_synthet
 from drgs.reconstruct.capture.load_views.nerfstudio import read_nerfstudio
 from drgs.reconstruct.capture.load_views.nero import read_nero
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
+from drgs.reconstruct.capture.load_views.realitycapture import find_cameras_table, read_realitycapture
 from drgs.reconstruct.capture.load_views.transforms_json import (
     frame_camera_from_world,
     frame_names,
@@ -70,11 +72,13 @@ def read_capture(folder: Path, split: Literal["train", "test"] = "train") -> Cap
         capture = read_colmap(folder)
     elif find_cameras_file(folder) is not None:
         capture = read_metashape(folder)
+    elif find_cameras_table(folder) is not None:
+        capture = read_realitycapture(folder)
     else:
         refuse_asset(folder)
         raise ValueError(
             f"{folder}: not a capture, expected transforms_train.json (NeRF-synthetic), transforms.json (nerfstudio), "
-            "sparse/0/cameras.bin or .txt (COLMAP), *.xml (Metashape) or *-camera.pkl (NeRO)."
+            "sparse/0/cameras.bin or .txt (COLMAP), *.xml (Metashape), *.csv (RealityCapture) or *-camera.pkl (NeRO)."
         )
     check_photographs(capture.photographs, folder)
     return capture
@@ -83,7 +87,7 @@ def read_capture(folder: Path, split: Literal["train", "test"] = "train") -> Cap
 def has_cameras(folder: Path) -> bool:
     """Whether one of the layouts is there: read_capture then reads it, or says what is wrong with it."""
     found = next((path for pattern in ("transforms_train.json", "transforms.json", "*-camera.pkl") for path in folder.glob(pattern)), None)
-    return found is not None or find_model(folder) is not None or find_cameras_file(folder) is not None
+    return found is not None or any(find(folder) is not None for find in (find_model, find_cameras_file, find_cameras_table))
 
 
 def load_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera]:

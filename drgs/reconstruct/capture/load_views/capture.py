@@ -1,6 +1,6 @@
 """What a reader finds in a capture folder before any pixel is decoded: which picture was taken from where.
 
-Readers (nerf_synthetic, nerfstudio, colmap, metashape, nero) write these records; read_pictures turns them into Views.
+Readers (nerf_synthetic, nerfstudio, colmap, metashape, realitycapture, nero) write these records; read_pictures turns them into Views.
 """
 
 from dataclasses import dataclass, replace
@@ -57,7 +57,7 @@ class Capture:
     """A readable capture folder."""
 
     source: str
-    """nerf-synthetic, nerfstudio, colmap, metashape or nero."""
+    """nerf-synthetic, nerfstudio, colmap, metashape, realitycapture or nero."""
     photographs: tuple[Photograph, ...]
     points_world: Float[ndarray, "point 3"] | None
     point_colors_srgb: Float[ndarray, "point 3"] | None
