@@ -1,13 +1,14 @@
 """RealityCapture (RealityScan): the CSV of "Internal/External camera parameters", pictures in images/ or beside it.
 
     #name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2
+    #name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2      (RealityScan 2)
 
-A line a picture; columns may stand in any order, for users may write the template, and what bends or shifts may be missing. The world is z up, x
-east and y north; at heading, pitch and roll of 0 a camera looks straight down with the picture's top to the north, heading turns clockwise as on a compass, pitch
-lifts the view and roll turns about the picture's own vertical. The focal length is that of a picture whose longer side is 36 mm, the principal point counts from the middle
-in shares of the longer side, k1 to k3 are Brown's and t1, t2 those of decentred elements. A georeferenced world is moved to the middle of its cameras: float32 has no digits left
-for an object there.
-Sources: columns and units by the program's help and by files that other readers take; brown1966 (docs/sources.md).
+A line a picture; columns may stand in any order, for users may write the template, and what bends or shifts may be missing. The world is local: z up, x east
+and y north; at heading, pitch and roll of 0 a camera looks straight down with the picture's top to the north, heading turns clockwise as on a compass, pitch lifts the view
+and roll turns about the picture's own vertical. The focal length is that of a picture whose longer side is 36 mm, the principal point counts from the middle in
+shares of the longer side, k1 to k3 are Brown's, and t1 belongs to x, which is OpenCV's p2. A georeferenced world is moved to the middle of its cameras: float32 has no
+digits left for an object there.
+Sources: the templates that the program ships, by what others report of them; brown1966 (docs/sources.md).
 """
 
 import csv
@@ -25,6 +26,8 @@ from drgs.scene.lens import Lens
 
 NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 BENDING = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+SINCE_REALITYSCAN_2 = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
+"""Columns that were called otherwise before."""
 FILM = 36.0
 """Longer side of the picture by which focal lengths are told [mm]."""
 EARTH = 1e5
@@ -69,7 +72,8 @@ def read_realitycapture(folder: Path) -> Capture:
 
 
 def _columns(line: str) -> list[str]:
-    return [word.strip().lstrip("#\ufeff").lower() for word in line.split(",")]
+    words = [word.strip().lstrip("#\ufeff").lower() for word in line.split(",")]
+    return [SINCE_REALITYSCAN_2.get(word, word) for word in words]
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -115,5 +119,5 @@ def _lens(own: dict[str, float], size: tuple[int, int], where: str) -> Lens:
     longer = max(size)
     focal = own["f"] * longer / FILM
     center = 0.5 * width + own["px"] * longer, 0.5 * height + own["py"] * longer
-    coefficients = own["k1"], own["k2"], own["t1"], own["t2"], own["k3"], 0.0, 0.0, 0.0
+    coefficients = own["k1"], own["k2"], own["t2"], own["t1"], own["k3"], 0.0, 0.0, 0.0
     return Lens("FULL_OPENCV", (focal, focal, *center, *coefficients), width, height)
