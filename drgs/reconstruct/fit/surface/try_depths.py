@@ -26,6 +26,7 @@ from torch import Tensor
 from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, crossed_squares
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates
@@ -302,11 +303,11 @@ class Trials:
             return seen[index][steep_enough(seen[index], packed[:, :3])]
 
         def shown(
-            index: int, places: SeenPlaces, tracer: AbstractTracer, packed: Tensor, generator: torch.Generator
+            index: int, places: SeenPlaces, tracer: AbstractTracer, packed: Tensor, light: MeshLight, generator: torch.Generator
         ) -> tuple[Tensor, Tensor, Tensor]:
             """Two estimates of the colours of a view's places, and the photograph's colours."""
             target = self._targets[index]
-            first, second = (shade_places(places, target, tracer, packed, light_of(target), generator) for _ in range(2))
+            first, second = (shade_places(places, target, tracer, packed, light, generator) for _ in range(2))
             return first, second, target.saturation.reshape(-1, 3)[places.pixels]
 
         def materials_of_now() -> AbstractTracer:
@@ -318,13 +319,13 @@ class Trials:
             terms = prior_terms(
                 self.edges, environment, packed, values["metal"], settings.weight_bend, settings.weight_smooth, 0.0, 0.0, 0.0
             )
-            tracer = materials_of_now()
+            tracer, light = materials_of_now(), light_of(self._targets[index])
             with torch.no_grad():
                 places = compared(index, packed)
 
             def cost(start: int, end: int, leaves: tuple[Tensor, ...], generator: torch.Generator) -> tuple[Tensor, Tensor]:
                 some = places[torch.arange(start, end, device=places.pixels.device)]
-                first, second, photo = shown(index, some, tracer, leaves[0], generator)
+                first, second, photo = shown(index, some, tracer, leaves[0], light, generator)
                 squared = (first.detach().clamp(0, 1) - photo).square().sum()
                 return crossed_halves(first, second, photo) * photo.numel() if len(some.pixels) else leaves[0].sum() * 0, squared[None]
 
@@ -348,7 +349,7 @@ class Trials:
                 if self.stopped:
                     break
                 places = compared(index, packed)
-                first, second, photo = shown(index, places, tracer, packed, state.generator)
+                first, second, photo = shown(index, places, tracer, packed, light_of(target), state.generator)
                 # A square would count the noise of mirrored rays, which hollows have and what fills them has not.
                 error = crossed_squares(first, second, photo)
                 errors.index_add_(0, places.nearest, torch.stack([error, torch.ones_like(error)], 1))
