@@ -16,7 +16,7 @@ from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Hits
-from drgs.scene.camera import pixel_rays_world, world_from_pixel
+from drgs.scene.camera import world_from_pixel
 
 SOLID = 0.995
 """Least coverage of a pixel that is compared: others mix in the background."""
@@ -49,9 +49,8 @@ class SeenPlaces:
 @torch.no_grad()
 def seen_places(target: ViewTarget, pixels: Int[Tensor, "pixel"], tracer: AbstractTracer) -> SeenPlaces:
     """Those of `pixels` (flat) that see the mesh, by their middles."""
-    origin, directions = pixel_rays_world(target.camera)
-    direction = directions.reshape(-1, 3)[pixels]
-    hits = trace_rays(origin.expand_as(direction), direction, tracer)
+    direction = _directions(target, pixels, torch.full((len(pixels), 2), 0.5, device=pixels.device))
+    hits = trace_rays(target.camera.center_world.expand_as(direction), direction, tracer)
     return _places_of(hits.hit, pixels, direction, hits, tracer)
 
 
@@ -64,16 +63,21 @@ def seen_twice(
     Why: a pixel shows its mean. With one place for both estimates, what differs within a pixel is noise that both share, and crossed_halves
     takes it for error: what is finer than a pixel would be flattened.
     """
-    width, rays = target.camera.width, []
+    rays = []
     for _ in range(2):
-        inside = torch.rand(len(pixels), 2, generator=generator).to(target.mask)
-        at = torch.stack([pixels % width, pixels // width], -1) + inside
-        direction = torch.cat([at, torch.ones_like(at[:, :1])], -1) @ world_from_pixel(target.camera).T
-        direction = torch.nn.functional.normalize(direction, dim=-1)
+        direction = _directions(target, pixels, torch.rand(len(pixels), 2, generator=generator).to(target.mask))
         rays.append((direction, trace_rays(target.camera.center_world.expand_as(direction), direction, tracer)))
     both = rays[0][1].hit & rays[1][1].hit
     first, second = (_places_of(both, pixels, direction, hits, tracer) for direction, hits in rays)
     return first, second
+
+
+def _directions(target: ViewTarget, pixels: Int[Tensor, "pixel"], inside: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 3"]:
+    """Unit, world, of the pixels (flat), through a place inside each, 0..1 from its corner."""
+    width = target.camera.width
+    at = torch.stack([pixels % width, pixels // width], -1) + inside
+    directions = torch.cat([at, torch.ones_like(at[:, :1])], -1) @ world_from_pixel(target.camera).T
+    return torch.nn.functional.normalize(directions, dim=-1)
 
 
 def _places_of(chosen: Tensor, pixels: Tensor, direction: Tensor, hits: Hits, tracer: AbstractTracer) -> SeenPlaces:
