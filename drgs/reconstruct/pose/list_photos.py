@@ -9,14 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drgs.reconstruct.capture.camera_files import check_readers, is_photograph, without_developed
+from drgs.reconstruct.capture.load_views import find_cameras
 from drgs.reconstruct.capture.load_views.checks import find_masks, is_folder, refuse_asset
-from drgs.reconstruct.capture.load_views.colmap import find_model
-from drgs.reconstruct.capture.load_views.metashape import find_cameras_file
-from drgs.reconstruct.capture.load_views.realitycapture import find_cameras_table
 
 FEWEST_PHOTOS = 8
 """With fewer, hardly anything is seen from enough sides, whatever their poses."""
-CAMERA_FILES = ("transforms.json", "transforms_train.json", "*-camera.pkl")
 OTHER_SUFFIXES = (".tif", ".tiff", ".mp4", ".mov", ".avi", ".mkv")
 """What people have in place of pictures, named in the sentence when nothing else is there."""
 
@@ -65,12 +62,7 @@ def any_photo(folder: Path) -> bool:
 def _refuse_posed(folder: Path) -> None:
     """A folder that has cameras already is a capture, and so is the one around its images/."""
     for place in (folder, folder.resolve().parent) if folder.name == "images" else (folder,):
-        found = (
-            next((path for pattern in CAMERA_FILES for path in place.glob(pattern)), None)
-            or find_model(place)
-            or find_cameras_file(place)
-            or find_cameras_table(place)
-        )
+        found = find_cameras(place)
         if found is not None:
             raise ValueError(
                 f"{found}: the pictures are part of a posed capture; build from {place} as it is, or copy the pictures alone to another folder."

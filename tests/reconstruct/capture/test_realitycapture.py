@@ -121,6 +121,7 @@ FAULTS = {
     "an infinite number": (",45,", ",inf,", "r_000.png: f = inf, expected a finite number"),
     "no focal length": (",45,", ",0,", "focal length"),
     "a column less": (",45,", ",", "the line of 'r_000.png' has 15 columns, expected 16"),
+    "a picture twice": ("r_003.png", "r_004.png", "the line of 'r_004.png' is there twice, expected one a picture"),
     "another picture": ("r_003.png", "r_903.png", "r_903.png.*: no such image, but cameras.csv names it"),
     "a way out": ("r_003.png", "../r_003.png", "leads outside the capture folder"),
     "an eighth power": (",0,0,0,0,0,0", ",0,0,0,0.1,0,0", "k4 = 0.1, expected 0: align with the distortion model Brown3"),
@@ -140,4 +141,6 @@ def test_a_faulty_file_is_refused_in_one_sentence(fault: str, tmp_path: Path) ->
 
 def test_other_tables_beside_pictures_are_no_cameras(tmp_path: Path) -> None:
     (tmp_path / "notes.csv").write_text("name,x,y\na,1,2\n")
+    for suffix in ("csv", "xml"):
+        (tmp_path / f"folder.{suffix}").mkdir()
     assert not has_cameras(tmp_path)

@@ -32,7 +32,7 @@ from drgs.reconstruct.capture.load_views.transforms_json import (
 from drgs.scene.camera import Camera
 from drgs.scene.views import Views
 
-__all__ = ["has_cameras", "load_cameras", "load_unmasked_views", "load_views", "read_capture"]
+__all__ = ["find_cameras", "has_cameras", "load_cameras", "load_unmasked_views", "load_views", "read_capture"]
 
 FALLBACK_SIZE = (400, 400)
 """Picture size when a camera file neither states one nor comes with its images."""
@@ -84,10 +84,16 @@ def read_capture(folder: Path, split: Literal["train", "test"] = "train") -> Cap
     return capture
 
 
+def find_cameras(folder: Path) -> Path | None:
+    """The file, or COLMAP's folder, by which one of the layouts is recognised: read_capture then reads it, or says what is wrong with it."""
+    patterns = ("transforms_train.json", "transforms.json", "*-camera.pkl")
+    found = next((path for pattern in patterns for path in folder.glob(pattern)), None)
+    return found or find_model(folder) or find_cameras_file(folder) or find_cameras_table(folder)
+
+
 def has_cameras(folder: Path) -> bool:
-    """Whether one of the layouts is there: read_capture then reads it, or says what is wrong with it."""
-    found = next((path for pattern in ("transforms_train.json", "transforms.json", "*-camera.pkl") for path in folder.glob(pattern)), None)
-    return found is not None or any(find(folder) is not None for find in (find_model, find_cameras_file, find_cameras_table))
+    """Whether one of the layouts is there."""
+    return find_cameras(folder) is not None
 
 
 def load_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera]:

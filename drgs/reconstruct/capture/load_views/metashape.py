@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, Pinhole
-from drgs.reconstruct.capture.load_views.checks import find_image, find_masks, finite_number, rigid_camera_from_world, shown
+from drgs.reconstruct.capture.load_views.checks import find_image, find_masks, finite_number, is_file, rigid_camera_from_world, shown
 from drgs.reconstruct.capture.load_views.undistort import optics_of
 from drgs.scene.lens import Lens
 
@@ -29,7 +29,7 @@ HEAD_BYTES = 1024
 
 def find_cameras_file(folder: Path) -> Path | None:
     """The first XML file of the folder that looks like Metashape's, or None."""
-    for path in sorted(folder.glob("*.xml")):
+    for path in filter(is_file, sorted(folder.glob("*.xml"))):
         with path.open("rb") as file:
             if b"<document" in file.read(HEAD_BYTES):
                 return path

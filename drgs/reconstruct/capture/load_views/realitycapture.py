@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from drgs.reconstruct.capture.load_views.capture import Capture, Photograph
-from drgs.reconstruct.capture.load_views.checks import find_image, find_masks, finite_number, image_size, rigid_camera_from_world
+from drgs.reconstruct.capture.load_views.checks import find_image, find_masks, finite_number, image_size, is_file, rigid_camera_from_world
 from drgs.reconstruct.capture.load_views.undistort import optics_of
 from drgs.scene.lens import Lens
 
@@ -40,7 +40,7 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 def find_cameras_table(folder: Path) -> Path | None:
     """The first CSV file of the folder that has these columns, or None."""
-    for path in sorted(folder.glob("*.csv")):
+    for path in filter(is_file, sorted(folder.glob("*.csv"))):
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES).decode("utf-8", "replace")
         if any(set(NEEDED) <= set(_columns(line)) for line in head.splitlines()):
@@ -82,13 +82,17 @@ def _rows(path: Path) -> list[dict[str, str]]:
         raise ValueError(f"{path}: {path.stat().st_size} bytes, expected at most {MOST_BYTES}.")
     lines = path.read_text("utf-8", "replace").splitlines()
     first = next(number for number, line in enumerate(lines) if set(NEEDED) <= set(_columns(line)))
-    columns, rows = _columns(lines[first]), []
+    columns, rows, names = _columns(lines[first]), [], set()
     for words in csv.reader(io.StringIO("\n".join(lines[first + 1 :]))):
         if not words or words[0].startswith("#"):
             continue
         if len(words) != len(columns):
             raise ValueError(f"{path}: the line of {words[0]!r} has {len(words)} columns, expected {len(columns)}.")
-        rows.append(dict(zip(columns, (word.strip() for word in words), strict=True)))
+        row = dict(zip(columns, (word.strip() for word in words), strict=True))
+        if row["name"] in names:
+            raise ValueError(f"{path}: the line of {row['name']!r} is there twice, expected one a picture.")
+        names.add(row["name"])
+        rows.append(row)
     if not rows:
         raise ValueError(f"{path}: no picture, expected a line for each.")
     return rows

@@ -24,6 +24,18 @@ def _linear(encoded: float) -> float:
     )
 
 
+@wp.func
+def _shown_at(picture: wp.array2d[wp.vec3], x: float, y: float) -> wp.vec3:
+    """Linear between the middles of pixels, which lie at halves; not within half a pixel of the border."""
+    column = int(x - 0.5)
+    row = int(y - 0.5)
+    right = x - 0.5 - float(column)
+    below = y - 0.5 - float(row)
+    upper = (1.0 - right) * picture[row, column] + right * picture[row, column + 1]
+    lower = (1.0 - right) * picture[row + 1, column] + right * picture[row + 1, column + 1]
+    return (1.0 - below) * upper + below * lower
+
+
 @wp.kernel
 def sums_kernel(
     first: int,
@@ -79,14 +91,7 @@ def sums_kernel(
     here = picture[int(y), int(x)]
     if mask[int(y), int(x)] <= solid or wp.max(wp.max(here[0], here[1]), here[2]) >= clipped:
         return
-    # Pixels' middles lie at halves.
-    column = int(x - 0.5)
-    row = int(y - 0.5)
-    right = x - 0.5 - float(column)
-    below = y - 0.5 - float(row)
-    upper = (1.0 - right) * picture[row, column] + right * picture[row, column + 1]
-    lower = (1.0 - right) * picture[row + 1, column] + right * picture[row + 1, column + 1]
-    encoded = (1.0 - below) * upper + below * lower
+    encoded = _shown_at(picture, x, y)
     s = side[nearest]
     said = explained[s, i]
     weight = trusted[s, i]

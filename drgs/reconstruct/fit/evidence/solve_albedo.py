@@ -171,11 +171,10 @@ def _sums_by_side(
 def _one_ahead(as_taken: Callable[[int], ViewTarget], count: int) -> Iterator[ViewTarget]:
     """All of them in turn; the next one is read meanwhile, for large files take as long as what is done with them."""
     with ThreadPoolExecutor(1, thread_name_prefix="photographs") as reader:
-        coming = [reader.submit(as_taken, number) for number in range(min(1, count))]
+        coming = None
         for number in range(count):
-            photograph = coming.pop().result()
-            if number + 1 < count:
-                coming.append(reader.submit(as_taken, number + 1))
+            photograph = (coming or reader.submit(as_taken, number)).result()
+            coming = reader.submit(as_taken, number + 1) if number + 1 < count else None
             yield photograph
 
 
