@@ -107,10 +107,18 @@ def sums_of_metal_with_a_spot_of_paint(mesh: TriangleMesh, paint_albedo: tuple[f
     return ViewSums(*products, torch.full((count,), 12.0))
 
 
+def in_random_order(mesh: TriangleMesh) -> TriangleMesh:
+    """The same mesh with its vertices renamed: minimum degree takes forty times as long (25 s for 0.7) on an icosphere's own order, as on no surface that builds make."""
+    order = torch.randperm(len(mesh.vertices), generator=torch.Generator().manual_seed(0))
+    named = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
+    by_vertex = {name: getattr(mesh, name)[order] for name in ("vertices", "normals", "albedo", "roughness", "metallic")}
+    return dataclasses.replace(mesh, faces=named[mesh.faces.long()].int(), **by_vertex)
+
+
 @pytest.mark.parametrize("subdivisions", [4, 5, 6])
 def test_finer_meshes_decide_alike(monkeypatch: pytest.MonkeyPatch, subdivisions: int):
     """A spot that its surroundings outvote on one mesh is outvoted on meshes of four and sixteen times its faces, too."""
-    mesh, coarse = sphere_mesh(subdivisions=subdivisions), sphere_mesh(subdivisions=4)
+    mesh, coarse = in_random_order(sphere_mesh(subdivisions=subdivisions)), sphere_mesh(subdivisions=4)
     monkeypatch.setattr(module, "EDGES", len(mesh_edges(coarse.faces).vertices))
     told = metal_evidence(sums_of_metal_with_a_spot_of_paint(mesh), mesh_edges(mesh.faces), False)
     assert (
