@@ -75,7 +75,7 @@ PRESETS = {
         512,
         FitSettings(iterations=660, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
-        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70, pixels_a_step=45_056), carve_after=(2,), cameras_after=(1, 2, 3)),
+        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carve_after=(2,), cameras_after=(1, 2, 3)),
         MeshMaterialSettings(iterations=180),
         DetailSettings(),
         HollowSettings(),
