@@ -23,8 +23,8 @@ MOST_STEPS = 40
 def factored(matrix: csc_matrix) -> Any:
     """SuperLU's factors of a symmetric positive definite matrix.
 
-    On an icosphere of 41 000 vertices in their own order minimum degree takes 25 s, with these renamed at random 0.7; on surfaces that builds make (99 000
-    and 120 000 vertices) 1.0 and 1.1 to 1.3 s, renamed 1.1 and 1.5 to 1.9: so nothing is renamed here.
+    On an icosphere of 41 000 vertices in their own order minimum degree takes 25 s, with these renamed at random 0.7; on two built
+    surfaces (99 000 and 120 000 vertices) 1.0 and 1.1 to 1.3 s, renamed 1.1 and 1.5 to 1.9: so nothing is renamed here.
     """
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
