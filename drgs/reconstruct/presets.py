@@ -8,7 +8,6 @@ from typing import Literal
 
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.open_vessels import VesselSettings
-from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.evidence.solve_albedo import DetailSettings
@@ -60,14 +59,12 @@ PRESETS = {
             3,
             SurfaceSettings(rounds=1, steps_a_round=50),
             replace(PASS_MESH, resolution=120, face_limit=30_000),
-            carve_after=(1,),
             cameras_after=(1, 2),
             division=DivisionSettings(most_faces=0),
         ),
         MeshMaterialSettings(iterations=80, points_a_step=1024),
         DetailSettings(most_samples=500_000, side=1024),
-        HollowSettings(RadianceGridSettings(levels=())),
-        MeshFitSettings(iterations=150),
+        mesh_surfels=MeshFitSettings(iterations=150),
         surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
     ),
     "fast": Preset(
@@ -75,11 +72,10 @@ PRESETS = {
         512,
         FitSettings(iterations=660, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
-        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), carve_after=(2,), cameras_after=(1, 2, 3)),
+        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), cameras_after=(1, 2, 3)),
         MeshMaterialSettings(iterations=180),
         DetailSettings(),
-        HollowSettings(),
-        MeshFitSettings(iterations=300),
+        mesh_surfels=MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
     ),
     "full": Preset(
@@ -90,15 +86,13 @@ PRESETS = {
         PassSettings(
             10,
             mesh=replace(PASS_MESH, resolution=320, face_limit=200_000),
-            carve_after=(),
             cameras_after=(2, 4, 6),
             try_after=(2, 4, 6, 8),
             division=DivisionSettings(most_faces=400_000),
         ),
         MeshMaterialSettings(iterations=1200, rounds=3, points_a_step=4096),
         DetailSettings(most_samples=6_000_000, side=4096),
-        HollowSettings(),
-        MeshFitSettings(iterations=500),
+        mesh_surfels=MeshFitSettings(iterations=500),
         surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),
     ),
 }

@@ -200,7 +200,7 @@ def _believed(
     seen: list[_Seen], targets: list[ViewTarget], outer: AbstractTracer, inner: AbstractTracer, radius: float, settings: HollowSettings
 ) -> Float[Tensor, "vertex"]:
     """Of the hull's vertices, the share of rays through them that believe what they see behind, averaged around."""
-    outside, behind = (unlikeness(surface, targets, radius, settings.cost_rings) for surface in (outer, inner))
+    outside, behind = (unlikeness(surface, targets, settings.cost_rings) for surface in (outer, inner))
     votes = torch.zeros(len(outer.mesh.vertices), 2, device=outside.device)
     for view in seen:
         distance, face, hit = view.behind(inner)

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.radiance_grid import Rays
 from drgs.reconstruct.capture.visual_hull import VisualHull
-from drgs.reconstruct.fit.evidence.carve_hollows import view_differences
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings, clean_mesh
@@ -30,6 +29,12 @@ SOLID = 0.99
 """Least coverage of a pixel whose ray is fitted."""
 FEWEST_VIEWS = 3
 """Of a place whose looks are compared."""
+FACING = 0.2
+"""Least cosine between the outward normal and the direction to the eye, of a look that is compared."""
+INSIDE = 0.9
+"""Least coverage of a place in the photograph."""
+TRIMMED = 2 / 3
+"""Share of the looks whose difference counts: highlights differ most."""
 HULL_MESH = MeshSettings(face_limit=40_000, keep_component_fraction=0.0)
 """Every part of the hull: what its rays did not meet would count as seen through."""
 
@@ -148,12 +153,41 @@ def large_patches(chosen: Bool[Tensor, "vertex"], faces: Int[Tensor, "face 3"], 
     return chosen & (torch.bincount(patch) >= least * len(chosen))[patch]
 
 
-def unlikeness(surface: AbstractTracer, targets: list[ViewTarget], radius: float, rings: int) -> Float[Tensor, "vertex"]:
+def unlikeness(surface: AbstractTracer, targets: list[ViewTarget], rings: int) -> Float[Tensor, "vertex"]:
     """Mean difference (display values) between the views that see a vertex, averaged around; inf where hardly any does."""
     mesh = surface.mesh
-    every = torch.arange(len(mesh.vertices), device=mesh.vertices.device)
-    difference, views = view_differences(surface, targets, every, -mesh.normals, 0.0, radius)
+    difference, views = _differences(surface, targets)
     known = torch.where(views >= FEWEST_VIEWS, views, torch.zeros_like(views))
     sums = torch.stack([difference.nan_to_num(0.0) * known, known], -1)
-    total, weight = averaged(averaging_matrix(mesh_edges(mesh.faces), len(every)), sums, rings).unbind(1)
+    total, weight = averaged(averaging_matrix(mesh_edges(mesh.faces), len(mesh.vertices)), sums, rings).unbind(1)
     return torch.where(weight > 0.1 * FEWEST_VIEWS, total / weight.clamp(min=1e-6), torch.full_like(total, torch.inf))
+
+
+def _differences(surface: AbstractTracer, targets: list[ViewTarget]) -> tuple[Float[Tensor, "vertex"], Float[Tensor, "vertex"]]:
+    """Of each vertex the mean difference from the median colour among the views that see it, without the third that differs most, and how many those are."""
+    place, normals = surface.mesh.vertices, surface.mesh.normals
+    shown = torch.full((len(targets), len(place), 3), torch.nan, device=place.device)
+    for index, target in enumerate(targets):
+        camera = target.camera
+        offset = place - camera.center_world
+        distance = offset.norm(dim=1)
+        direction = offset / distance[:, None]
+        at = place @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+        homogeneous = at @ camera.intrinsics.T
+        pixel = homogeneous[:, :2] / homogeneous[:, 2:]
+        size = torch.tensor([camera.width, camera.height], device=place.device)
+        faces_eye = -(direction * normals).sum(1) > FACING
+        seen = (faces_eye & (at[:, 2] > 0) & (pixel > 1).all(1) & (pixel < size - 1).all(1)).nonzero().squeeze(1)
+        first = trace_rays(camera.center_world.expand_as(direction[seen]), direction[seen], surface)
+        seen = seen[first.distance > distance[seen] - 8 * surface.lift]
+        grid = (2 * pixel[seen] / size - 1)[None, None]
+        picture = torch.cat([target.saturation, target.mask[..., None]], -1).permute(2, 0, 1)[None]
+        sampled = torch.nn.functional.grid_sample(picture, grid, mode="bilinear", align_corners=False)[0, :, 0].T
+        inside = sampled[:, 3] > INSIDE
+        shown[index, seen[inside]] = sampled[inside, :3]
+    difference = (shown - shown.nanmedian(0).values).abs().mean(-1)
+    count = (~torch.isnan(difference)).sum(0)
+    ordered = difference.nan_to_num(nan=torch.inf).sort(0).values
+    kept = torch.arange(len(targets), device=place.device)[:, None] < (TRIMMED * count).ceil()
+    total = torch.where(kept, ordered, torch.zeros_like(ordered)).sum(0)
+    return total / kept.sum(0).clamp(min=1), count.float()

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.find_pit import PitSettings, find_pit
 from drgs.reconstruct.capture.hull_rays import (
+    TRIMMED,
     SolidRays,
     bounds_of,
     large_patches,
@@ -37,7 +38,6 @@ from drgs.reconstruct.capture.hull_rays import (
     unlikeness,
 )
 from drgs.reconstruct.capture.visual_hull import VisualHull
-from drgs.reconstruct.fit.evidence.carve_hollows import TRIMMED
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -159,7 +159,7 @@ class _Search:
     def opened(self) -> VisualHull | None:
         """None where nothing is a vessel."""
         settings, found = self.settings, False
-        unlike = unlikeness(self.outer, self.targets, self.radius, settings.cost_rings)
+        unlike = unlikeness(self.outer, self.targets, settings.cost_rings)
         seeds = torch.isfinite(unlike) & (unlike > settings.unlike)
         for _ in range(settings.most_lids):
             seeds = large_patches(seeds, self.outer.mesh.faces, settings.least_lid)

@@ -1,8 +1,13 @@
-"""What other views see at a place is the mean of their rays that end there, and of nothing else."""
+"""What other views see at a place is the mean of their rays that end there, and of nothing else; on the surface itself paint looks alike, mirrors do not."""
+
+from dataclasses import replace
 
 import torch
 
-from drgs.reconstruct.capture.hull_rays import seen_from_elsewhere
+from drgs.reconstruct.capture.hull_rays import seen_from_elsewhere, unlikeness
+from drgs.reconstruct.fit.view_targets import view_targets
+from drgs.render.intersect.trace_rays import build_tracer
+from tests.reconstruct.capture.test_find_hollows import CPU, bowl_and_ball, mirror, paint, photographed
 
 
 def test_a_ray_is_compared_with_other_views_rays_in_its_cell() -> None:
@@ -18,3 +23,20 @@ def test_a_ray_is_compared_with_other_views_rays_in_its_cell() -> None:
         assert bool(seen[ray]) == bool(others.any())
         torch.testing.assert_close(mean[ray], colors[others].mean(0) if bool(others.any()) else torch.zeros(3), atol=1e-5, rtol=1e-5)
     assert 0.1 < float(seen.float().mean()) < 0.9
+
+
+def test_paint_looks_alike_on_the_surface_and_not_before_it_nor_do_mirrors() -> None:
+    bowl = bowl_and_ball()
+    painted, mirrored = (view_targets(photographed(bowl, shade, count=16), 1.0, CPU) for shade in (paint, mirror))
+    right = unlikeness(bowl, painted, rings=1)
+    seen = torch.isfinite(right)
+    assert 0.5 < float(seen.float().mean()) < 1, "what the ball touches and the wall hides no view sees"
+    mesh = bowl.mesh
+    fatter = build_tracer(replace(mesh, vertices=mesh.vertices + 0.05 * mesh.normals))
+    assert float(right[seen].median()) < 0.02
+    for other in (unlikeness(fatter, painted, rings=1), unlikeness(bowl, mirrored, rings=1)):
+        assert float(other[torch.isfinite(other)].median()) > 3 * float(right[seen].median())
+    one = [replace(painted[0], saturation=1 - painted[0].saturation), *painted[1:]]
+    changed = (unlikeness(bowl, one, rings=1) - right)[seen].abs()
+    assert float(changed.median()) < 0.02, "the looks that differ most are left out"
+    assert torch.isinf(unlikeness(bowl, painted[:2], rings=1)).all(), "two views are too few"

@@ -18,6 +18,7 @@ from drgs.reconstruct.capture import open_vessels as module
 from drgs.reconstruct.capture.find_hollows import HollowSettings
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.open_vessels import VesselSettings, open_vessels
+from drgs.reconstruct.capture.radiance_grid import RadianceGridSettings
 from drgs.reconstruct.capture.visual_hull import VisualHull, VisualHullSettings, visual_hull
 from drgs.reconstruct.presets import PRESETS
 from drgs.reconstruct.report_progress import BuildReporter
@@ -136,7 +137,8 @@ def test_a_build_begins_inside_and_looks_behind_what_was_opened(
 ) -> None:
     points = initial_points(white_cup, 3000, 0, hull_settings=HULL)
     place = stages.Workplace(tmp_path, {"seed": "0"}, False, BuildReporter(None, {"read": 1.0}), lambda: False)
-    preset = replace(PRESETS["draft"], points=3000, vessels=SETTINGS, hull=HULL)
+    nothing_more = HollowSettings(RadianceGridSettings(levels=()))
+    preset = replace(PRESETS["draft"], points=3000, vessels=SETTINGS, hull=HULL, hollows=nothing_more)
     found = stages.hollows_stage(place, white_cup, points, preset, 0, CPU, None)
 
     def share_inside(of: InitialPoints) -> float:

@@ -53,7 +53,7 @@ class SurfaceRates:
     vertices: float = 0.0
     """Moved by the solve alone."""
     homeward: float = 0.0
-    """From each vertex to where the surface began, or was carved to."""
+    """From each vertex to where the surface began, or was moved by a trial."""
     to_texture: float = 0.0
     """From each vertex to where the photographs show its pattern, and how much that is believed."""
     texture_weight: float = 0.0

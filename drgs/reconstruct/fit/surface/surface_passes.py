@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from drgs.reconstruct.fit.evidence.carve_hollows import CarveSettings, carved_depths
 from drgs.reconstruct.fit.evidence.register_cameras import register_cameras, seen_from
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
@@ -27,14 +26,12 @@ from drgs.reconstruct.fit.surface.try_kinds import iterations as iterations_of_k
 from drgs.reconstruct.fit.surface.try_kinds import try_kinds
 from drgs.reconstruct.fit.surface.try_sheets import SheetSettings, try_sheets
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
-from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
+from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces, divisions, undivided_faces
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mask_outlines import mask_outlines
-from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.reconstruct.geometry.remesh import NothingEnclosed, remesh
-from drgs.render.intersect.trace_rays import build_tracer
-from drgs.scene.mesh import TriangleMesh, vertex_normals
+from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
 
 PASS_MESH = MeshSettings(resolution=200, face_limit=60_000, smoothing_passes=0, keep_component_fraction=0.01)
@@ -52,7 +49,6 @@ class PassSettings:
     surface: SurfaceSettings = field(default_factory=lambda: SurfaceSettings(rounds=1, steps_a_round=80))
     """Of one pass; weights that change over a fit change over all passes."""
     mesh: MeshSettings = PASS_MESH
-    carve: CarveSettings = field(default_factory=CarveSettings)
     trials: TrialSettings = field(default_factory=TrialSettings)
     try_after: tuple[int, ...] = ()
     """Passes, counted from 1, after which the surface is tried at other depths."""
@@ -69,9 +65,6 @@ class PassSettings:
     """On divided faces: of normals, materials and light, while the surface stays where it is."""
     cameras_after: tuple[int, ...] = ()
     """Passes, counted from 1, after which cameras are moved to where their photographs fit the surface, where they are off (register_cameras)."""
-    carve_after: tuple[int, ...] = (3,)
-    """Passes, counted from 1, after which hollows are looked for: once, two fifths of the way. Each time right places sink as well, by chance; earlier,
-    normals and materials are not what carving asks, and later too few passes are left to smooth what was carved (figures in docs/decisions/0003)."""
 
 
 @dataclass(eq=False)
@@ -145,20 +138,6 @@ def settings_of_relief(settings: PassSettings) -> SurfaceSettings:
         still=True,
         seed=last.seed + 1,
     )
-
-
-@torch.no_grad()
-def carve_hollows(fit: SurfaceFit, targets: list[ViewTarget], settings: CarveSettings, radius: float) -> None:
-    """Move the surface to where the photographs agree; what moved gets the moved surface's normals."""
-    parameters, mesh = fit.state.parameters, fit.mesh
-    inward, depth = carved_depths(build_tracer(mesh), parameters["metal"], targets, mesh_edges(fit.faces), radius, settings)
-    step = depth[:, None] * inward
-    moved = (depth > settings.step * radius)[:, None]
-    parameters["vertices"] += step
-    # What was carved is at home there; what was only carried along is not.
-    parameters["homeward"].copy_(torch.where(moved, torch.zeros_like(step), parameters["homeward"] - step))
-    parameters["to_texture"] -= step
-    parameters["normals"].copy_(torch.where(moved, vertex_normals(parameters["vertices"], fit.faces), parameters["normals"]))
 
 
 def move_to_tried_depths(
@@ -252,23 +231,21 @@ def _settle_where_tried(fit: SurfaceFit, before: dict[str, Tensor], found: dict[
 
 
 def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> None:
-    """Mesh the surface anew and start the next pass on it.
+    """Mesh the surface anew and start the next pass on it; on the surface as it is where solves have undone it.
 
     Args:
         radius: of the object's bounding sphere [world units].
-
-    Raises:
-        NothingEnclosed: what is there has no inside; the fit is as it was.
     """
-    new = remesh(fit.state.parameters["vertices"].detach(), fit.faces, settings.mesh)
-    values = {}
-    for name, value in fit.state.parameters.items():
-        if name.startswith("environment_"):
-            values[name] = value.detach().clone()
-        else:
-            values[name] = new.vertices if name == "vertices" else new.carried(value.detach())
-    fit.faces = new.faces
-    _start_pass(fit, values, settings_of_pass(settings, fit.index + 1), radius)
+    own = settings_of_pass(settings, fit.index + 1)
+    values = {name: value.detach() for name, value in fit.state.parameters.items()}
+    try:
+        new = remesh(values["vertices"], fit.faces, settings.mesh)
+    except NothingEnclosed as error:
+        fit.remark = f"after pass {fit.index + 1} the mesh before was kept, for {error}"
+    else:
+        values = {name: value if name.startswith("environment_") else new.carried(value) for name, value in values.items()}
+        values["vertices"], fit.faces = new.vertices, new.faces
+    _start_pass(fit, values, own, radius)
 
 
 def start_relief(fit: SurfaceFit, times: int, settings: PassSettings, radius: float) -> None:
@@ -288,22 +265,6 @@ def _start_pass(fit: SurfaceFit, values: dict[str, Tensor], own: SurfaceSettings
     values = leaves(values, frozen=NOT_FITTED)
     fit.index += 1
     fit.state = FitState(values, make_optimizer(values, own.rates, radius), torch.Generator().manual_seed(own.seed + 2))
-
-
-def carve_and_start_next_pass(fit: SurfaceFit, targets: list[ViewTarget], settings: PassSettings, radius: float) -> None:
-    """The steps between two passes. A surface that carving and solves have undone is not meshed anew: the pass starts on the mesh before them.
-
-    Args:
-        targets: to look for hollows in; empty: none are looked for.
-    """
-    before = {name: value.detach().clone() for name, value in fit.state.parameters.items()}
-    if targets:
-        carve_hollows(fit, targets, settings.carve, radius)
-    try:
-        start_next_pass(fit, settings, radius)
-    except NothingEnclosed as error:
-        fit.remark = f"after pass {fit.index + 1} the mesh before was kept, for {error}"
-        _start_pass(fit, before, settings_of_pass(settings, fit.index + 1), radius)
 
 
 def fit_surface_in_passes(
@@ -358,10 +319,7 @@ def fit_surface_in_passes(
             fit, views, settings, radius, partial(tell, done + steps), should_stop
         ):
             return False
-        # Under light that turns with the camera paint does not look alike from all sides, so nothing says where it lies.
-        carves = number in settings.carve_after and views.light_from_world is None
-        targets = view_targets(views, 1.0, fit.faces.device) if carves else []
-        carve_and_start_next_pass(fit, targets, settings, radius)
+        start_next_pass(fit, settings, radius)
     relief = settings_of_relief(settings)
     fit_surface(views, fit.mesh, fit.state, relief, partial(tell, total - relief.iterations), should_stop)
     return fit.state.iteration >= relief.iterations

@@ -14,9 +14,9 @@ from drgs.reconstruct.fit.surface.moving_surface import MoveSettings
 from drgs.reconstruct.fit.surface.surface_passes import (
     PassSettings,
     SurfaceFit,
-    carve_and_start_next_pass,
     fit_surface_in_passes,
     settings_of_pass,
+    start_next_pass,
 )
 from drgs.reconstruct.fit.surface.try_depths import TriedDepths
 from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, iterations
@@ -109,7 +109,7 @@ def test_relief_is_fitted_on_divided_faces_while_the_surface_stays_and_goes_on_w
 
 @pytest.mark.slow
 def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    settings = replace(SHORT, carve_after=(), try_after=(1,))
+    settings = replace(SHORT, try_after=(1,))
     asked: list[int] = []
     homes: list[torch.Tensor] = []
 
@@ -123,12 +123,12 @@ def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tm
         report(FitReport(1, trials.iterations, 20.0, len(depth), 0.0))
         return TriedDepths(parameters | {"vertices": moved}, depth, torch.ones(len(depth), 1), depth > 0)
 
-    def start(fit, targets, settings, radius):
+    def start(fit, settings, radius):
         homes.append(fit.state.parameters["homeward"].clone())
-        carve_and_start_next_pass(fit, targets, settings, radius)
+        start_next_pass(fit, settings, radius)
 
     monkeypatch.setattr(surface_passes, "try_depths", sunk)
-    monkeypatch.setattr(surface_passes, "carve_and_start_next_pass", start)
+    monkeypatch.setattr(surface_passes, "start_next_pass", start)
     surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
     begun = placed_sphere()
     fit = SurfaceFit(start_surface(surfels, begun, grey_light(), settings.surface, SPHERE_RADIUS), begun.faces)
@@ -145,7 +145,7 @@ def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tm
 
 @pytest.mark.slow
 def test_the_fit_goes_on_from_where_cameras_were_moved_to_and_asks_once_a_pass(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    settings = replace(SHORT, passes=3, carve_after=(), try_after=(1,), cameras_after=(1, 2))
+    settings = replace(SHORT, passes=3, try_after=(1,), cameras_after=(1, 2))
     asked: list[int] = []
     seen: list[torch.Tensor] = []
 
@@ -199,12 +199,12 @@ def test_where_light_turns_both_kinds_are_tried_after_the_first_pass_and_elsewhe
             report(FitReport(1, iterations(own), 20.0, len(faces), 0.0))
         return TriedKinds(parameters | {"metal": torch.full_like(parameters["metal"], 0.7)}, (1.0, 2.0))
 
-    def start(fit, targets, settings, radius):
+    def start(fit, settings, radius):
         kept.append(float(fit.state.parameters["metal"].min()))
-        carve_and_start_next_pass(fit, targets, settings, radius)
+        start_next_pass(fit, settings, radius)
 
     monkeypatch.setattr(surface_passes, "try_kinds", tried)
-    monkeypatch.setattr(surface_passes, "carve_and_start_next_pass", start)
+    monkeypatch.setattr(surface_passes, "start_next_pass", start)
     surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
     begun, views = placed_sphere(), painted_views(tmp_path)
 
@@ -226,12 +226,11 @@ def test_a_surface_that_cannot_be_meshed_anew_stays_as_it_was_and_the_user_is_to
         raise NothingEnclosed("the mesh of 8 faces encloses nothing at 40 cells; expected a closed surface")
 
     monkeypatch.setattr(surface_passes, "remesh", nothing)
-    settings = PassSettings(3, carve_after=(1,))
+    settings = PassSettings(3)
     surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
     start = placed_sphere(1.0)
     fit = SurfaceFit(start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS), start.faces)
-    monkeypatch.setattr(surface_passes, "carve_hollows", lambda fit, *_: fit.state.parameters["vertices"].data.fill_(0.0))
-    surface_passes.carve_and_start_next_pass(fit, [], settings, SPHERE_RADIUS)
+    start_next_pass(fit, settings, SPHERE_RADIUS)
     assert fit.index == 1 and torch.equal(fit.faces, start.faces) and torch.equal(fit.mesh.vertices, start.vertices)
     assert fit.remark == (
         "after pass 1 the mesh before was kept, for the mesh of 8 faces encloses nothing at 40 cells; expected a closed surface"
