@@ -172,12 +172,12 @@ def _differences(surface: AbstractTracer, targets: list[ViewTarget]) -> tuple[Fl
         offset = place - camera.center_world
         distance = offset.norm(dim=1)
         direction = offset / distance[:, None]
-        at = place @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
-        homogeneous = at @ camera.intrinsics.T
+        in_camera = place @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+        homogeneous = in_camera @ camera.intrinsics.T
         pixel = homogeneous[:, :2] / homogeneous[:, 2:]
         size = torch.tensor([camera.width, camera.height], device=place.device)
         faces_eye = -(direction * normals).sum(1) > FACING
-        seen = (faces_eye & (at[:, 2] > 0) & (pixel > 1).all(1) & (pixel < size - 1).all(1)).nonzero().squeeze(1)
+        seen = (faces_eye & (in_camera[:, 2] > 0) & (pixel > 1).all(1) & (pixel < size - 1).all(1)).nonzero().squeeze(1)
         first = trace_rays(camera.center_world.expand_as(direction[seen]), direction[seen], surface)
         seen = seen[first.distance > distance[seen] - 8 * surface.lift]
         grid = (2 * pixel[seen] / size - 1)[None, None]
