@@ -40,6 +40,7 @@ from drgs.reconstruct.fit.surface.surface_passes import SurfaceFit
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, gaussians_from_state
 from drgs.reconstruct.fit.surfels.fit_materials import gaussians_from_materials
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import gaussians_from_mesh_fit
+from drgs.reconstruct.fit.surfels.try_light_frames import light_by_trial
 from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians, points_from_binding
@@ -65,6 +66,7 @@ from drgs.reconstruct.stages import (
     ground_again_stage,
     ground_stage,
     hollows_stage,
+    light_stage,
     masks_stage,
     mesh_materials_stage,
     mesh_stage,
@@ -191,11 +193,11 @@ def build_stages(
         else:
             masked = views
         light = _light(settings, preset, found, masked, points)
+        if light.wants_trial and not found_by:
+            light = light_by_trial(light, *light_stage(place, masked, points, settings.seed, device))
         if light.frame == "camera":
-            # Hollows are found by paint that looks alike from all sides, which it does not under such light.
-            views, place = with_light_of_camera(views), place.of(light="camera")
-        else:
-            points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
+            views, masked, place = with_light_of_camera(views), with_light_of_camera(masked), place.of(light="camera")
+        points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
     yield "read", None
 
     with timed("fit"):

@@ -35,6 +35,7 @@ from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings, fit_mat
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import MeshFitSettings, MeshFitState, fit_mesh_surfels, start_mesh_fit, surfels_on_faces
 from drgs.reconstruct.fit.surfels.render_stage_one import render_stage_one
 from drgs.reconstruct.fit.surfels.render_stage_two import render_stage_two
+from drgs.reconstruct.fit.surfels.try_light_frames import try_light_frames
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, drop_unseen, mesh_from_gaussians
 from drgs.reconstruct.presets import Preset
@@ -53,6 +54,8 @@ MASKS = "masks.safetensors"
 """Of a capture that has none of its own."""
 GROUND, GROUND_AGAIN = "ground.safetensors", "ground_again.safetensors"
 """What the object stands on, where it has no masks; and as the masks that were found show it."""
+LIGHT = "light.safetensors"
+"""Errors by light of the object and of the camera, where both had to be tried."""
 HOLLOWS = "hollows.safetensors"
 """Points without the hull's hollows; those of the hull where it has none."""
 FIT, MESH, SURFACE, MATERIALS = "stage1.safetensors", "mesh.safetensors", "surface.safetensors", "stage2.safetensors"
@@ -91,7 +94,7 @@ def capture_digest(views: Views, box: BuildBox | None = None) -> str:
 
 def forget_checkpoints(place: Workplace) -> None:
     """Else a later build that resumes would take them for this one's."""
-    for stale in (GROUND, MASKS, GROUND_AGAIN, *CHECKPOINTS):
+    for stale in (GROUND, MASKS, GROUND_AGAIN, LIGHT, *CHECKPOINTS):
         (place.folder / stale).unlink(missing_ok=True)
 
 
@@ -184,10 +187,30 @@ def points_of_found_masks(
         return points
 
 
+def light_stage(place: Workplace, views: Views, points: InitialPoints, seed: int, device: torch.device) -> tuple[float, float]:
+    """try_light_frames."""
+
+    def report(share: float) -> None:
+        place.reporter.report("read", share, "trying light that turns with the camera")
+
+    def made() -> dict[str, Tensor]:
+        report(0.0)
+        errors = try_light_frames(views, points, seed, device, report, place.should_stop)
+        if errors is None:
+            raise BuildStopped
+        return {"errors": torch.tensor(errors, dtype=torch.float64)}
+
+    of_object, of_camera = _kept_or_made(place, LIGHT, torch.device("cpu"), made)["errors"].tolist()
+    return of_object, of_camera
+
+
 def hollows_stage(
     place: Workplace, views: Views, points: InitialPoints, preset: Preset, seed: int, device: torch.device, box: BuildBox | None
 ) -> InitialPoints:
-    """open_vessels and find_hollows: the points on the hull, moved to what the photographs show behind it. The bounds stay the hull's."""
+    """open_vessels and find_hollows: the points on the hull, moved to what the photographs show behind it. The bounds stay the hull's.
+
+    Where the light turns with the camera no vessel is opened: they are told by colours as they are.
+    """
     looks_for_any = preset.vessels.walls or preset.hollows.grid.levels
     if points.hull_vertices is None or points.hull_faces is None or points.normals_world is None or not looks_for_any:
         return points
@@ -199,7 +222,7 @@ def hollows_stage(
 
     def made() -> dict[str, Tensor]:
         report(0.0)
-        opened = open_vessels(views, hull, preset.vessels, device)
+        opened = hull if views.light_from_world is not None else open_vessels(views, hull, preset.vessels, device)
         looks_behind = bool(preset.hollows.grid.levels)
         surface = find_hollows(views, opened, preset.hollows, seed, device, report, place.should_stop) if looks_behind else opened
         if surface is None:

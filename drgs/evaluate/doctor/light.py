@@ -70,4 +70,12 @@ def light(capture: Capture, views: Views, points: InitialPoints) -> Section:
                 "If the camera went around the object all the same, build with --light object.",
             )
         )
+    if found.wants_trial:
+        findings.append(
+            Finding(
+                "info",
+                f"The light may stand still with the camera, as on a turntable: {found.why}.",
+                "A build tries both; say --light object or --light camera if you know.",
+            )
+        )
     return {key: value for key, value in asdict(found).items() if value is not None}, findings

@@ -3,7 +3,8 @@
 Silhouettes do not show hollows: the hull of things on a plate is a hill. Everything after it moves surfaces by small steps and stays on that hill.
 So a coarse radiance field (radiance_grid) is fitted first; it finds the floor between the things, but mistakes mirrors and gloss, which it
 sees below their surfaces. Each ray therefore says whether what it sees behind the hull's surface deserves belief: the place looks alike from all
-sides, more so than the hull's surface before it, and the ray is stopped there rather than on its way. Rays vote for the place of the hull that they
+sides, more so than the hull's surface before it, and the ray is stopped there rather than on its way. Where the light turns with the
+camera, alike is what does not go with its turns (as_if_still). Rays vote for the place of the hull that they
 pass through; where enough do, depth is the field's, else the hull's, and all depths are fused to one surface. Where something was found all is done once
 more behind that: between leaves the first look reaches the next leaf, where it is coarse.
 

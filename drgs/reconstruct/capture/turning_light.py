@@ -3,7 +3,8 @@
 In the object's frame such light turns with the camera, so no environment fixed to the object explains it. Two signs together say so, and each alone
 could be something else: what is around the object looks the same in all pictures though these were taken from all sides (so would plain paper
 that somebody walks around), and brightness follows where a place faces in the camera's frame rather than what it mirrors in the object's (so it
-seems where the hull is far from the surface). Pictures that were cut out say nothing of what was around; then the light is the object's.
+seems where the hull is far from the surface). Pictures that were cut out say nothing of what was around; where brightness follows the camera
+there, both have to be tried (fit/surfels/try_light_frames).
 
 In: a capture, its views, points with normals. Out: LightFound; `with_light_of_camera` turns the light of Views.
 """
@@ -64,6 +65,8 @@ class LightFound:
     explained_by_object: float | None = None
     explained_by_camera: float | None = None
     """Share of the differences between pictures of a place, by what is mirrored in the object's frame and by what faces where in the camera's."""
+    wants_trial: bool = False
+    """It may be the camera's all the same: brightness says so, and what is around the object is not to be seen."""
 
 
 def with_light_of_camera(views: Views) -> Views:
@@ -82,19 +85,20 @@ def light_found(capture: Capture, views: Views, points: InitialPoints) -> LightF
     apart = float(torch.rad2deg(torch.acos((axes @ axes.T).clamp(-1, 1))).max())
     if len(views.cameras) < FEWEST_VIEWS or apart < WIDEST_APART:
         return LightFound("object", "the pictures were taken from one side")
-    differ = _surroundings_differ(capture)
-    if differ is None:
-        return LightFound("object", "the pictures do not show what is around the object")
-    if differ > ALIKE:
+    differ, unseen = _surroundings_differ(capture), "the pictures do not show what is around the object"
+    if differ is not None and differ > ALIKE:
         return LightFound(
             "object", f"what is around the object changes from picture to picture (by {differ:.2f} of full brightness)", differ
         )
     if points.normals_world is None or not views.has_masks:
-        return LightFound("object", "nothing is known of the object's shape yet", differ)
+        return LightFound("object", unseen if differ is None else "nothing is known of the object's shape yet", differ)
     explained = {frame: _explained(views, points, frame) for frame in ("object", "camera")}
     figures = (differ, explained["object"], explained["camera"])
     shares = f"{explained['camera']:.3f} of the differences between pictures of a place follow the camera and {explained['object']:.3f} the object"
-    if explained["camera"] < explained["object"] + CLEARER:
+    follows_camera = explained["camera"] >= explained["object"] + CLEARER
+    if differ is None:
+        return LightFound("object", f"{unseen}, and {shares}" if follows_camera else unseen, *figures, wants_trial=follows_camera)
+    if not follows_camera:
         return LightFound("object", f"{shares}, though what is around the object stays the same", *figures)
     return LightFound("camera", f"what is around the object stays the same while it turns, and {shares}", *figures)
 

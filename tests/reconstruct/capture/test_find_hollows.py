@@ -13,6 +13,7 @@ from drgs.reconstruct.capture import find_hollows as module
 from drgs.reconstruct.capture.find_hollows import CHOSEN_MESH, FIELD_MESH, HollowSettings, find_hollows
 from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
+from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.capture.visual_hull import VisualHull, VisualHullSettings, visual_hull
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
@@ -62,6 +63,12 @@ def mirror(place: Tensor, normal: Tensor, direction: Tensor) -> Tensor:
     """Of a room with stripes."""
     reflected = direction - 2 * (direction * normal).sum(-1, keepdim=True) * normal
     return 0.5 + 0.35 * torch.sin(7 * reflected + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def lit_from_the_camera(place: Tensor, normal: Tensor, direction: Tensor) -> Tensor:
+    """Paint under a lamp above the camera, which turns with it."""
+    lamp = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 0.7]) - direction, dim=-1)
+    return (0.25 + 0.75 * (normal * lamp).sum(-1, keepdim=True).clamp(min=0)) * paint(place, normal, direction)
 
 
 def photographed(object_: AbstractTracer, shade: Callable[[Tensor, Tensor, Tensor], Tensor], count: int = 48, side: int = SIDE) -> Views:
@@ -122,6 +129,15 @@ def test_a_painted_hollow_is_found_and_points_start_in_it(painted: Views, drum: 
     points = initial_points(painted, 2000, 0, found).points_world
     within = (points[:, :2].norm(dim=1) < 0.35) & (points[:, 2] > FLOOR - 0.15)
     assert float(points[within, 2].median()) < FLOOR + 0.15
+
+
+@pytest.mark.slow
+def test_a_painted_hollow_is_found_under_light_that_turns_with_the_camera(drum: VisualHull) -> None:
+    turned = photographed(bowl_and_ball(), lit_from_the_camera)
+    found = find_hollows(with_light_of_camera(turned), drum, SETTINGS, 0, CPU)
+    assert found is not None
+    filled = height_inside(drum.vertices_world, drum.faces)
+    assert abs(height_inside(found.vertices_world, found.faces) - FLOOR) < 0.25 * (filled - FLOOR)
 
 
 @pytest.mark.slow

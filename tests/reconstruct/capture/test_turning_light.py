@@ -1,6 +1,7 @@
 """What the light stood still with, told from pictures of a ball on a turntable and of one that a camera went around."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.load_views import read_capture
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
 from drgs.reconstruct.capture.turning_light import LightFound, light_found, with_light_of_camera
+from drgs.reconstruct.fit.surfels import try_light_frames as module
+from drgs.reconstruct.fit.surfels.try_light_frames import light_by_trial, try_light_frames
 from tests.reconstruct.tiny_capture import CX, CY, FX, FY, HEIGHT, SPHERE_CENTER, SPHERE_RADIUS, WIDTH, hits_sphere, sphere_views
 
 LAMP = np.array([0.3, -0.8, -0.52])
@@ -89,7 +92,30 @@ def test_masks_that_are_cut_outs_count_by_their_alpha(tmp_path: Path) -> None:
 def test_one_sign_alone_is_not_believed(tmp_path: Path, how: dict[str, bool], why: str) -> None:
     found = found_in(write_turntable(tmp_path, **how))
     assert found.frame == "object" and why in found.why
-    assert not any("turntable" in f["sentence"] for f in doctor(tmp_path)["findings"])
+    # Where the surroundings are not to be seen, brightness alone is reason enough to try both.
+    assert found.wants_trial == ("cut_out" in how)
+    sentences = [f["sentence"] for f in doctor(tmp_path)["findings"]]
+    assert any("may stand still with the camera" in sentence for sentence in sentences) == found.wants_trial
+    assert not any("stands still with the camera" in sentence for sentence in sentences)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on_camera", [True, False])
+def test_two_short_fits_tell_whose_light_it_is_where_pictures_are_cut_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_camera: bool
+) -> None:
+    monkeypatch.setattr(module, "SETTINGS", replace(module.SETTINGS, iterations=40, most_pixels=48 * 48))
+    folder = write_turntable(tmp_path, lamp_on_camera=on_camera, same_around=True, cut_out=True)
+    capture = read_capture(folder)
+    views = read_pictures(capture, None)
+    points = initial_points(views, 1500, 0)
+    told: list[float] = []
+    errors = try_light_frames(views, points, 0, torch.device("cpu"), told.append)
+    assert errors is not None and told == sorted(told) and told[-1] == 1
+    light = light_by_trial(light_found(capture, views, points), *errors)
+    assert light.frame == ("camera" if on_camera else "object") and not light.wants_trial
+    assert f"{errors[1] / errors[0]:.2f}" in light.why
+    assert try_light_frames(views, points, 0, torch.device("cpu"), should_stop=lambda: True) is None
 
 
 def test_the_light_of_each_view_is_turned_so_that_cameras_are_still(tmp_path: Path) -> None:

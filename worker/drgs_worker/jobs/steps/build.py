@@ -19,6 +19,8 @@ KEPT_CHECKPOINTS = {
     "mesh": ("stage1.safetensors", "mesh.safetensors", "surface.safetensors", "mesh_surfels.safetensors"),
 }
 """Of a finished build of either binding: what a re-decoupling starts from."""
+FOUND_BEFORE = ("masks.safetensors", "ground.safetensors", "ground_again.safetensors", "light.safetensors", "hollows.safetensors")
+"""What it would look for once more otherwise; not every build did."""
 
 
 class BuildRun(AbstractJobRun):
@@ -83,7 +85,7 @@ class BuildRun(AbstractJobRun):
         retry_while_unavailable(lambda: register_asset(job.directory, job.engine, job.job_id, job.name, "build"), job.should_stop)
         work = Path(f"{built}.build")
         for path in work.iterdir() if work.is_dir() else ():
-            if path.name in (*KEPT_CHECKPOINTS[self._binding], POSED):
+            if path.name in (*KEPT_CHECKPOINTS[self._binding], *FOUND_BEFORE, POSED):
                 continue
             if path.is_dir():
                 shutil.rmtree(path)
@@ -109,8 +111,10 @@ class RedecoupleRun(BuildRun):
         retry_while_unavailable(lambda: refresh_job(job.directory, job.parameters["asset"]), job.should_stop)
         source, work = job.directory.job(job.parameters["asset"]) / "asset.build", job.folder / "asset.build"
         work.mkdir(exist_ok=True)
-        for name in KEPT_CHECKPOINTS[self._binding]:
+        for name in (*KEPT_CHECKPOINTS[self._binding], *FOUND_BEFORE):
             if not (source / name).is_file():
+                if name in FOUND_BEFORE:
+                    continue
                 raise ValueError("This asset's geometry was not kept by a build on this service; build it here first.")
             draft = work / f"{name}.part"
             shutil.copyfile(source / name, draft)
