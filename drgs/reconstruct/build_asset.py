@@ -193,6 +193,7 @@ def build_stages(
         else:
             masked = views
         light = _light(settings, preset, found, masked, points)
+        # Masks that a build had to find are of whole pictures, whose room mostly stands still with the object.
         if light.wants_trial and not found_by:
             light = light_by_trial(light, *light_stage(place, masked, points, settings.seed, device))
         if light.frame == "camera":

@@ -118,6 +118,13 @@ def test_two_short_fits_tell_whose_light_it_is_where_pictures_are_cut_out(
     assert try_light_frames(views, points, 0, torch.device("cpu"), should_stop=lambda: True) is None
 
 
+def test_a_trial_in_which_nothing_can_be_compared_leaves_the_light_as_it_was_found() -> None:
+    found = LightFound("object", "the pictures are cut out", wants_trial=True)
+    assert light_by_trial(found, 0.0, 0.0) == replace(found, wants_trial=False)
+    for errors in ((float("nan"), 1.0), (1.0, float("nan")), (1.0, 0.95)):
+        assert light_by_trial(found, *errors).frame == "object"
+
+
 def test_the_light_of_each_view_is_turned_so_that_cameras_are_still(tmp_path: Path) -> None:
     views = with_light_of_camera(read_pictures(read_capture(write_turntable(tmp_path, True, True)), None))
     assert views.light_from_world is not None

@@ -39,8 +39,8 @@ def try_light_frames(
     report: Callable[[float], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[float, float] | None:
-    """Mean squared error (display space) of what masks fill in the photographs left out, by light of the object and of the camera; None when
-    should_stop() said so."""
+    """Mean squared error (display space) of what masks fill in the photographs left out, by light of the object and of the camera: 0 where they fill no
+    pixel. None when should_stop() said so."""
     count, errors = len(views.cameras), []
     left_out = list(range(LEFT_OUT // 2, count, LEFT_OUT)) or [count - 1]
     kept = [number for number in range(count) if number not in left_out]
@@ -64,7 +64,9 @@ def try_light_frames(
 
 
 def light_by_trial(found: LightFound, of_object: float, of_camera: float) -> LightFound:
-    """What try_light_frames' errors say of a light that wanted a trial."""
+    """What try_light_frames' errors say of a light that wanted a trial; as it was found where there was nothing to compare."""
+    if of_object == 0:
+        return replace(found, wants_trial=False)
     left = f"in photographs that surfels were not fitted to the camera's light leaves {of_camera / of_object:.2f} of the error that the object's leaves"
     return replace(found, frame="camera" if of_camera < BETTER * of_object else "object", why=f"{found.why}; {left}", wants_trial=False)
 
