@@ -14,6 +14,8 @@ gradients do not.
 
 Source: places of alike chroma have one reflectance (docs/sources.md: garces2012), here on a surface and with light by direction; steps of beck2009.
 
+Where the light turns with the camera, photographs say more: light_from_turns.
+
 In: the mesh through its tracer, the light so far. Out: by what factor it is to change, by direction.
 """
 
@@ -85,11 +87,11 @@ def light_from_paint(
         radiance: of the environment, so far. light: the same with what arrives, in the world's directions.
     """
     mesh = tracer.mesh
-    drawn = _drawn(tracer, settings.places, generator)
+    drawn = drawn_by_area(tracer, settings.places, generator)
     chosen, metal = drawn[paint[drawn]], drawn[~paint[drawn]]
     if len(chosen) < settings.fewest:
         return None
-    known = _means(radiance, settings.rows)
+    known = mean_radiance(radiance, settings.rows)
     shares, from_object = _arriving(tracer, chosen, light, settings.rows, generator)
     albedo = mesh.albedo[chosen] * (1 - mesh.metallic[chosen])[:, None]
     sent = (albedo * (shares @ known + from_object)).clamp(min=DARKEST)
@@ -98,25 +100,29 @@ def light_from_paint(
     before, after = ((shares @ radiance_of + from_object).clamp(min=DARKEST) for radiance_of in (known, solved))
     solved = solved * (before / after).log().mean(0).exp()
     # ... but for as much as leaves albedo room below white.
-    area = _solid_angles(settings.rows).to(known)[:, None]
+    area = solid_angles(settings.rows).to(known)[:, None]
     whole = (known * area).sum(0) / (solved * area).sum(0).clamp(min=DARKEST)
-    albedos = torch.cat([sent / (shares @ solved + from_object).clamp(min=DARKEST), mesh.albedo[metal] * whole])
-    solved = solved * max(1.0, float(albedos.amax(1).quantile(settings.share_below)) / settings.brightest)
+    solved = solved * too_dark(torch.cat([sent / (shares @ solved + from_object).clamp(min=DARKEST), mesh.albedo[metal] * whole]), settings)
     return (solved / known.clamp(min=1e-6)).clamp(1 / settings.most, settings.most).view(settings.rows, 2 * settings.rows, 3)
 
 
-def _drawn(tracer: AbstractTracer, count: int, generator: torch.Generator) -> Int[Tensor, "place"]:
+def too_dark(albedo: Float[Tensor, "place 3"], settings: PaintLightSettings) -> float:
+    """By what factor light is to be brighter, that what it falls on is not above white; 1 where it is not."""
+    return max(1.0, float(albedo.amax(1).quantile(settings.share_below)) / settings.brightest)
+
+
+def drawn_by_area(tracer: AbstractTracer, count: int, generator: torch.Generator) -> Int[Tensor, "place"]:
     """Vertices, by the area of a face around them."""
     faces, area = tracer.mesh.faces.long(), face_areas(tracer.mesh.vertices, tracer.mesh.faces)
     return faces[torch.multinomial(area.cpu(), count, replacement=True, generator=generator).to(faces.device), 0].unique()
 
 
-def _solid_angles(rows: int) -> Float[Tensor, "texel"]:
+def solid_angles(rows: int) -> Float[Tensor, "texel"]:
     """Of a table's texels [sr]."""
     return texel_solid_angles(rows).repeat_interleave(2 * rows)
 
 
-def _means(radiance: Float[Tensor, "128 256 3"], rows: int) -> Float[Tensor, "texel 3"]:
+def mean_radiance(radiance: Float[Tensor, "128 256 3"], rows: int) -> Float[Tensor, "texel 3"]:
     """Of a table, over the texels of a coarser one."""
     area = texel_solid_angles(radiance.shape[0]).to(radiance)[:, None].expand(radiance.shape[:2])[None]
     sums = torch.nn.functional.adaptive_avg_pool2d(radiance.permute(2, 0, 1) * area, (rows, 2 * rows))
@@ -134,7 +140,7 @@ def _arriving(
     corner = torch.stack([u, v], -1).reshape(-1, 2)
     within = torch.rand(len(chosen), len(corner), 2, generator=generator)
     direction = direction_from_uv(((corner + within) / torch.tensor([columns, rows])).to(start))
-    solid_angle = _solid_angles(rows).to(start)
+    solid_angle = solid_angles(rows).to(start)
     weight = (direction * normal[:, None]).sum(-1).clamp(min=0) * solid_angle / math.pi
     place, texel = (weight > 0).nonzero().unbind(1)
     origins = start[place] + SHARE_LIFT * tracer.lift * normal[place]
@@ -159,9 +165,8 @@ def _solved(
         positions: of the places, in the world. sent: radiance, above 0. known: the light so far.
     """
     light = known
-    middle = positions - positions.mean(0)
-    where = middle / (settings.alike_place * middle.square().sum(1).mean().sqrt())
-    solid_angle = (_solid_angles(settings.rows) / (4 * math.pi)).to(known)[:, None]
+    where = standing_apart(positions, settings)
+    solid_angle = (solid_angles(settings.rows) / (4 * math.pi)).to(known)[:, None]
     unit = known + (known * solid_angle).sum(0)  # a texel's steps are relative, for those that are dark to their mean
     for _ in range(settings.rounds):
         arriving = (shares @ light + from_object).clamp(min=1e-4)
@@ -195,12 +200,29 @@ def _mean_of_alike(
     """Of places with alike chroma and brightness near each other.
 
     Args:
-        where: in standard deviations of the kernel.
+        where: of standing_apart.
+    """
+    near = alikeness(log_albedo, where, settings)
+    return (near @ log_albedo) / near.sum(1, keepdim=True)
+
+
+def standing_apart(positions: Float[Tensor, "place 3"], settings: PaintLightSettings) -> Float[Tensor, "place 3"]:
+    """Where places are, in standard deviations of the kernel of alikeness."""
+    middle = positions - positions.mean(0)
+    return middle / (settings.alike_place * middle.square().sum(1).mean().sqrt())
+
+
+def alikeness(
+    log_albedo: Float[Tensor, "place 3"], where: Float[Tensor, "place 3"], settings: PaintLightSettings
+) -> Float[Tensor, "place place"]:
+    """How much places are of one paint, 0..1, by chroma, brightness and where they are.
+
+    Args:
+        where: of standing_apart.
     """
     brightness = log_albedo.mean(1, keepdim=True)
     scaled = torch.cat([(log_albedo - brightness) / settings.alike_chroma, brightness / settings.alike_brightness, where], 1)
-    near = torch.exp(-0.5 * torch.cdist(scaled, scaled).square())
-    return (near @ log_albedo) / near.sum(1, keepdim=True)
+    return torch.exp(-0.5 * torch.cdist(scaled, scaled).square())
 
 
 def _non_negative(

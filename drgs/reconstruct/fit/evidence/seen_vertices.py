@@ -33,27 +33,32 @@ class SeenVertices:
     """Unit direction to the camera, world."""
 
 
-def seen_vertices(tracer: AbstractTracer, target: ViewTarget) -> SeenVertices:
-    """Of the tracer's mesh; there may be none."""
+def seen_vertices(tracer: AbstractTracer, target: ViewTarget, among: Int[Tensor, "some"] | None = None) -> SeenVertices:
+    """Of the tracer's mesh; there may be none.
+
+    Args:
+        among: vertices that are asked; None: all.
+    """
     mesh, camera = tracer.mesh, target.camera
-    towards = camera.center_world - mesh.vertices
+    vertices, normals = (values if among is None else values[among] for values in (mesh.vertices, mesh.normals))
+    towards = camera.center_world - vertices
     wo = torch.nn.functional.normalize(towards, dim=-1)
-    at = mesh.vertices @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    at = vertices @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
     homogeneous = at @ camera.intrinsics.T
     place = homogeneous[:, :2] / homogeneous[:, 2:]
     size = torch.tensor([camera.width, camera.height], device=place.device)
-    seen = ((mesh.normals * wo).sum(-1) > FACING) & (at[:, 2] > 1e-6) & (place > 1).all(1) & (place < size - 1).all(1)
+    seen = ((normals * wo).sum(-1) > FACING) & (at[:, 2] > 1e-6) & (place > 1).all(1) & (place < size - 1).all(1)
     index = seen.nonzero().squeeze(1)
     column, row = place[index].long().unbind(1)
     colour = target.saturation[row, column]
     index_ok = (target.mask[row, column] > SOLID) & (colour.amax(-1) < SATURATED * target.ceiling)
     index, place = index[index_ok], place[index][index_ok]
-    origin = mesh.vertices[index] + 4 * tracer.lift * mesh.normals[index]
+    origin = vertices[index] + 4 * tracer.lift * normals[index]
     open_ = ~trace_rays(origin, wo[index], tracer).hit
     index, place = index[open_], place[open_]
     grid = (2 * place / size - 1)[None, None]
     sampled = torch.nn.functional.grid_sample(target.saturation.permute(2, 0, 1)[None], grid, mode="bilinear", align_corners=False)
-    return SeenVertices(index, linear_from_srgb(sampled[0, :, 0].T), wo[index])
+    return SeenVertices(index if among is None else among[index], linear_from_srgb(sampled[0, :, 0].T), wo[index])
 
 
 def mirrored_radiance(tracer: AbstractTracer, seen: SeenVertices, light: MeshLight) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,8 @@ Value and derivative come from different sets, 1/2 [l'(A) dB + l'(B) dA]: with o
 leans towards low variance, that is to rough and dim. Source: the paper's stage 2 with the parameters of Gu et al. 2025 where it is silent;
 independent halves after Nicolet et al. 2023 (docs/sources.md: gu2025irgs, nicolet2023). Exact densities and one definition of F0 throughout.
 
-In rounds: between two the surface follows the normals, which this estimate knows better than split sum does (moving_surface).
+In rounds: between two the surface follows the normals, which this estimate knows better than split sum does (moving_surface). Light that turns with the
+camera is looked for once more before the first one (light_from_turns): the last passes of the surface left it to gradients.
 
 In: the state of fit_surface. Out: the same, further.
 """
@@ -58,6 +59,8 @@ class MeshMaterialSettings:
     weight_bend: float = 0.0015
     weight_smooth: float = 0.05
     weight_metal: float = 0.3
+    times_light: int = 2
+    """That light which turns with the camera is looked for before the first step: what the object sends to itself, and its gloss, are of the light before."""
     weight_white_light: float = 0.002
     """Ten times as much holds each direction's light to grey, whatever the photographs say, and a lamp's colour is missing where metal mirrors it."""
     weight_rough_light: float = 0.002
@@ -126,6 +129,9 @@ class _Steps:
 
     def step(self, iteration: int) -> StepLoss:
         parameters, settings = self.state.parameters, self.settings
+        if iteration == 0 and self.surface.light_turns:
+            for _ in range(settings.times_light):
+                self.surface.look_for_light(self.targets, settings.moves)
         view = drawn_view(iteration, len(self.targets), settings.seed)
         target = self.targets[view]
         environment = environment_table(parameters)

@@ -77,7 +77,7 @@ class SurfaceSettings:
     """Share of the steps after which rates fall, by a cosine to a twentieth; 1: they do not."""
     moves: MoveSettings = field(default_factory=MoveSettings)
     looks_for_light: bool = False
-    """Before the first step, under which paint is alike on all sides (light_from_paint)."""
+    """Under which paint is alike on all sides: before the first step (light_from_paint); half-way where it turns with the camera (light_from_turns)."""
     still: bool = False
     """The surface stays where it is, and so do its metal and the light that arrives at it."""
     to_surface_end: float = 0.1
@@ -164,6 +164,8 @@ class _Steps:
         self.state, self.settings, self.faces = state, settings, faces
         self.targets = view_targets(views, 1.0, faces.device)
         self.surface = MovingSurface(views, faces, state, same_place)
+        # What photographs say of light that turns (light_from_turns) they say by normals, which a move has half returned to the surface's own.
+        self._light_at = settings.iterations // 2 if self.surface.light_turns else 0
 
     def end_round(self, done: int) -> None:
         if not self.settings.still and done % self.settings.steps_a_round == 0:
@@ -179,8 +181,8 @@ class _Steps:
         if iteration == 0 and not self.settings.still:
             self.surface.look_for_texture(self.settings.moves)
             self.move_surface()
-            if self.settings.looks_for_light:
-                self.surface.look_for_light(self.settings.moves)
+        if self.settings.looks_for_light and not self.settings.still and iteration == self._light_at:
+            self.surface.look_for_light(self.targets, self.settings.moves)
         target = self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
         parameters = self.state.parameters
         environment = environment_table(parameters)

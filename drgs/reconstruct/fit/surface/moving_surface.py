@@ -13,6 +13,7 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
 from drgs.reconstruct.fit.evidence.light_from_paint import PaintLightSettings, light_from_paint
+from drgs.reconstruct.fit.evidence.light_from_turns import TurnedLightSettings, even_choice, light_from_turns
 from drgs.reconstruct.fit.evidence.matched_texture import matched_texture
 from drgs.reconstruct.fit.evidence.metal_evidence import ViewSums, light_scale, metal_evidence, view_sums
 from drgs.reconstruct.fit.fit_loop import FitState
@@ -35,6 +36,8 @@ from drgs.scene.views import Views
 
 SHARED_RINGS = 2
 """Edges over which shares of irradiance are averaged."""
+MEAN_VIEWS = 8
+"""Photographs over which irradiance is averaged where the light turns with the camera."""
 ALIKE = 16
 """Power of the cosine between normals by which a neighbour counts."""
 
@@ -69,7 +72,7 @@ class MovingSurface:
         self._state, self.faces = state, faces
         self._cameras = tuple(camera.to(faces.device) for camera in views.cameras)
         self._views = views
-        self._light_turns = views.light_from_world is not None
+        self.light_turns = views.light_from_world is not None
         self._seen_sky: SeenSky | None = None
         if same_place is None:
             self.edges, self.tracer = mesh_edges(faces), self._tracer()
@@ -85,7 +88,7 @@ class MovingSurface:
     @property
     def _sky(self) -> SeenSky | None:
         """What the vertices see, where the light turns: traced when it is first asked for after relight, as fits do many times between two moves."""
-        if self._light_turns and self._seen_sky is None:
+        if self.light_turns and self._seen_sky is None:
             self._seen_sky = seen_sky(self.tracer)
         return self._seen_sky
 
@@ -145,7 +148,7 @@ class MovingSurface:
         parameters = self._state.parameters
         self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
         self._seen_sky = None
-        if self._light_turns:
+        if self.light_turns:
             return
         radiance = environment_table(parameters)
         light = MeshLight(filter_environment(radiance), parameters["open_share"])
@@ -162,34 +165,54 @@ class MovingSurface:
         return averaged(averaging_matrix(self.edges, len(vertices), alike), share, SHARED_RINGS)
 
     @torch.no_grad()
-    def look_for_light(self, settings: MoveSettings) -> None:
-        """The light under which paint is alike on all sides, and the paint's albedo under it. Light that turns with the camera shows paint from all sides already."""
-        if self._light_turns:
-            return
+    def look_for_light(self, targets: list[ViewTarget], settings: MoveSettings) -> None:
+        """The light under which paint is alike on all sides, and the paint's albedo under it."""
         parameters = self._state.parameters
         radiance = environment_table(parameters)
-        light = MeshLight(filter_environment(radiance), parameters["open_share"])
         self.tracer = self.tracer.with_materials(mesh_from_surface_fit(self._state, self.faces))
-        paint = parameters["metal"] <= 0
-        factor = light_from_paint(self.tracer, radiance, light, paint, settings.paint_light, self._state.generator)
+        paint, generator = parameters["metal"] <= 0, self._state.generator
+        light_of = self.light_of(filter_environment(radiance))
+        if self.light_turns:
+            own = TurnedLightSettings(settings.paint_light)
+            factor = light_from_turns(self.tracer, radiance, light_of, targets, paint, own, generator)
+        else:
+            factor = light_from_paint(self.tracer, radiance, light_of(targets[0]), paint, settings.paint_light, generator)
         if factor is None:
             return
-        before = self.irradiance(light)
+        before = self._mean_irradiance(targets)
         parameters[f"environment_{ENVIRONMENT_PYRAMID[1]}"] += upsampled(factor.log().permute(2, 0, 1)[None], ENVIRONMENT_PYRAMID[1])
-        self.relight(settings.share_rays)
-        after = self.irradiance(MeshLight(filter_environment(environment_table(parameters)), parameters["open_share"]))
+        if not self.light_turns:
+            self.relight(settings.share_rays)
+        after = self._mean_irradiance(targets)
         albedo = torch.sigmoid(parameters["albedo_logits"])
         changed = logits_of_shares(albedo * before / after.clamp(min=1e-6))
         parameters["albedo_logits"].copy_(torch.where(paint[:, None], changed, parameters["albedo_logits"]))
+
+    def _mean_irradiance(self, targets: list[ViewTarget]) -> Tensor:
+        """(vertex, 3) of irradiance; where the light turns, over some photographs from whose side a vertex faces."""
+        light_of = self.light_of(filter_environment(environment_table(self._state.parameters)))
+        if not self.light_turns:
+            return self.irradiance(light_of(targets[0]))
+        mesh = self.tracer.mesh
+        total, weight = torch.zeros_like(mesh.vertices), torch.full_like(mesh.vertices[:, :1], 1e-6)
+        for target in (targets[k] for k in even_choice(len(targets), MEAN_VIEWS)):
+            towards = torch.nn.functional.normalize(target.camera.center_world - mesh.vertices, dim=-1)
+            facing = (mesh.normals * towards).sum(-1, keepdim=True).clamp(min=0) + 1e-6
+            total += facing * self.irradiance(light_of(target))
+            weight += facing
+        return total / weight
 
     def irradiance(self, light: MeshLight) -> Tensor:
         """(vertex, 3), over pi, that arrives."""
         normals = torch.nn.functional.normalize(self._state.parameters["normals"], dim=-1)
         black, one = torch.zeros_like(normals), torch.ones_like(normals)
         white, none = (
-            shade_split_sum(albedo, black, black, one[:, 0].contiguous(), normals, normals, light.tables, open_share=light.open_share)
+            shade_split_sum(
+                albedo, black, black, one[:, 0].contiguous(), normals, normals, light.tables,
+                open_share=light.open_share, light_from_world=light.light_from_world,
+            )
             for albedo in (one, black)
-        )
+        )  # fmt: skip
         return white - none
 
     def light_of(self, tables: Tensor) -> LightOf:
@@ -207,7 +230,7 @@ class MovingSurface:
         sums = self.sums(targets)
         parameters = self._state.parameters
         scale = light_scale(sums)
-        parameters["metal"].copy_(metal_evidence(sums, self.edges, self._light_turns, scale))
+        parameters["metal"].copy_(metal_evidence(sums, self.edges, self.light_turns, scale))
         if scale != 1:
             parameters[f"environment_{ENVIRONMENT_PYRAMID[0]}"] += math.log(scale)
             parameters["albedo_logits"].copy_(logits_of_shares(torch.sigmoid(parameters["albedo_logits"]) / scale))

@@ -58,7 +58,8 @@ class PassSettings:
     before whole builds say that it pays (docs/decisions/0003). Not those of try_after: stopped in the second of two trials, a
     build would repeat the first."""
     light_before: tuple[int, ...] = (2, 3, 4, 5)
-    """Passes, counted from 1, before which light is looked for that makes paint alike on all sides. Not before all of many: each time light gets rougher."""
+    """Passes, counted from 1, before which light is looked for that makes paint alike on all sides (half-way through which, where it turns with the camera).
+    Not before all of many: each time light gets rougher."""
     division: DivisionSettings = field(default_factory=DivisionSettings)
     """How fine faces are divided after the last pass."""
     relief_steps: int = 70

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.light.mesh_light import MeshLight
@@ -16,7 +17,7 @@ from drgs.reconstruct.fit.surface.fit_mesh_materials import (
     traced_light,
 )
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, start_surface
-from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.records import SampleCounts
 from drgs.scene.views import Views
@@ -100,3 +101,12 @@ def test_a_resumed_fit_ends_with_the_same_numbers(views: Views, tmp_path: Path):
     assert resumed.iteration == 7
     for name, value in whole.parameters.items():
         assert torch.equal(resumed.parameters[name], value), name
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_light_that_turns_is_looked_for_before_the_first_step(views: Views, turns: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = short(2, times_light=3)
+    state, asked = started(settings), []
+    monkeypatch.setattr(MovingSurface, "look_for_light", lambda surface, targets, moves: asked.append(state.iteration))
+    fitted(with_light_of_camera(views) if turns else views, settings, state=state)
+    assert asked == ([0, 0, 0] if turns else [])

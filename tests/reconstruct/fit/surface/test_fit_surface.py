@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, fit_surface, start_surface
-from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.scene.views import Views
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
 from tests.reconstruct.surfel_spheres import surfel_sphere
@@ -91,3 +92,14 @@ def test_no_rounds_leave_the_mesh_as_it_was(views: Views):
     settings = short(rounds=0)
     state, reports = fitted(views, settings)
     assert reports == [] and torch.equal(mesh_from_surface_fit(state, placed_sphere().faces).vertices, placed_sphere(SHRUNK).vertices)
+
+
+@pytest.mark.parametrize(("turns", "still", "expected"), [(False, False, [0]), (True, False, [2]), (True, True, [])])
+def test_light_is_looked_for_by_paint_before_the_first_step_or_half_way_where_it_turns(
+    views: Views, turns: bool, still: bool, expected: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = short(rounds=1, steps_a_round=4, looks_for_light=True, still=still)
+    state, asked = started(settings), []
+    monkeypatch.setattr(MovingSurface, "look_for_light", lambda surface, targets, moves: asked.append(state.iteration))
+    fitted(with_light_of_camera(views) if turns else views, settings, state=state)
+    assert asked == expected

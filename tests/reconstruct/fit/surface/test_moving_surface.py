@@ -109,7 +109,8 @@ def test_paint_that_light_is_taken_from_sends_what_it_sent(tmp_path: Path) -> No
     with torch.no_grad():
         parameters["albedo_logits"].copy_(logits_of_shares((0.4 + 0.2 * up).expand(-1, 3)))
         parameters["metal"][0] = 1.0
-    surface = MovingSurface(painted_views(tmp_path), faces, state)
+    views = painted_views(tmp_path)
+    surface, target = MovingSurface(views, faces, state), view_targets(views, 1.0, torch.device("cpu"))[0]
     surface.relight(64)
 
     @torch.no_grad()
@@ -118,7 +119,7 @@ def test_paint_that_light_is_taken_from_sends_what_it_sent(tmp_path: Path) -> No
         return torch.sigmoid(parameters["albedo_logits"]) * surface.irradiance(light)
 
     before, metal = sent(), parameters["albedo_logits"][0].detach().clone()
-    surface.look_for_light(MoveSettings(share_rays=64))
+    surface.look_for_light([target], MoveSettings(share_rays=64))
     change = (sent() / before).log()[1:]
     assert float(change.abs().mean()) < 0.02
     albedo = torch.sigmoid(parameters["albedo_logits"].detach()).mean(1)
