@@ -59,8 +59,9 @@ class MeshMaterialSettings:
     weight_bend: float = 0.0015
     weight_smooth: float = 0.05
     weight_metal: float = 0.3
-    times_light: int = 2
-    """That light which turns with the camera is looked for before the first step: what the object sends to itself, and its gloss, are of the light before."""
+    times_light: int = 0
+    """That light which turns with the camera is looked for before the first step: each time what the object sends to itself, and its gloss, are of the light
+    before. Not in fits of a few steps, which everything else needs to follow the light."""
     weight_white_light: float = 0.002
     """Ten times as much holds each direction's light to grey, whatever the photographs say, and a lamp's colour is missing where metal mirrors it."""
     weight_rough_light: float = 0.002
