@@ -166,9 +166,9 @@ def _looks(
     open_share = weight
     open_share[place, texel] = 0
 
-    def looked_at(view: ViewTarget, shown: Tensor) -> Looks:
-        """The places `shown`, by number, of which the view sees all."""
-        light, seen = light_of(view), seen_vertices(tracer, view, chosen[shown])
+    def looked_at(view: ViewTarget, shown: Tensor, seen: SeenVertices) -> Looks:
+        """The places `shown`, by number, as the view has `seen` them."""
+        light = light_of(view)
         assert light.light_from_world is not None  # of views whose light turns
         slot = torch.full((len(chosen),), -1, device=shown.device)
         slot[shown] = torch.arange(len(shown), device=shown.device)
@@ -179,7 +179,7 @@ def _looks(
         return Looks(shown, shares, from_object, (seen.photo - _gloss(tracer, seen, light)).clamp(min=DARKEST))
 
     drawn = _drawn_looks(tracer, chosen, targets, settings.looks, generator)
-    parts = [looked_at(target, shown) for target, shown in zip(targets, drawn, strict=True)]
+    parts = [looked_at(target, *shown) for target, shown in zip(targets, drawn, strict=True)]
     return Looks(*(torch.cat([getattr(part, name) for part in parts]) for name in ("place", "shares", "from_object", "sent")))
 
 
@@ -203,14 +203,24 @@ def _gloss(tracer: AbstractTracer, seen: SeenVertices, light: MeshLight) -> Floa
 
 def _drawn_looks(
     tracer: AbstractTracer, chosen: Int[Tensor, "place"], targets: list[ViewTarget], most: int, generator: torch.Generator
-) -> list[Int[Tensor, "shown"]]:
-    """For each photograph the places, by number, that are looked at in it: of each, `most` of the photographs that show it."""
+) -> list[tuple[Int[Tensor, "shown"], SeenVertices]]:
+    """For each photograph the places, by number, that are looked at in it, and what it has there: of each, `most` of the photographs that show it.
+
+    Args:
+        chosen: vertices in ascending order.
+    """
+    seen = [seen_vertices(tracer, target, chosen) for target in targets]
+    places = [torch.searchsorted(chosen, each.index) for each in seen]
     shows = torch.zeros(len(targets), len(chosen), dtype=torch.bool)
-    for target, shown in zip(targets, shows, strict=True):
-        shown[torch.isin(chosen, seen_vertices(tracer, target, chosen).index).cpu()] = True
+    for shown, place in zip(shows, places, strict=True):
+        shown[place.cpu()] = True
     order = torch.rand(shows.shape, generator=generator) + (~shows).float()
     last = order.sort(0).values[min(most, len(targets)) - 1]
-    return [(shown & (own <= last)).nonzero().squeeze(1).to(chosen.device) for shown, own in zip(shows, order, strict=True)]
+    looks = []
+    for own, place, each in zip((order <= last).to(chosen.device), places, seen, strict=True):
+        kept = own[place]
+        looks.append((place[kept], SeenVertices(each.index[kept], each.photo[kept], each.wo[kept])))
+    return looks
 
 
 def _turned_texels(turn: Float[Tensor, "3 3"], rows: int) -> Float[Tensor, "texel texel"]:
