@@ -180,7 +180,7 @@ def build_stages(
         capture, poses = _posed(dataset, out, settings, reporter, should_stop)
         stop = should_stop or (lambda: False)
         found, views, points = _opened(capture, settings, preset, reporter, stop)
-        photographs = views
+        photographs, gains_of_files = views, views.gains is not None
         views = with_gains_of_points(views, points)
         identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views, settings.box)}
         place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, stop)
@@ -199,6 +199,9 @@ def build_stages(
         if light.frame == "camera":
             views, masked, place = with_light_of_camera(views), with_light_of_camera(masked), place.of(light="camera")
         points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
+        if light.frame == "camera" and not gains_of_files:
+            # By what the same places show: hollows are looked for as if light stood still, but a fit is to explain these differences by light.
+            views = replace(views, gains=None)
     yield "read", None
 
     with timed("fit"):
