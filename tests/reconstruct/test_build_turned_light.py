@@ -11,6 +11,8 @@ import torch
 from PIL import Image
 
 from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
+from drgs.reconstruct.capture import exposures
+from drgs.reconstruct.capture.turning_light import LightChoice
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
 from drgs.reconstruct.presets import PRESETS
@@ -119,6 +121,17 @@ def test_with_the_right_frame_pictures_are_explained_and_with_the_wrong_one_not(
     )
     errors = [error_of_renders(asset, tmp_path / f"{asset.light_frame}_renders", turntable) for asset in (right, wrong)]
     assert errors[0] < 0.05 and errors[0] < 0.7 * errors[1], errors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("light", "exposed"), [("camera", False), ("object", True)])
+def test_what_light_that_turns_changes_is_not_taken_for_exposures(
+    light: LightChoice, exposed: bool, half_turntable: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exposures, "VARIED_STOPS", 0.0)  # so that points find exposures in any capture, ...
+    monkeypatch.setattr(exposures, "LEFT_STOPS", 1e9)  # ... and so short a fit, which explains little, in none
+    asset = build_asset(half_turntable, tmp_path / "a", replace(SETTINGS, light=light))
+    assert ("exposure_stops" in asset.provenance) == exposed
 
 
 @pytest.mark.slow

@@ -5,6 +5,9 @@ Three sources, the first that knows wins: what the camera wrote into the files (
 before anything is fitted; the surfels of stage 1, which know what depends on the view, afterwards. Gains are relative: their logarithms have
 the mean 0. Where they differ by less than chance would make them, there are none, and nothing changes.
 
+Where light turns with the camera, what one place shows changes with it, by a stop and more, and points cannot tell that from exposures: so those gains
+serve the search for hollows, which takes light for still, and no fit.
+
 White balances only the surfels tell, for points that mirror coloured things differ as much.
 
 In: Views. Out: Views with `gains`, or `tints`, or the very same.
