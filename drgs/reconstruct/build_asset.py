@@ -339,7 +339,7 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
     where these were moved to."""
     place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
     with timed("surface"):
-        passes = built.preset.surface
+        passes = built.preset.surface.under(views.light_from_world is not None)
         moves = replace(passes.surface.moves, texture_radius=built.radius, box=built.settings.box)
         passes = replace(passes, surface=replace(passes.surface, seed=seed, moves=moves))
         passes = passes if built.settings.cameras == "auto" else replace(passes, cameras_after=())

@@ -64,8 +64,14 @@ class PassSettings:
     """How fine faces are divided after the last pass."""
     relief_steps: int = 70
     """On divided faces: of normals, materials and light, while the surface stays where it is."""
+    more_where_light_turns: int = 0
+    """Passes, in all of which light, shadows and shape have farther to go together: stage 1 leaves a worse shape where light turns with the camera."""
     cameras_after: tuple[int, ...] = ()
     """Passes, counted from 1, after which cameras are moved to where their photographs fit the surface, where they are off (register_cameras)."""
+
+    def under(self, light_turns: bool) -> "PassSettings":
+        """With as many passes as such light needs."""
+        return replace(self, passes=self.passes + self.more_where_light_turns) if light_turns else self
 
 
 @dataclass(eq=False)
