@@ -124,14 +124,17 @@ def test_with_the_right_frame_pictures_are_explained_and_with_the_wrong_one_not(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("light", "exposed"), [("camera", False), ("object", True)])
-def test_what_light_that_turns_changes_is_not_taken_for_exposures(
-    light: LightChoice, exposed: bool, half_turntable: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("light", "exposed", "passes"), [("camera", False, 2), ("object", True, 1)])
+def test_what_light_that_turns_changes_is_not_taken_for_exposures_and_it_has_more_passes(
+    light: LightChoice, exposed: bool, passes: int, half_turntable: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(exposures, "VARIED_STOPS", 0.0)  # so that points find exposures in any capture, ...
     monkeypatch.setattr(exposures, "LEFT_STOPS", 1e9)  # ... and so short a fit, which explains little, in none
-    asset = build_asset(half_turntable, tmp_path / "a", replace(SETTINGS, light=light))
+    monkeypatch.setitem(PRESETS, "tiny", replace(SMALL, surface=replace(SMALL.surface, passes=1, more_where_light_turns=1)))
+    told: list[str] = []
+    asset = build_asset(half_turntable, tmp_path / "a", replace(SETTINGS, light=light), lambda p: told.append(p.message))
     assert ("exposure_stops" in asset.provenance) == exposed
+    assert any(f"pass {passes} of {passes}," in message for message in told)
 
 
 @pytest.mark.slow
