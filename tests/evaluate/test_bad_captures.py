@@ -200,7 +200,7 @@ BAD: dict[str, Bad] = {
     "exposures up and down": Bad(
         spoiled(*(pixels(number, brighter(1.2 if number % 2 else 0.5)) for number in range(balls.VIEWS))),
         "warning",
-        r"The same points differ in brightness by 1\.\d\d stops between views; a build takes that for their exposures\.",
+        r"The same points differ in brightness by 1\.\d\d stops between views; a build takes that for their exposures, unless the light turns with the camera\.",
         "Lock exposure",
     ),
     "copies of a picture": Bad(

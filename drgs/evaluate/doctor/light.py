@@ -46,7 +46,8 @@ def exposure(views: Views, points: InitialPoints, known: Sequence[str]) -> Secti
         findings.append(
             Finding(
                 "warning",
-                f"The same points differ in brightness by {spread(of_others):.2f} stops between views; a build takes that for their exposures.",
+                f"The same points differ in brightness by {spread(of_others):.2f} stops between views; a build takes that for their exposures, "
+                "unless the light turns with the camera.",
                 "Lock exposure and white balance, and keep the light still.",
             )
         )
