@@ -200,7 +200,7 @@ def build_stages(
             views, masked, place = with_light_of_camera(views), with_light_of_camera(masked), place.of(light="camera")
         points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
         if light.frame == "camera" and not gains_of_files:
-            # By what the same places show: hollows are looked for as if light stood still, but a fit is to explain these differences by light.
+            # with_gains_of_points took for exposures what the light's turns do. It helps to look for hollows as if light stood still; a fit has the light.
             views = replace(views, gains=None)
     yield "read", None
 
@@ -339,7 +339,7 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
     where these were moved to."""
     place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
     with timed("surface"):
-        passes = built.preset.surface.under(views.light_from_world is not None)
+        passes = built.preset.surface.under(light_turns=views.light_from_world is not None)
         moves = replace(passes.surface.moves, texture_radius=built.radius, box=built.settings.box)
         passes = replace(passes, surface=replace(passes.surface, seed=seed, moves=moves))
         passes = passes if built.settings.cameras == "auto" else replace(passes, cameras_after=())
