@@ -1,7 +1,7 @@
 """The mesh becomes the surface that the photographs show: shading normals, materials and light by deferred shading, positions from them.
 
 In rounds. First the mesh moves (integrate_normals): its outlines onto the masks', its faces across the normals found so far. Then visibility and
-inter-reflection are traced anew, and for the rest of the round each step looks at one photograph: rays find the mesh behind its pixels,
+inter-reflection are traced anew, and for the rest of the round each step looks at some pixels of a few photographs: rays find the mesh behind them,
 split sum with one mirrored ray shades them, and normals, albedo, roughness and metallic of the vertices and the environment follow the
 gradient. Normals are free while they are fitted, so that each vertex answers to its own pixels; the solve makes them a surface again.
 
@@ -15,7 +15,6 @@ In: Views with masks, a mesh, surfels for the normals to start from, the light o
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -99,7 +98,10 @@ class SurfaceSettings:
     """Ten times as much holds each direction's light to grey, whatever the photographs say, and a lamp's colour is missing where metal mirrors it."""
     weight_rough_light: float = 0.002
     pixels_a_step: int = 65_536
-    """Of one photograph; of larger ones as many are drawn anew in each step."""
+    """At most, of all photographs that a step looks at; drawn anew in each step."""
+    photographs_a_step: int = 4
+    """That share the pixels which one of them has. What one photograph gets wrong (its light, its shadows) it gets wrong over whole surfaces, and
+    turns their normals together; what pixels of several get wrong evens out (decisions/0003, "Several photographs a step")."""
     seed: int = 0
 
     @property
@@ -183,12 +185,14 @@ class _Steps:
             self.move_surface()
         if self.settings.looks_for_light and not self.settings.still and iteration == self._light_at:
             self.surface.look_for_light(self.targets, self.settings.moves)
-        target = self.targets[drawn_view(iteration, len(self.targets), self.settings.seed)]
+        several = self.settings.photographs_a_step
+        drawn = (drawn_view(iteration * several + k, len(self.targets), self.settings.seed) for k in range(several))
+        targets = [self.targets[number] for number in drawn]
         parameters = self.state.parameters
         environment = environment_table(parameters)
         surface = packed_surface(parameters)
         terms: dict[str, Tensor] = {}
-        shaded, squared_error = self._shaded(target, environment, surface)
+        shaded, squared_error = self._shaded(targets, environment, surface)
         if squared_error is not None:
             terms["shaded"] = shaded
         settings, progress = self.settings, iteration / self.settings.iterations
@@ -198,35 +202,50 @@ class _Steps:
             self.surface.edges, environment, surface, parameters["metal"], bend, smooth, settings.weight_metal,
             settings.weight_white_light, settings.weight_rough_light,
         )  # fmt: skip
-        return StepLoss(terms, target.camera, squared_error)
+        return StepLoss(terms, targets[0].camera, squared_error)
 
-    def _shaded(self, target: ViewTarget, environment: Tensor, surface: Tensor) -> tuple[Tensor, float | None]:
-        """The mean error of the pixels that mask and mesh fill, in display space, by two estimates of their colours, and the squared one of the
+    def _shaded(self, targets: list[ViewTarget], environment: Tensor, surface: Tensor) -> tuple[Tensor, float | None]:
+        """The mean error of pixels that masks and mesh fill, in display space, by two estimates of their colours, and the squared one of the
         first; None where there is no such pixel."""
-        solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
-        if len(solid) > self.settings.pixels_a_step:
-            drawn = torch.randperm(len(solid), generator=self.state.generator)[: self.settings.pixels_a_step]
-            solid = solid[drawn.sort().values.to(solid.device)]
         tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
-        light = self.surface.light_of(filter_environment(environment))(target)
-        cost = partial(_cost_of_pixels, solid, target, tracer, light)
-        leaves = (light.tables, surface)
-        total, (squared, count) = cost_in_slices(len(solid), leaves, cost, self.state.generator)
+        tables = filter_environment(environment)
+        light_of = self.surface.light_of(tables)
+        chosen = [self._some_pixels(target, len(targets)) for target in targets]
+
+        def cost(first: int, last: int, leaves: tuple[Tensor, ...], generator: torch.Generator) -> tuple[Tensor, Tensor]:
+            seen = zip(chosen[first:last], targets[first:last], strict=True)
+            # Light that turns is found here, by the thread that needs it.
+            parts = [_cost_of_pixels(pixels, target, tracer, light_of(target), leaves, generator) for pixels, target in seen]
+            if not parts:  # fewer photographs than threads
+                return leaves[0].sum() * 0, torch.zeros(2, device=surface.device)
+            errors, others = zip(*parts, strict=True)
+            return torch.stack(errors).sum(), torch.stack(others).sum(0)
+
+        total, (squared, count) = cost_in_slices(len(targets), (tables, surface), cost, self.state.generator)
         return (total / count, float(squared / count)) if count else (total, None)
+
+    def _some_pixels(self, target: ViewTarget, several: int) -> Tensor:
+        """One in `several` of a photograph's solid pixels (flat), or fewer, one out of each so many that follow each other."""
+        solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
+        wanted = -(-min(len(solid), self.settings.pixels_a_step) // several)
+        if wanted == len(solid):
+            return solid
+        edges = torch.arange(wanted + 1) * len(solid) // wanted
+        inside = torch.rand(wanted, dtype=torch.float64, generator=self.state.generator) * (edges[1:] - edges[:-1])
+        return solid[(edges[:-1] + inside.long()).to(solid.device)]
 
 
 def _cost_of_pixels(
-    pixels: Tensor, target: ViewTarget, tracer: AbstractTracer, light: MeshLight, first: int, last: int, leaves: tuple[Tensor, ...],
-    generator: torch.Generator,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """SliceCost of some of the `pixels`: the error, summed; the squared one and the number of channels that were compared.
+    pixels: Tensor, target: ViewTarget, tracer: AbstractTracer, light: MeshLight, leaves: tuple[Tensor, ...], generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Of the `pixels` (flat) the error, summed; the squared one and the number of channels that were compared.
 
     Args:
         leaves: the light's tables and packed_surface.
     """
     tables, surface = leaves
     normals, light = surface.detach()[:, :3].contiguous(), replace(light, tables=tables)
-    twice = seen_twice(target, pixels[first:last], tracer, generator)
+    twice = seen_twice(target, pixels, tracer, generator)
     steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
     halves = [shade_places(seen[steep], target, tracer, surface, light, generator) for seen in twice]
     photo = target.saturation.reshape(-1, 3)[twice[0].pixels[steep]]

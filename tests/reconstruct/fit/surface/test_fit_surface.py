@@ -1,15 +1,20 @@
 """The surface's fit on the painted sphere: it finds size and colours, repeats itself, and goes on where it stopped."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
+import drgs.reconstruct.fit.surface.fit_surface as fit_surface_module
 from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, fit_surface, start_surface
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, seen_twice
+from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.scene.views import Views
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
 from tests.reconstruct.surfel_spheres import surfel_sphere
@@ -86,6 +91,22 @@ def test_of_large_photographs_some_pixels_are_looked_at(views: Views):
     changed = (some.parameters["albedo_logits"] != started(few).parameters["albedo_logits"]).any(1)
     assert float(changed.float().mean()) > 0.05
     assert reports[-1].psnr > 5
+
+
+@pytest.mark.parametrize("several", [1, 3])
+def test_a_step_shares_its_pixels_among_several_photographs(views: Views, several: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[tuple[int, int, int]] = []  # which photograph, pixels drawn, pixels it has
+
+    def watched(target: ViewTarget, pixels: Tensor, *rest: Any) -> tuple[SeenPlaces, SeenPlaces]:
+        solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
+        assert len(pixels.unique()) == len(pixels) and torch.isin(pixels, solid).all()
+        looked.append((id(target), len(pixels), len(solid)))
+        return seen_twice(target, pixels, *rest)
+
+    monkeypatch.setattr(fit_surface_module, "seen_twice", watched)
+    fitted(views, short(rounds=1, steps_a_round=1, photographs_a_step=several))
+    assert len({number for number, _, _ in looked}) == len(looked) == several
+    assert all(drawn == -(-has // several) for _, drawn, has in looked)
 
 
 def test_no_rounds_leave_the_mesh_as_it_was(views: Views):
