@@ -70,8 +70,13 @@ class PassSettings:
     """Passes, counted from 1, after which cameras are moved to where their photographs fit the surface, where they are off (register_cameras)."""
 
     def under(self, light_turns: bool) -> "PassSettings":
-        """With as many passes as such light needs."""
-        return replace(self, passes=self.passes + self.more_where_light_turns) if light_turns else self
+        """With as many passes as such light needs; normals then go less far in each, and as far in all of them."""
+        if not light_turns or not self.more_where_light_turns:
+            return self
+        passes, given = self.passes + self.more_where_light_turns, self.surface
+        share = self.passes / passes
+        rates = replace(given.rates, normals=given.rates.normals * share)
+        return replace(self, passes=passes, surface=replace(given, rates=rates, normals_end=given.normals_end * share))
 
 
 @dataclass(eq=False)
