@@ -100,7 +100,7 @@ class SurfaceSettings:
     pixels_a_step: int = 65_536
     """At most, of all photographs that a step looks at; drawn anew in each step."""
     photographs_a_step: int = 4
-    """That share the pixels which one of them has. What one photograph gets wrong (its light, its shadows) it gets wrong over whole surfaces, and
+    """Of which each gives one in so many of its pixels. What one photograph gets wrong (its light, its shadows) it gets wrong over whole surfaces, and
     turns their normals together; what pixels of several get wrong evens out (decisions/0003, "Several photographs a step")."""
     seed: int = 0
 
