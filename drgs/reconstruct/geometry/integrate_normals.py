@@ -2,14 +2,16 @@
 
 Each vertex moves along its own normal by s, which minimises
 
-    sum_edges w_e ((x_i - x_j) . n_e / |x_i - x_j|)^2  +  w_outline sum_outlines w_o l_o d_o(x)^2  +  anchor sum_vertices (s / mean edge)^2
+    sum_edges w_e ((x_i - x_j) . n_e / |x_i - x_j| - a_e)^2  +  w_outline sum_outlines w_o l_o d_o(x)^2  +  anchor sum_vertices (s / mean edge)^2
     +  even sum_edges ((s_i - s_j) / |x_i - x_j|)^2  +  home sum_vertices w_h ((s - h) / mean edge)^2
     +  texture sum_vertices w_t ((s - t) / mean edge)^2
 
-with n_e the mean of the wanted normals at the edge's ends, d_o the outlines' distances in pixels, h how far behind or before the vertex its home
+with n_e the mean of the wanted normals at the edge's ends and a_e how far the edge leans towards the mean of the surface's own normals there: a surface
+that has the normals which are wanted stays as it is, creases and all. Without a_e each solve rounds a crease by an edge, as no edge that leads into
+it lies across the mean of the normals at its ends (decisions/0003, "Moves that round nothing"). d_o are the outlines' distances in pixels, h how far behind or before the vertex its home
 lies and t how far its texture (matched_texture), by a sparse linear solve in float64. Homes matter where nothing else says how deep a place is: a
 floor within a rim may sink as a whole without turning any normal, and does so solve by solve if each starts from where the one before ended.
-Weights are robust (Cauchy's), so that creases, where no normal fits an edge, and wrong outlines do not pull their surroundings along.
+Weights are robust (Cauchy's), so that normals that no surface has and wrong outlines do not pull their surroundings along.
 Source: Nehab et al. 2005 (positions from normals), with outlines in place of measured depths (docs/sources.md: nehab2005).
 """
 
@@ -46,7 +48,7 @@ class IntegrationSettings:
     even: float = 0.02
     """Of a difference between neighbours' moves, as an edge's tilt: keeps slivers, which hardly know their normal, with their surroundings."""
     crease_angle: float = 0.2
-    """[radians] at which an edge's weight is halved."""
+    """[radians] by which an edge is to tilt, at which its weight is halved."""
     outline_outlier: float = 1.0
     """[pixels] at which an outline's weight is halved."""
     reweightings: int = 3
@@ -86,7 +88,8 @@ def integrate_normals(
     normal = torch.nn.functional.normalize(wanted_normals[start] + wanted_normals[end], dim=-1)
     across = vertices[start] - vertices[end]
     length = across.norm(dim=1).clamp(min=1e-30)
-    tilt = (across * normal).sum(1) / length
+    own = torch.nn.functional.normalize(direction[start] + direction[end], dim=-1)
+    tilt = (across * (normal - own)).sum(1) / length
     by_start, by_end = (direction[start] * normal).sum(1) / length, -(direction[end] * normal).sum(1) / length
     by_corners = outlines.weights * (outlines.gradient[:, None] * direction[outlines.corners]).sum(-1)
 

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+import trimesh
 
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import MaskOutline, mask_outline, outline_rays, outline_residuals
@@ -55,6 +56,20 @@ def test_a_sphere_that_is_too_small_and_bumpy_becomes_the_sphere_of_its_normals_
 def test_the_true_sphere_stays_where_it_is():
     true = sphere_mesh(subdivisions=4)
     assert float((solved(true, true.normals, IntegrationSettings()) - true.vertices).norm(dim=1).max()) < 4e-3
+
+
+def test_creases_of_a_surface_that_has_its_normals_stay():
+    """A cube, whose edges would be rounded by a third of a triangle's side in one solve if sides of triangles were laid across the mean normal."""
+    cube = trimesh.creation.box().subdivide().subdivide().subdivide()
+    vertices, faces = torch.from_numpy(cube.vertices).float(), torch.from_numpy(cube.faces).int()
+    edges, own = mesh_edges(faces), vertex_normals(vertices, faces)
+    none = outline_residuals(build_tracer(sphere_mesh(subdivisions=1)), outline_rays((), [], faces.device))
+    turned = torch.nn.functional.normalize(own + torch.tensor([0.02, 0.0, 0.0]), dim=-1)
+    moved = [
+        float((integrate_normals(vertices, faces, wanted, edges, none, IntegrationSettings()) - vertices).norm(dim=1).max())
+        for wanted in (own, turned)
+    ]
+    assert moved[0] < 1e-6 and moved[1] > 1e-3
 
 
 @pytest.mark.parametrize("anchor", [1e-3, 1e3])

@@ -49,7 +49,7 @@ class MoveSettings:
     integration: IntegrationSettings = field(default_factory=IntegrationSettings)
     solves: int = 2
     """Of positions: outlines are found anew between."""
-    to_surface: float = 0.5
+    to_surface: float = 1.0
     """Share by which normals return to the surface's own afterwards."""
     share_rays: int = 48
     """A vertex, for the irradiance that arrives there."""

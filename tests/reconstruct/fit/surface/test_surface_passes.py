@@ -64,7 +64,7 @@ def test_weights_go_on_where_the_pass_before_ended_and_rates_fall():
     assert falling == sorted(falling, reverse=True) and falling[0] ** 8 == pytest.approx(0.02**7 * 0.002)
     assert falling[-1] ** 8 == pytest.approx(0.02 * 0.002**7)
     assert [one.fall_from for one in each] == [1.0, 1.0, 1.0, settings.surface.fall_from]
-    assert [one.moves.to_surface for one in each] == [0.5, 0.5, 0.5, 0.1]
+    assert [one.moves.to_surface for one in each] == [1.0, 1.0, 1.0, 0.1]
     assert [one.light_at_end for one in each] == [False, False, False, True]
     assert len({one.seed for one in each}) == 4
 
