@@ -45,7 +45,7 @@ class IntegrationSettings:
     texture: float = 0.5
     """Of a mean edge's length away from where texture lies. With 0.02 outlines of masks that were drawn too wide hold the tankard's walls where they
     are; with 0.5 half of what texture says is left of it after a pass."""
-    even: float = 0.02
+    even: float = 0.005
     """Of a difference between neighbours' moves, as an edge's tilt: keeps slivers, which hardly know their normal, with their surroundings."""
     crease_angle: float = 0.2
     """[radians] by which an edge is to tilt, at which its weight is halved."""
