@@ -6,11 +6,12 @@ Each vertex moves along its own normal by s, which minimises
     +  even sum_edges ((s_i - s_j) / |x_i - x_j|)^2  +  home sum_vertices w_h ((s - h) / mean edge)^2
     +  texture sum_vertices w_t ((s - t) / mean edge)^2
 
-with n_e the mean of the wanted normals at the edge's ends and a_e how far the edge leans towards the mean of the surface's own normals there: a surface
-that has the normals which are wanted stays as it is, creases and all. Without a_e each solve rounds a crease by an edge, as no edge that leads into
-it lies across the mean of the normals at its ends (decisions/0003, "Moves that round nothing"). d_o are the outlines' distances in pixels, h how far behind or before the vertex its home
-lies and t how far its texture (matched_texture), by a sparse linear solve in float64. Homes matter where nothing else says how deep a place is: a
-floor within a rim may sink as a whole without turning any normal, and does so solve by solve if each starts from where the one before ended.
+with n_e the mean of the wanted normals at the edge's ends, a_e how far the edge leans now, by the mean of the surface's own normals there, d_o the
+outlines' distances in pixels, h how far behind or before the vertex its home lies and t how far its texture (matched_texture), by a sparse linear
+solve in float64. So a surface that has the normals which are wanted stays as it is, creases and all: without a_e each solve rounds a crease by an
+edge, as no edge that leads into it lies across the mean of the normals at its ends (decisions/0003, "Moves that round nothing"). Homes matter where
+nothing else says how deep a place is: a floor within a rim may sink as a whole without turning any normal, and does so solve by solve if each
+starts from where the one before ended.
 Weights are robust (Cauchy's), so that normals that no surface has and wrong outlines do not pull their surroundings along.
 Source: Nehab et al. 2005 (positions from normals), with outlines in place of measured depths (docs/sources.md: nehab2005).
 """

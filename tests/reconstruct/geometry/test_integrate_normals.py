@@ -59,7 +59,7 @@ def test_the_true_sphere_stays_where_it_is():
 
 
 def test_creases_of_a_surface_that_has_its_normals_stay():
-    """A cube, whose edges would be rounded by a third of a triangle's side in one solve if sides of triangles were laid across the mean normal."""
+    """A cube, whose corners move by half a triangle's side in one solve if sides of triangles are laid across the mean of their ends' normals."""
     cube = trimesh.creation.box().subdivide().subdivide().subdivide()
     vertices, faces = torch.from_numpy(cube.vertices).float(), torch.from_numpy(cube.faces).int()
     edges, own = mesh_edges(faces), vertex_normals(vertices, faces)

@@ -166,7 +166,7 @@ class _Steps:
         self.state, self.settings, self.faces = state, settings, faces
         self.targets = view_targets(views, 1.0, faces.device)
         self.surface = MovingSurface(views, faces, state, same_place)
-        # What photographs say of light that turns (light_from_turns) they say by normals, which a move has half returned to the surface's own.
+        # What photographs say of light that turns (light_from_turns) they say by normals, which a move has returned to the surface's own.
         self._light_at = settings.iterations // 2 if self.surface.light_turns else 0
 
     def end_round(self, done: int) -> None:
