@@ -12,7 +12,7 @@ from drgs.reconstruct.capture.visual_hull import VisualHullSettings
 from drgs.reconstruct.fit.densify import DensifySettings
 from drgs.reconstruct.fit.evidence.solve_albedo import DetailSettings
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
-from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings
 from drgs.reconstruct.fit.surface.surface_passes import PASS_MESH, PassSettings
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings
 from drgs.reconstruct.fit.surfels.fit_materials import MaterialSettings
@@ -91,7 +91,9 @@ PRESETS = {
             try_after=(2, 4, 6, 8),
             division=DivisionSettings(most_faces=400_000),
         ),
-        MeshMaterialSettings(iterations=1200, rounds=3, points_a_step=4096, times_light=2),
+        MeshMaterialSettings(
+            iterations=1200, rounds=6, points_a_step=4096, rates=SurfaceRates(normals=0.0015), gradient_rings=2, times_light=2
+        ),
         DetailSettings(most_samples=6_000_000, side=4096),
         mesh_surfels=MeshFitSettings(iterations=500),
         surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),

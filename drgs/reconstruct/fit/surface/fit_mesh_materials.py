@@ -16,6 +16,7 @@ camera is looked for once more before the first one (light_from_turns): the last
 In: the state of fit_surface. Out: the same, further.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -35,6 +36,8 @@ from drgs.reconstruct.fit.surface.prior_terms import prior_terms
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_twice
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
+from drgs.reconstruct.geometry.average_around import averaged
+from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings
 from drgs.render.integrate.environment_table import EnvironmentTable, build_environment_table
 from drgs.render.integrate.integrate_samples import integrate_samples
 from drgs.render.integrate.sample_rays import sample_rays
@@ -51,11 +54,16 @@ class MeshMaterialSettings:
     iterations: int = 300
     rounds: int = 2
     """After each the surface follows its normals, and what is metal is looked at again; but not after the last one."""
-    moves: MoveSettings = field(default_factory=lambda: MoveSettings(to_surface=0.1))
+    moves: MoveSettings = field(default_factory=lambda: MoveSettings(IntegrationSettings(home=0.01), to_surface=0.5))
+    """Homes hold floors whose height no normal tells: else they drift with every move."""
     points_a_step: int = 2048
     samples: SampleCounts = field(default_factory=lambda: SampleCounts(32, 16, 16))
     """Rays a point in each of two sets: cosine, GGX, environment (the paper: 256, 128, 128 in one)."""
     rates: SurfaceRates = field(default_factory=lambda: SurfaceRates(normals=0.0007))
+    normals_end: float = 0.00007
+    """What the normals' rate has fallen to in the end: mirrors show its noise."""
+    gradient_rings: int = 1
+    """Edges over which the normals' gradients are averaged; 0: they are not."""
     weight_bend: float = 0.0015
     weight_smooth: float = 0.05
     weight_metal: float = 0.3
@@ -69,8 +77,9 @@ class MeshMaterialSettings:
 
 
 def start_mesh_materials(surface: FitState, settings: MeshMaterialSettings, radius: float) -> FitState:
-    """The surface as it was fitted, with this stage's rates."""
-    values = leaves(surface.parameters, frozen=NOT_FITTED)
+    """The surface as it was fitted, at home where it is, with this stage's rates."""
+    home = {"homeward": torch.zeros_like(surface.parameters["homeward"])}
+    values = leaves(surface.parameters | home, frozen=NOT_FITTED)
     return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 1))
 
 
@@ -86,10 +95,14 @@ def fit_mesh_materials(
     steps = _Steps(views, faces, state, settings)
 
     def rates(iteration: int) -> dict[str, float]:
-        return cosine_rates(state.optimizer, iteration, settings.iterations)
+        start, end = settings.rates.normals, settings.normals_end
+        left = 0.5 + 0.5 * math.cos(math.pi * iteration / settings.iterations)
+        return cosine_rates(state.optimizer, iteration, settings.iterations) | {"normals": end + (start - end) * left}
 
     return run_fit(
-        FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, after_step=steps.end_round), report, should_stop
+        FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, steps.share_gradients, steps.end_round),
+        report,
+        should_stop,
     )
 
 
@@ -121,6 +134,14 @@ class _Steps:
         self.targets = view_targets(views, 1.0, faces.device)
         self.solid = [(target.mask.flatten() > SOLID).nonzero().squeeze(1) for target in self.targets]
         self.surface = MovingSurface(views, faces, state)
+
+    @torch.no_grad()
+    def share_gradients(self, _: StepLoss) -> None:
+        """Of normals, with neighbours that face the same way: a step's few rays at few places make noise, which moves would make shape of and mirrors
+        show (Nicolet et al. 2021; docs/sources.md: nicolet2021)."""
+        normals = self.state.parameters["normals"]
+        if self.settings.gradient_rings and normals.grad is not None:
+            normals.grad = averaged(self.surface.around(), normals.grad, self.settings.gradient_rings)
 
     def end_round(self, done: int) -> None:
         total, rounds = self.settings.iterations, self.settings.rounds

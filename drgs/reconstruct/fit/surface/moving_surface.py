@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
+from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
@@ -74,6 +75,7 @@ class MovingSurface:
         self._views = views
         self.light_turns = views.light_from_world is not None
         self._seen_sky: SeenSky | None = None
+        self._around: csr_matrix | None = None
         if same_place is None:
             self.edges, self.tracer = mesh_edges(faces), self._tracer()
         else:
@@ -118,7 +120,7 @@ class MovingSurface:
             for place in (homeward, parameters["to_texture"]):
                 place += vertices - moved
             vertices.copy_(moved)
-            self.tracer = self._tracer()
+            self.tracer, self._around = self._tracer(), None
         own = vertex_normals(parameters["vertices"], self.faces)
         back = (1 - settings.to_surface) * normals + settings.to_surface * own
         parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))
@@ -158,11 +160,16 @@ class MovingSurface:
     def _agreed_share(self, share: Tensor) -> Tensor:
         """The means around of (vertex, 3) shares. A few rays a vertex err by a tenth, which materials and normals would then explain; light changes less
         than that within two edges, but for places that face elsewhere: they count little."""
-        vertices = self._state.parameters["vertices"]
-        normals = vertex_normals(vertices, self.faces)
-        start, end = self.edges.vertices.unbind(1)
-        alike = (normals[start] * normals[end]).sum(-1).clamp(min=0) ** ALIKE
-        return averaged(averaging_matrix(self.edges, len(vertices), alike), share, SHARED_RINGS)
+        return averaged(self.around(), share, SHARED_RINGS)
+
+    def around(self) -> csr_matrix:
+        """That takes means over neighbours which face the same way, of the surface as it lies now: made once for each place."""
+        if self._around is None:
+            normals = vertex_normals(self._state.parameters["vertices"], self.faces)
+            start, end = self.edges.vertices.unbind(1)
+            alike = (normals[start] * normals[end]).sum(-1).clamp(min=0) ** ALIKE
+            self._around = averaging_matrix(self.edges, len(normals), alike)
+        return self._around
 
     @torch.no_grad()
     def look_for_light(self, targets: list[ViewTarget], settings: MoveSettings) -> None:

@@ -1,5 +1,6 @@
 """Stage 2 on the mesh: rays on a convex object, a fit that finds colours, repeats itself and resumes."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -7,16 +8,17 @@ import torch
 
 from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
-from drgs.reconstruct.fit.fit_loop import FitReport, FitState
+from drgs.reconstruct.fit.fit_loop import FitReport, FitState, StepLoss
 from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.surface import fit_mesh_materials as fit_mesh_materials_file
 from drgs.reconstruct.fit.surface.fit_mesh_materials import (
     MeshMaterialSettings,
     fit_mesh_materials,
     start_mesh_materials,
     traced_light,
 )
-from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, start_surface
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings, start_surface
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.records import SampleCounts
@@ -78,6 +80,53 @@ def test_between_rounds_the_surface_follows_and_keeps_its_outline(views: Views):
     assert torch.equal(once["vertices"], placed_sphere().vertices)
     moved = (twice["vertices"] - once["vertices"]).norm(dim=-1)
     assert float(moved.max()) > 0.001 * SPHERE_RADIUS and float(moved.mean()) < 0.02 * SPHERE_RADIUS
+
+
+def test_the_surface_is_at_home_where_its_fit_left_it():
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    surface = start_surface(surfels, placed_sphere(), grey_light(), SurfaceSettings(), SPHERE_RADIUS)
+    surface.parameters["homeward"].fill_(0.5)
+    assert not start_mesh_materials(surface, short(1), SPHERE_RADIUS).parameters["homeward"].any()
+    assert float(surface.parameters["homeward"].min()) == 0.5
+
+
+def test_the_rate_of_normals_falls_to_its_end(views: Views, monkeypatch: pytest.MonkeyPatch):
+    settings = short(8, rates=SurfaceRates(normals=0.01), normals_end=0.0001, rounds=1)
+    state, rates = started(settings), []
+    step = state.optimizer.step
+
+    def noted() -> None:
+        rates.extend(group["lr"] for group in state.optimizer.param_groups if group["name"] == "normals")
+        step()
+
+    monkeypatch.setattr(state.optimizer, "step", noted)
+    fitted(views, settings, state=state)
+    assert rates[0] == pytest.approx(0.01) and rates == sorted(rates, reverse=True)
+    assert rates[-1] == pytest.approx(0.0001 + 0.0099 * 0.5 * (1 + math.cos(math.pi * 7 / 8)))
+
+
+@pytest.mark.parametrize("rings", [0, 1])
+def test_normals_share_their_gradients_with_neighbours_that_face_the_same_way(views: Views, rings: int, monkeypatch: pytest.MonkeyPatch):
+    settings = short(1, gradient_rings=rings)
+    state, faces, seen = started(settings), placed_sphere().faces, {}
+
+    def step() -> None:
+        seen["gradient"] = state.parameters["normals"].grad
+
+    def one_place(steps: object, iteration: int) -> StepLoss:
+        return StepLoss({"traced": state.parameters["normals"][0].sum()}, views.cameras[0], 0.0)
+
+    monkeypatch.setattr(fit_mesh_materials_file._Steps, "step", one_place)
+    monkeypatch.setattr(state.optimizer, "step", step)
+    fitted(views, settings, state=state)
+    beside = faces[(faces == 0).any(1)].unique().long()
+    others = torch.ones(len(seen["gradient"]), dtype=torch.bool).index_fill(0, beside, False)
+    gradient = seen["gradient"][:, 0]
+    assert not gradient[others].any()
+    if rings:
+        assert 0.1 < float(gradient[0]) < 0.3 and float(gradient[beside].min()) > 0.05
+    else:
+        assert float(gradient[0]) == 1 and float(gradient.sum()) == 1
 
 
 @pytest.mark.slow
