@@ -163,7 +163,7 @@ class MovingSurface:
         return averaged(self.around(), share, SHARED_RINGS)
 
     def around(self) -> csr_matrix:
-        """That takes means over neighbours which face the same way, of the surface as it lies now: made once for each place."""
+        """averaging_matrix over neighbours that face the same way, of the surface as it lies now; made anew after a move."""
         if self._around is None:
             normals = vertex_normals(self._state.parameters["vertices"], self.faces)
             start, end = self.edges.vertices.unbind(1)
