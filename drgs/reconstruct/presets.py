@@ -74,7 +74,7 @@ PRESETS = {
         FitSettings(iterations=660, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), more_where_light_turns=2, cameras_after=(1, 2, 3)),
-        MeshMaterialSettings(iterations=180, times_light=2),
+        MeshMaterialSettings(iterations=360, rounds=3, rates=SurfaceRates(normals=0.0015), gradient_rings=2, times_light=2),
         DetailSettings(),
         mesh_surfels=MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
@@ -88,11 +88,11 @@ PRESETS = {
             10,
             mesh=replace(PASS_MESH, resolution=320, face_limit=200_000),
             cameras_after=(2, 4, 6),
-            try_after=(2, 4, 6, 8),
+            try_after=(2,),
             division=DivisionSettings(most_faces=400_000),
         ),
         MeshMaterialSettings(
-            iterations=1200, rounds=6, points_a_step=4096, rates=SurfaceRates(normals=0.0015), gradient_rings=2, times_light=2
+            iterations=2400, rounds=12, points_a_step=4096, rates=SurfaceRates(normals=0.0015), gradient_rings=2, times_light=2
         ),
         DetailSettings(most_samples=6_000_000, side=4096),
         mesh_surfels=MeshFitSettings(iterations=500),

@@ -53,7 +53,7 @@ class MeshMaterialSettings:
 
     iterations: int = 300
     rounds: int = 2
-    """After each the surface follows its normals, and what is metal is looked at again; but not after the last one."""
+    """After each the surface follows its normals, but not after the last one."""
     moves: MoveSettings = field(default_factory=lambda: MoveSettings(IntegrationSettings(home=0.01), to_surface=0.5))
     """Homes hold floors whose height no normal tells: else they drift with every move."""
     points_a_step: int = 2048
@@ -147,7 +147,10 @@ class _Steps:
         total, rounds = self.settings.iterations, self.settings.rounds
         if done < total and done * rounds // total > (done - 1) * rounds // total:
             self.surface.move(self.settings.moves)
-            self.surface.look_for_metal(self.targets, self.settings.moves)
+            # Under light that stands still the last pass has said it: asked again, places that see nothing but other metal are called paint
+            # (decisions/0003, "Fewer trials, more of stage 2"). Light that turns was found anew before the first step.
+            if self.surface.light_turns:
+                self.surface.look_for_metal(self.targets, self.settings.moves)
 
     def step(self, iteration: int) -> StepLoss:
         parameters, settings = self.state.parameters, self.settings

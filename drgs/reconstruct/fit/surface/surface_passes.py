@@ -24,7 +24,6 @@ from drgs.reconstruct.fit.surface.shade_surface import packed_surface
 from drgs.reconstruct.fit.surface.try_depths import TrialSettings, try_depths
 from drgs.reconstruct.fit.surface.try_kinds import iterations as iterations_of_kinds
 from drgs.reconstruct.fit.surface.try_kinds import try_kinds
-from drgs.reconstruct.fit.surface.try_sheets import SheetSettings, try_sheets
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces, divisions, undivided_faces
@@ -52,11 +51,6 @@ class PassSettings:
     trials: TrialSettings = field(default_factory=TrialSettings)
     try_after: tuple[int, ...] = ()
     """Passes, counted from 1, after which the surface is tried at other depths."""
-    sheets: SheetSettings = field(default_factory=SheetSettings)
-    sheets_after: tuple[int, ...] = ()
-    """Passes, counted from 1, after which narrow hollows are tried without what may fill them. No preset does so
-    before whole builds say that it pays (docs/decisions/0003). Not those of try_after: stopped in the second of two trials, a
-    build would repeat the first."""
     light_before: tuple[int, ...] = (2, 3, 4, 5)
     """Passes, counted from 1, before which light is looked for that makes paint alike on all sides (half-way through which, where it turns with the camera).
     Not before all of many: each time light gets rougher."""
@@ -169,32 +163,13 @@ def move_to_tried_depths(
     fit.doing = ""
     if found is None:
         return False
-    _settle_where_tried(fit, before, found.parameters, found.depth.abs() > settings.trials.still * radius)
-    return True
-
-
-def empty_tried_hollows(
-    fit: SurfaceFit,
-    views: Views,
-    settings: PassSettings,
-    radius: float,
-    report: Callable[[FitReport], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
-) -> bool:
-    """Take out what trials say fills narrow hollows; False: should_stop() said so, and nothing moved."""
-    before = {name: value.detach().clone() for name, value in fit.state.parameters.items()}
-    seed = settings.surface.seed + 7919 * (fit.index + 1)
-    fit.doing = "trying narrow hollows"
-    try:
-        found = try_sheets(views, before, fit.faces, settings.sheets, settings.mesh, radius, seed, report, should_stop)
-    except NothingEnclosed as error:
-        fit.remark = f"after pass {fit.index + 1} no hollows were tried, for {error}"
-        return True
-    finally:
-        fit.doing = ""
-    if found is None:
-        return False
-    _settle_where_tried(fit, before, found.parameters, found.moved)
+    step = found.parameters["vertices"] - before["vertices"]
+    # What moved is at home where it is now.
+    moved = (found.depth.abs() > settings.trials.still * radius)[:, None]
+    homeward = torch.where(moved, torch.zeros_like(step), before["homeward"] - step)
+    with torch.no_grad():
+        for name, value in (found.parameters | {"homeward": homeward, "to_texture": before["to_texture"] - step}).items():
+            parameters[name].copy_(value)
     return True
 
 
@@ -231,15 +206,6 @@ def begin_as_either_kind(
         for name, value in found.parameters.items():
             fit.state.parameters[name].copy_(value)
     return True
-
-
-@torch.no_grad()
-def _settle_where_tried(fit: SurfaceFit, before: dict[str, Tensor], found: dict[str, Tensor], moved: Tensor) -> None:
-    """The fit goes on with what was found; what moved, (vertex,), is at home where it is now."""
-    step = found["vertices"] - before["vertices"]
-    homeward = torch.where(moved[:, None], torch.zeros_like(step), before["homeward"] - step)
-    for name, value in (found | {"homeward": homeward, "to_texture": before["to_texture"] - step}).items():
-        fit.state.parameters[name].copy_(value)
 
 
 def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> None:
@@ -294,7 +260,6 @@ def fit_surface_in_passes(
     """
     steps = settings.surface.iterations
     between = [(after, settings.trials.iterations) for after in settings.try_after]
-    between += [(after, settings.sheets.iterations) for after in settings.sheets_after]
     turns = views.light_from_world is not None and settings.passes > KINDS_AFTER
     between += [(KINDS_AFTER, iterations_of_kinds(settings_of_pass(settings, KINDS_AFTER)))] if turns else []
     total = settings.passes * steps + sum(more for _, more in between) + settings.relief_steps * (settings.division.most_faces > 0)
@@ -324,10 +289,6 @@ def fit_surface_in_passes(
         if turns and number == KINDS_AFTER and not begin_as_either_kind(fit, views, settings, partial(tell, done + steps), should_stop):
             return False
         if number in settings.try_after and not move_to_tried_depths(
-            fit, views, settings, radius, partial(tell, done + steps), should_stop
-        ):
-            return False
-        if number in settings.sheets_after and not empty_tried_hollows(
             fit, views, settings, radius, partial(tell, done + steps), should_stop
         ):
             return False

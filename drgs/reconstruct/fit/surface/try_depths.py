@@ -254,8 +254,6 @@ class Settled:
     """Sum of the squared errors of the pixels at each vertex, and their number."""
     nearest: list[Tensor]
     """Of each photograph: (pixel,) the vertex that it sees; -1 for none."""
-    squares: list[Tensor]
-    """Of each photograph: (pixel,) the squared error; nan where it is not compared."""
 
 
 class Trials:
@@ -342,7 +340,7 @@ class Trials:
 
         run_fit(FitLoop(state, settings.steps, len(self._targets), step, rates), self._tell, self._stops)
         self._done += settings.steps
-        errors, squares = torch.zeros(len(values["vertices"]), 2, device=self._faces.device), []
+        errors = torch.zeros(len(values["vertices"]), 2, device=self._faces.device)
         with torch.no_grad():
             packed, tracer = packed_surface(values), materials_of_now()
             for index, target in enumerate(self._targets):
@@ -353,13 +351,10 @@ class Trials:
                 # A square would count the noise of mirrored rays, which hollows have and what fills them has not.
                 error = crossed_squares(first, second, photo)
                 errors.index_add_(0, places.nearest, torch.stack([error, torch.ones_like(error)], 1))
-                of_all = torch.full((target.mask.numel(),), math.nan, device=errors.device)
-                of_all[places.pixels] = error
-                squares.append(of_all[self._solid[index]])
                 foreign = seen_places(target, self._bare[index], surface.tracer).nearest
                 wrong = torch.tensor([FOREIGN_ERROR, 1.0], device=errors.device)
                 errors.index_add_(0, foreign, wrong.expand(len(foreign), 2))
-        return Settled({name: value.detach() for name, value in values.items()}, surface.tracer, errors, nearest, squares)
+        return Settled({name: value.detach() for name, value in values.items()}, surface.tracer, errors, nearest)
 
     def _seen(self, tracer: AbstractTracer, beside: Settled | None, only: Tensor | None) -> tuple[list[SeenPlaces], list[Tensor]]:
         """Of each photograph, the places that are compared, and `Settled.nearest`."""

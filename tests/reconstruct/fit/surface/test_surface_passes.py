@@ -20,7 +20,6 @@ from drgs.reconstruct.fit.surface.surface_passes import (
 )
 from drgs.reconstruct.fit.surface.try_depths import TriedDepths
 from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, iterations
-from drgs.reconstruct.fit.surface.try_sheets import TriedSheets
 from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.remesh import NothingEnclosed
@@ -249,32 +248,3 @@ def test_a_surface_that_cannot_be_meshed_anew_stays_as_it_was_and_the_user_is_to
     assert fit.remark == (
         "after pass 1 the mesh before was kept, for the mesh of 8 faces encloses nothing at 40 cells; expected a closed surface"
     )
-
-
-def test_emptied_hollows_are_at_home_there_and_what_cannot_be_tried_is_told(monkeypatch: pytest.MonkeyPatch):
-    settings = PassSettings(3, sheets_after=(1,))
-    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
-    start = placed_sphere(1.0)
-    fit = SurfaceFit(start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS), start.faces)
-    fit.state.parameters["homeward"].fill_(0.5)
-    answers: list[object] = [None, NothingEnclosed("there is no inside"), 0.02]
-
-    def tried(views, parameters, *_):
-        answer = answers.pop(0)
-        if isinstance(answer, Exception):
-            raise answer
-        if answer is None:
-            return None
-        moved = torch.zeros(len(parameters["vertices"]), dtype=torch.bool)
-        moved[0] = True
-        return TriedSheets(parameters | {"vertices": parameters["vertices"] - answer * moved[:, None]}, moved)
-
-    monkeypatch.setattr(surface_passes, "try_sheets", tried)
-    no_views = Views((), (), (), None, None, False, "none")
-    assert not surface_passes.empty_tried_hollows(fit, no_views, settings, SPHERE_RADIUS)
-    assert torch.equal(fit.mesh.vertices, start.vertices) and fit.remark == ""
-    assert surface_passes.empty_tried_hollows(fit, no_views, settings, SPHERE_RADIUS)
-    assert torch.equal(fit.mesh.vertices, start.vertices) and fit.remark == "after pass 1 no hollows were tried, for there is no inside"
-    assert surface_passes.empty_tried_hollows(fit, no_views, settings, SPHERE_RADIUS)
-    assert float((fit.mesh.vertices - start.vertices)[0].amax()) < -0.019 and torch.equal(fit.mesh.vertices[1:], start.vertices[1:])
-    assert float(fit.state.parameters["homeward"][0].norm()) == 0 and float(fit.state.parameters["homeward"][1:].min()) == 0.5
