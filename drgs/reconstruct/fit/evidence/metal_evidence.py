@@ -45,8 +45,9 @@ NOISE = 0.02
 """Standard deviation of a photograph's radiance, relative above DARK, that explains nothing."""
 NEIGHBOURHOOD = 3
 """Times that residuals are averaged with the neighbours'."""
-DOUBT = 0.4
-"""Of the residuals' logarithms: by how much metal may explain worse and is believed, where it leaves much unexplained."""
+DOUBT = 0.5
+"""Of the residuals' logarithms: by how much metal may explain worse and is believed, where it leaves much unexplained. On finished surfaces (decisions/0003, "Metal by its
+hue") 0.6 misses less metal yet and calls more paint metal."""
 DOUBT_TURNED = 0.2
 """The same where light turns with the camera. Drafts, metallic RMSE of bunny and teapot: .45 and .38 with 0.4, .17 and .42 with 0.2, .09 and .54 with 0."""
 DARKEST = (0.08, 0.16)
@@ -65,9 +66,10 @@ UNSEEN = 1e-4
 EDGES = 90_000
 """Of the meshes (60 000 faces) for which NEIGHBOURHOOD and TOGETHER were chosen. Finer ones average oftener and hold neighbours together the more, so that a place
 hears as much of the surface: else errors of shape that are a few pixels wide are called paint on a mesh that has faces enough for them."""
-SAME_COLOUR = 0.6
-"""Difference of the logarithms of colours, over three channels, across an edge whose ends hear each other a third as much as if there were none. On finished surfaces (decisions/0003,
-"Metal by its colour") 0.4 takes a few of the teapot's wrong normals for paint, 0.8 gains half as much on a small gold spot."""
+SAME_COLOUR = 0.4
+"""Difference of the logarithms of colours, over three channels, across an edge whose ends hear each other a third as much as if there were none ..."""
+BRIGHTNESS = 0.1
+"""... where differences that all channels share count so much: what arrives in a hollow, and so how bright matter seems there, is known less well than its hue."""
 STRANGERS = 1e-3
 """At least."""
 DECISIVE = 0.3
@@ -220,7 +222,10 @@ def _alike(sums: ViewSums, edges: MeshEdges) -> Float[Tensor, "edge"]:
     """How much the ends of an edge hear each other, 1 where their colours are the same or not known."""
     start, end = edges.vertices.unbind(1)
     color, known = sums.color.clamp(min=1e-3).log(), sums.views >= FEWEST_VIEWS
-    step = (color[start] - color[end]).square().sum(-1) * (known[start] & known[end])
+    apart = color[start] - color[end]
+    brighter = apart.mean(-1, keepdim=True)
+    unlike = (apart - brighter).square().sum(-1) + BRIGHTNESS * 3 * brighter.square()[:, 0]
+    step = unlike * (known[start] & known[end])
     return torch.exp(-step / SAME_COLOUR**2).clamp(min=STRANGERS)
 
 

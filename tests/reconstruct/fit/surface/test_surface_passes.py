@@ -23,7 +23,6 @@ from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, iterations
 from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.remesh import NothingEnclosed
-from drgs.scene.views import Views
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
 from tests.reconstruct.surfel_spheres import surfel_sphere
 from tests.reconstruct.tiny_capture import SPHERE_RADIUS
