@@ -49,6 +49,9 @@ class Preset:
     """Whose insides that surface is to have."""
 
 
+FINE_MATERIALS = MeshMaterialSettings(rates=SurfaceRates(normals=0.0015), gradient_rings=2, times_light=2)
+"""Stage 2 that has steps enough for normals to go on by it."""
+
 PRESETS = {
     "draft": Preset(
         8_000,
@@ -74,7 +77,7 @@ PRESETS = {
         FitSettings(iterations=660, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), more_where_light_turns=2, cameras_after=(1, 2, 3)),
-        MeshMaterialSettings(iterations=360, rounds=3, rates=SurfaceRates(normals=0.0015), gradient_rings=2, times_light=2),
+        replace(FINE_MATERIALS, iterations=360, rounds=3),
         DetailSettings(),
         mesh_surfels=MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
@@ -91,9 +94,7 @@ PRESETS = {
             try_after=(2,),
             division=DivisionSettings(most_faces=400_000),
         ),
-        MeshMaterialSettings(
-            iterations=2400, rounds=12, points_a_step=4096, rates=SurfaceRates(normals=0.0015), gradient_rings=2, times_light=2
-        ),
+        replace(FINE_MATERIALS, iterations=2400, rounds=12, points_a_step=4096),
         DetailSettings(most_samples=6_000_000, side=4096),
         mesh_surfels=MeshFitSettings(iterations=500),
         surfel_materials=MaterialSettings(iterations=500, samples=SampleCounts(96, 48, 48)),

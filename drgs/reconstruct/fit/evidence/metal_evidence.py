@@ -10,7 +10,7 @@ Gradients never decide this: a darker light and a diffuse part trade places with
 
 Errors of shape and light spoil the predicted mirror S_v, not the constant E, so they count against metal alone: real paint hardly ever says
 "metal", real metal says "paint" wherever its normals are off. So the benefit of the doubt is metal's, and each place hears its surroundings, as far as they are
-of its colour: matter of one kind seldom changes colour at once, and often does where another kind begins.
+of its colour, its hue above all: matter of one kind seldom changes colour at once, and often does where another kind begins.
 Where light turns with the camera, what arrives at paint changes from view to view as well, and is predicted nearly as badly: then there is less of it.
 And no metal is dark: what reflects less than a twelfth in its brightest channel is lacquer, however well a dark mirror explains it.
 
@@ -224,6 +224,7 @@ def _alike(sums: ViewSums, edges: MeshEdges) -> Float[Tensor, "edge"]:
     color, known = sums.color.clamp(min=1e-3).log(), sums.views >= FEWEST_VIEWS
     apart = color[start] - color[end]
     brighter = apart.mean(-1, keepdim=True)
+    # What the three channels share, and what is left: their squares add up to that of the difference.
     unlike = (apart - brighter).square().sum(-1) + BRIGHTNESS * 3 * brighter.square()[:, 0]
     step = unlike * (known[start] & known[end])
     return torch.exp(-step / SAME_COLOUR**2).clamp(min=STRANGERS)
