@@ -291,20 +291,28 @@ def sample_set(counts: SampleCounts, seed: int, samples_round: int = 0, by_mater
     return samples
 
 
-def sample_rays(points: ShadingPoints, environment_table: EnvironmentTable, counts: SampleCounts, seed: int, lift: float = 0.0) -> Rays:
+def sample_rays(
+    points: ShadingPoints,
+    environment_table: EnvironmentTable,
+    counts: SampleCounts,
+    seed: int,
+    lift: float = 0.0,
+    by_material: bool = False,
+) -> Rays:
     """Directions and weights for all points. Materials, normals and light enter as numbers: no gradient flows through
     the choice of directions, and none is needed for an unbiased gradient of the estimate.
 
     Args:
         environment_table: of the unturned environment (training has none turned).
         lift: origins stand this far off the points along the normal [world units].
+        by_material: each point shares its samples out by its material (split_at).
     """
     device = points.normal_world.device
     point_count = len(points.pixel)
     light = environment_light(environment_table)
     direction = torch.empty(point_count, counts.total, 3, device=device)
     weight = torch.empty(point_count, counts.total, device=device)
-    inputs = [point_arrays(points), light, sample_set(counts, seed)]
+    inputs = [point_arrays(points), light, sample_set(counts, seed, by_material=by_material)]
     outputs = [warp_array(direction.view(-1, 3), wp.vec3), warp_array(weight.view(-1))]
     launch(sample_directions, point_count * counts.total, inputs, outputs, warp_device(direction))
     return Rays((points.position_world + lift * points.normal_world).detach(), direction, weight)

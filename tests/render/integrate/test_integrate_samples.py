@@ -130,6 +130,25 @@ def test_a_metal_under_a_constant_sky_reflects_the_integral_of_its_brdf(roughnes
         assert float(radiance[k, 0]) == pytest.approx(2.0 * (0.6 * f1 + f2), rel=0.015)
 
 
+def test_rays_shared_out_by_material_keep_the_mean_gradient_of_metal_and_calm_it():
+    """What stage 2 asks of a place: all but a few of the rays that a mirror gets by an even split see what it does not mirror."""
+    points = points_seen_at([40.0], albedo=0.6, roughness=0.2, metallic=1.0, copies=8000)
+    sky = sunny_sky(height=32, sun=20.0)
+
+    def gradients_of_points(by_material: bool) -> list[torch.Tensor]:
+        rays = sample_rays(points, build_environment_table(sky), SampleCounts(32, 16, 16), seed=5, by_material=by_material)
+        leaves = {name: getattr(points, name).clone().requires_grad_(True) for name in NAMES}
+        open_sky, dark = torch.ones_like(rays.weight), torch.zeros_like(rays.direction_world)
+        radiance = integrate_samples(dataclasses.replace(points, **leaves), rays, open_sky, dark, sky.radiance)
+        return [gradient.view(len(points.pixel), -1) for gradient in torch.autograd.grad(radiance.sum(), list(leaves.values()))]
+
+    for name, even, shared in zip(NAMES, gradients_of_points(False), gradients_of_points(True), strict=True):
+        error = (even.var(0) / len(even) + shared.var(0) / len(shared)).sqrt()
+        assert bool(((even.mean(0) - shared.mean(0)).abs() < 4 * error + 1e-3 * even.mean(0).abs()).all()), name
+        if name != "metallic":
+            assert float(shared.std(0).norm()) < 0.8 * float(even.std(0).norm()), name
+
+
 def test_same_bits_whatever_the_number_of_threads(monkeypatch: pytest.MonkeyPatch):
     scene = various_scene(SampleCounts(8, 4, 4), copies=40)
     results = []

@@ -19,15 +19,19 @@ def points_as(points: ShadingPoints, dtype: torch.dtype | None = None, device: s
     return ShadingPoints(**{k: v.to(dtype) if dtype and v.is_floating_point() else v for k, v in fields.items()})
 
 
-@pytest.mark.parametrize("roughness", [0.2, 0.6, 1.0])
-def test_kernel_draws_what_the_reference_draws(device: str, roughness: float) -> None:
-    points = points_seen_at([5.0, 50.0, 85.0], roughness=roughness, copies=20)
+@pytest.mark.parametrize(("roughness", "metallic", "by_material"), [(0.2, 0.0, False), (0.6, 0.0, True), (1.0, 0.0, False), (0.2, 1.0, True)])
+def test_kernel_draws_what_the_reference_draws(device: str, roughness: float, metallic: float, by_material: bool) -> None:
+    points = points_seen_at([5.0, 50.0, 85.0], roughness=roughness, metallic=metallic, copies=20)
     counts = SampleCounts(16, 8, 8)
     environment = sunny_sky(sun=20.0)
     table = build_environment_table(Environment(environment.radiance.to(device)))
-    rays = sample_rays(points_as(points, device=device), table, counts, seed=3)
+    rays = sample_rays(points_as(points, device=device), table, counts, seed=3, by_material=by_material)
     twin = reference.sample_rays(
-        points_as(points, torch.float64), build_environment_table(Environment(environment.radiance.double())), counts, 3
+        points_as(points, torch.float64),
+        build_environment_table(Environment(environment.radiance.double())),
+        counts,
+        3,
+        by_material=by_material,
     )
     kept = (twin.weight > 0) & (rays.weight.cpu() > 0)
     assert float((kept == (twin.weight > 0)).float().mean()) > 0.995

@@ -58,7 +58,7 @@ class MeshMaterialSettings:
     """Homes hold floors whose height no normal tells: else they drift with every move."""
     points_a_step: int = 2048
     samples: SampleCounts = field(default_factory=lambda: SampleCounts(32, 16, 16))
-    """Rays a point in each of two sets: cosine, GGX, environment (the paper: 256, 128, 128 in one)."""
+    """Rays a point in each of two sets: cosine, GGX, environment (the paper: 256, 128, 128 in one); shared out anew by each point's material (split_at)."""
     rates: SurfaceRates = field(default_factory=lambda: SurfaceRates(normals=0.0007))
     normals_end: float = 0.00007
     """What the normals' rate has fallen to in the end: mirrors show its noise."""
@@ -248,7 +248,7 @@ def _radiance(
     )
     turned = in_light(points, turn)
     with torch.no_grad():
-        rays = sample_rays(turned, around.table, settings.samples, settings.seed * 1_000_003 + draw)
+        rays = sample_rays(turned, around.table, settings.samples, settings.seed * 1_000_003 + draw, by_material=True)
         transmittance, met = traced_light(tracer, around.light, points, tracer.face_normals[seen.face], in_world(rays, turn))
     return integrate_samples(turned, rays, transmittance, met, environment)
 
