@@ -56,9 +56,10 @@ class MeshMaterialSettings:
     """After each the surface follows its normals, but not after the last one."""
     moves: MoveSettings = field(default_factory=lambda: MoveSettings(IntegrationSettings(home=0.01), to_surface=0.5))
     """Homes hold floors whose height no normal tells: else they drift with every move."""
-    points_a_step: int = 2048
-    samples: SampleCounts = field(default_factory=lambda: SampleCounts(32, 16, 16))
-    """Rays a point in each of two sets: cosine, GGX, environment (the paper: 256, 128, 128 in one); shared out anew by each point's material (split_at)."""
+    points_a_step: int = 4096
+    samples: SampleCounts = field(default_factory=lambda: SampleCounts(4, 12, 16))
+    """Rays a point in each of two sets: cosine, GGX, environment (the paper: 256, 128, 128 in one); shared out anew by each point's material (split_at).
+    Pixels differ more than rays do: half as many rays at twice as many points find more (decisions/0003, "Many points, few rays")."""
     rates: SurfaceRates = field(default_factory=lambda: SurfaceRates(normals=0.0007))
     normals_end: float = 0.00007
     """What the normals' rate has fallen to in the end: mirrors show its noise."""
