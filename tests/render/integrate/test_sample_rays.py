@@ -19,7 +19,9 @@ def points_as(points: ShadingPoints, dtype: torch.dtype | None = None, device: s
     return ShadingPoints(**{k: v.to(dtype) if dtype and v.is_floating_point() else v for k, v in fields.items()})
 
 
-@pytest.mark.parametrize(("roughness", "metallic", "by_material"), [(0.2, 0.0, False), (0.6, 0.0, True), (1.0, 0.0, False), (0.2, 1.0, True)])
+@pytest.mark.parametrize(
+    ("roughness", "metallic", "by_material"), [(0.2, 0.0, False), (0.6, 0.0, True), (1.0, 0.0, False), (0.2, 1.0, True)]
+)
 def test_kernel_draws_what_the_reference_draws(device: str, roughness: float, metallic: float, by_material: bool) -> None:
     points = points_seen_at([5.0, 50.0, 85.0], roughness=roughness, metallic=metallic, copies=20)
     counts = SampleCounts(16, 8, 8)
