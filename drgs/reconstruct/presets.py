@@ -92,6 +92,7 @@ PRESETS = {
             mesh=replace(PASS_MESH, resolution=320, face_limit=200_000),
             cameras_after=(2, 4, 6),
             try_after=(2,),
+            displacement_steps=600,
             division=DivisionSettings(most_faces=400_000),
         ),
         replace(FINE_MATERIALS, iterations=2400, rounds=12, points_a_step=8192),

@@ -319,7 +319,9 @@ def surface_stage(
 
 
 def _pass_of(fit: SurfaceFit, settings: PassSettings) -> str:
-    return f"pass {fit.index + 1} of {settings.passes}" if fit.index < settings.passes else "relief"
+    if fit.index < settings.passes:
+        return f"pass {fit.index + 1} of {settings.passes}"
+    return "displacement" if fit.index < settings.relief_index else "relief"
 
 
 def mesh_materials_stage(place: Workplace, views: Views, surface: SurfaceFit, radius: float, settings: MeshMaterialSettings) -> SurfaceFit:

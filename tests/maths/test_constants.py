@@ -65,6 +65,8 @@ OTHERS = {
     ("drgs/reconstruct/capture/sharpen_masks.py", 0.99): "a share of pixels",
     ("drgs/reconstruct/fit/evidence/light_from_paint.py", 0.99): "a share of places",
     ("drgs/reconstruct/capture/hull_rays.py", 0.99): "the coverage of a pixel that the object fills",
+    ("drgs/reconstruct/fit/surface/displaced_surface.py", 0.99): "a decay rate of Adam",
+    ("drgs/reconstruct/fit/surface/surface_passes.py", 0.04): "a weight of bending",
     ("drgs/reconstruct/fit/surface/try_depths.py", 0.055): "a depth that is tried",
     ("drgs/reconstruct/capture/radiance_grid.py", 0.99): "a decay rate of Adam",
     ("drgs/reconstruct/fit/surfel_parameters.py", 0.04): "a learning rate",

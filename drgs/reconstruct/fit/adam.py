@@ -14,7 +14,8 @@ class Adam:
     """Steps parameters that have gradients.
 
     Args:
-        groups: records with "params" (float32 leaves, all on one device) and "lr" (rate); whatever else they hold is kept.
+        groups: records with "params" (float32 leaves, all on one device) and "lr" (rate), and "betas" and "eps" of their own where they have them;
+            whatever else they hold is kept.
         betas: how much of the running means of gradients and of their squares a step keeps. eps: is added to the root of the latter.
     """
 
@@ -31,6 +32,7 @@ class Adam:
             moved = [value for value in group["params"] if value.grad is not None]
             if not moved:
                 continue
+            betas = group.get("betas", self._betas)
             states = [self.state.setdefault(value, {}) or self._begun(value) for value in moved]
             steps = [state["step"] for state in states]
             torch._foreach_add_(steps, 1)
@@ -42,10 +44,10 @@ class Adam:
                 [],
                 steps,
                 lr=group["lr"],
-                beta1=self._betas[0],
-                beta2=self._betas[1],
+                beta1=betas[0],
+                beta2=betas[1],
                 weight_decay=0.0,
-                eps=self._eps,
+                eps=group.get("eps", self._eps),
                 amsgrad=False,
                 maximize=False,
             )

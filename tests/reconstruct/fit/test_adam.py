@@ -35,6 +35,21 @@ def test_steps_are_those_of_torch_to_the_last_bit() -> None:
     assert ours["still"] not in adam.state and ours["a"].grad is None
 
 
+def test_a_group_may_have_its_own_running_means_and_floor() -> None:
+    ours, theirs = values(), values()
+    own = {"betas": (0.8, 0.95), "eps": 0.1}
+    ours_groups, theirs_groups = groups(ours), groups(theirs)
+    ours_groups[1] |= own
+    theirs_groups[1] |= own
+    adam, torchs = Adam(ours_groups, eps=1e-15), torch.optim.Adam(theirs_groups, eps=1e-15, fused=True)
+    for number in range(5):
+        for optimizer, parameters in ((adam, ours), (torchs, theirs)):
+            (parameters["a"].sin().sum() + (parameters["b"] ** 2).sum() * number).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+    assert all(ours[name].equal(theirs[name]) for name in ours)
+
+
 def test_a_step_does_not_load_torch_s_compiler() -> None:
     code = (
         "import sys, torch; from drgs.reconstruct.fit.adam import Adam; value = torch.ones(3, requires_grad=True); "

@@ -25,6 +25,7 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves
+from drgs.reconstruct.fit.surface.displaced_surface import DisplacedSurface, weights_where_seen
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.prior_terms import prior_terms
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places, steep_enough
@@ -51,6 +52,8 @@ class SurfaceRates:
     environment: float = 0.02
     vertices: float = 0.0
     """Moved by the solve alone."""
+    offsets: float = 0.0
+    """[mean edges] Of a DisplacedSurface."""
     homeward: float = 0.0
     """From each vertex to where the surface began, or was moved by a trial."""
     to_texture: float = 0.0
@@ -102,6 +105,10 @@ class SurfaceSettings:
     photographs_a_step: int = 4
     """Of which each gives one in so many of its pixels. What one photograph gets wrong (its light, its shadows) it gets wrong over whole surfaces, and
     turns their normals together; what pixels of several get wrong evens out (decisions/0003, "Several photographs a step")."""
+    displaces: bool = False
+    """Positions follow what pixels show, and normals them (displaced_surface); outlines and the normals' integral wait for the next move."""
+    settle_every: int = 20
+    """Steps after which rays are traced against the surface as it was displaced."""
     seed: int = 0
 
     @property
@@ -126,6 +133,7 @@ def start_surface(
         "texture_weight": torch.zeros_like(mesh.roughness),
         "open_share": torch.ones_like(mesh.vertices),
         "metal": torch.zeros_like(mesh.roughness),
+        "offsets": torch.zeros_like(mesh.roughness),
     } | light_parameters(stage_one)
     values = leaves(parameters, frozen=NOT_FITTED)
     return FitState(values, make_optimizer(values, settings.rates, radius), torch.Generator().manual_seed(settings.seed + 2))
@@ -153,7 +161,7 @@ def fit_surface(
         # Of these settings, not of those that the optimizer was made with: each pass has its own.
         return {group["name"]: rate_of_group(group["name"], settings.rates) * share for group in state.optimizer.param_groups}
 
-    fit = FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, after_step=steps.end_round)
+    fit = FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, steps.hold_steps, steps.end_round)
     return run_fit(fit, report, should_stop)
 
 
@@ -166,10 +174,22 @@ class _Steps:
         self.state, self.settings, self.faces = state, settings, faces
         self.targets = view_targets(views, 1.0, faces.device)
         self.surface = MovingSurface(views, faces, state, same_place)
+        self.displaced = DisplacedSurface(self.surface, state, settings.moves.box) if settings.displaces else None
         # What photographs say of light that turns (light_from_turns) they say by normals, which a move has returned to the surface's own.
         self._light_at = settings.iterations // 2 if self.surface.light_turns else 0
 
+    def hold_steps(self, _: StepLoss) -> None:
+        """Between gradients and the step by them."""
+        if self.displaced is not None:
+            self.displaced.hold_steps(self.state.optimizer)
+
     def end_round(self, done: int) -> None:
+        if self.displaced is not None:
+            if done % self.settings.settle_every == 0 or done == self.settings.iterations:
+                self.displaced.settle()
+            if done == self.settings.iterations:
+                self.surface.relight(self.settings.moves.share_rays)
+            return
         if not self.settings.still and done % self.settings.steps_a_round == 0:
             self.move_surface(self.settings.light_at_end or done < self.settings.iterations)
 
@@ -180,7 +200,7 @@ class _Steps:
             self.surface.look_for_metal(self.targets, self.settings.moves)
 
     def step(self, iteration: int) -> StepLoss:
-        if iteration == 0 and not self.settings.still:
+        if iteration == 0 and not self.settings.still and not self.settings.displaces:
             self.surface.look_for_texture(self.settings.moves)
             self.move_surface()
         if self.settings.looks_for_light and not self.settings.still and iteration == self._light_at:
@@ -190,9 +210,13 @@ class _Steps:
         targets = [self.targets[number] for number in drawn]
         parameters = self.state.parameters
         environment = environment_table(parameters)
-        surface = packed_surface(parameters)
+        positions, shown = None, parameters
+        if self.displaced is not None:
+            positions = self.displaced.positions()
+            shown = parameters | {"normals": self.displaced.normals(positions)}
+        surface = packed_surface(shown)
         terms: dict[str, Tensor] = {}
-        shaded, squared_error = self._shaded(targets, environment, surface)
+        shaded, squared_error = self._shaded(targets, environment, surface, positions)
         if squared_error is not None:
             terms["shaded"] = shaded
         settings, progress = self.settings, iteration / self.settings.iterations
@@ -204,9 +228,15 @@ class _Steps:
         )  # fmt: skip
         return StepLoss(terms, targets[0].camera, squared_error)
 
-    def _shaded(self, targets: list[ViewTarget], environment: Tensor, surface: Tensor) -> tuple[Tensor, float | None]:
+    def _shaded(
+        self, targets: list[ViewTarget], environment: Tensor, surface: Tensor, positions: Tensor | None
+    ) -> tuple[Tensor, float | None]:
         """The mean error of pixels that masks and mesh fill, in display space, by two estimates of their colours, and the squared one of the
-        first; None where there is no such pixel."""
+        first; None where there is no such pixel.
+
+        Args:
+            surface: of packed_surface. positions: of the displaced surface; None: it lies where the tracer's does.
+        """
         tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
         tables = filter_environment(environment)
         light_of = self.surface.light_of(tables)
@@ -221,7 +251,8 @@ class _Steps:
             errors, others = zip(*parts, strict=True)
             return torch.stack(errors).sum(), torch.stack(others).sum(0)
 
-        total, (squared, count) = cost_in_slices(len(targets), (tables, surface), cost, self.state.generator)
+        leaves = (tables, surface) if positions is None else (tables, surface, positions)
+        total, (squared, count) = cost_in_slices(len(targets), leaves, cost, self.state.generator)
         return (total / count, float(squared / count)) if count else (total, None)
 
     def _some_pixels(self, target: ViewTarget, several: int) -> Tensor:
@@ -241,14 +272,17 @@ def _cost_of_pixels(
     """Of the `pixels` (flat) the error, summed; the squared one and the number of channels that were compared.
 
     Args:
-        leaves: the light's tables and packed_surface.
+        leaves: the light's tables, packed_surface and, of a displaced surface, positions.
     """
-    tables, surface = leaves
+    tables, surface, *positions = leaves
     normals, light = surface.detach()[:, :3].contiguous(), replace(light, tables=tables)
     twice = seen_twice(target, pixels, tracer, generator)
     steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
-    halves = [shade_places(seen[steep], target, tracer, surface, light, generator) for seen in twice]
-    photo = target.saturation.reshape(-1, 3)[twice[0].pixels[steep]]
+    compared = [seen[steep] for seen in twice]
+    if positions:
+        compared = [replace(seen, weights=weights_where_seen(seen, tracer.mesh.vertices, positions[0])) for seen in compared]
+    halves = [shade_places(seen, target, tracer, surface, light, generator) for seen in compared]
+    photo = target.saturation.reshape(-1, 3)[compared[0].pixels]
     count = photo.numel()
     error = crossed_halves(halves[0], halves[1], photo) * count if count else tables.sum() * 0
     return error, torch.stack([(halves[0].detach().clamp(0, 1) - photo).square().sum(), tables.new_tensor(count)])

@@ -100,6 +100,11 @@ class MovingSurface:
         return tracer
 
     @torch.no_grad()
+    def follow(self) -> None:
+        """The tracer lies where the state's vertices do now; what light arrives stays what it was."""
+        self.tracer, self._around = self._tracer(), None
+
+    @torch.no_grad()
     def move(self, settings: MoveSettings, relight: bool = True) -> None:
         """Positions from normals and outlines, then light that the moved surface blocks and sends back.
 
@@ -120,7 +125,7 @@ class MovingSurface:
             for place in (homeward, parameters["to_texture"]):
                 place += vertices - moved
             vertices.copy_(moved)
-            self.tracer, self._around = self._tracer(), None
+            self.follow()
         own = vertex_normals(parameters["vertices"], self.faces)
         back = (1 - settings.to_surface) * normals + settings.to_surface * own
         parameters["normals"].copy_(torch.nn.functional.normalize(back, dim=-1))

@@ -117,6 +117,13 @@ def shade_places(
     """
     known = MeshLight(light.tables.detach(), light.open_share, light.light_from_world)
     with torch.no_grad():
-        transmittance, met = mirrored_light(tracer, seen.face, seen.weights, seen.wo, known, generator)
+        transmittance, met = mirrored_light(tracer, seen.face, seen.weights.detach(), seen.wo, known, generator)
     photo = target.saturation.reshape(-1, 3)[seen.pixels]
-    return surface_color(seen.corners, seen.weights, seen.wo, transmittance, met, photo, target.ceiling, surface, light)
+    corners, weights = seen.corners, seen.weights
+    if weights.requires_grad:
+        # The kernel has no slope by weights: it gets what lies at each place, as that place's own vertex.
+        surface, open_share = at_corners(surface, corners, weights), at_corners(light.open_share, corners, weights)
+        light = MeshLight(light.tables, open_share, light.light_from_world)
+        corners = torch.arange(len(weights), device=weights.device)[:, None].expand(-1, 3).contiguous()
+        weights = torch.eye(3, device=weights.device)[0].expand(len(corners), 3).contiguous()
+    return surface_color(corners, weights, seen.wo, transmittance, met, photo, target.ceiling, surface, light)

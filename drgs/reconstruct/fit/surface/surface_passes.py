@@ -2,8 +2,8 @@
 
 Between two passes the surface is sampled and meshed anew (remesh), and what its vertices carried is interpolated. Without it triangles fold
 where a hollow deepens, and a fold is a dent that no later solve removes: still_life, fast, 7 passes instead of 6 rounds, 28.1 -> 29.2 dB,
-mean distance of the mesh 1.53 -> 1.15 % of the radius (docs/decisions/0003-fitting.md). After the last one faces are divided as finely as
-photographs show, and their normals and materials get some more steps.
+mean distance of the mesh 1.53 -> 1.15 % of the radius (docs/decisions/0003-fitting.md). After the last one positions follow what pixels show
+(displaced_surface); then faces are divided as finely as photographs show, and their normals and materials get some more steps.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from drgs.reconstruct.fit.evidence.register_cameras import register_cameras, see
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
-from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings, fit_surface
+from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates, SurfaceSettings, fit_surface
 from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.shade_surface import packed_surface
 from drgs.reconstruct.fit.surface.try_depths import TrialSettings, try_depths
@@ -38,6 +38,10 @@ PASS_MESH = MeshSettings(resolution=200, face_limit=60_000, smoothing_passes=0, 
 KINDS_AFTER = 1
 """Pass, counted from 1, after which the fit begins once more as metal and as paint where light turns with the camera: normals are known a little, and no
 pass but the first was led by what one light said."""
+DISPLACEMENT_RATES = SurfaceRates(
+    normals=0.0, albedo_logits=0.01, roughness_logits=0.01, metallic_logits=0.01, environment=0.005, offsets=0.03
+)
+"""Materials and light follow a surface that moves less than it did in the passes."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,11 @@ class PassSettings:
     light_before: tuple[int, ...] = (2, 3, 4, 5)
     """Passes, counted from 1, before which light is looked for that makes paint alike on all sides (half-way through which, where it turns with the camera).
     Not before all of many: each time light gets rougher."""
+    displacement_steps: int = 0
+    """After the last pass, in which positions follow what pixels show, and normals them (displaced_surface)."""
+    displacement_rates: SurfaceRates = field(default_factory=lambda: DISPLACEMENT_RATES)
+    weight_bend_displaced: float = 0.04
+    """SurfaceSettings.weight_bend in those steps: it holds positions, too."""
     division: DivisionSettings = field(default_factory=DivisionSettings)
     """How fine faces are divided after the last pass."""
     relief_steps: int = 70
@@ -72,6 +81,11 @@ class PassSettings:
         rates = replace(given.rates, normals=given.rates.normals * share)
         return replace(self, passes=passes, surface=replace(given, rates=rates, normals_end=given.normals_end * share))
 
+    @property
+    def relief_index(self) -> int:
+        """Of the steps on divided faces, where passes and displacement count as 0, 1, ..."""
+        return self.passes + (self.displacement_steps > 0)
+
 
 @dataclass(eq=False)
 class SurfaceFit:
@@ -82,9 +96,9 @@ class SurfaceFit:
     faces: Int[Tensor, "face 3"]
     """Of the state's vertices."""
     index: int = 0
-    """Of the pass under way."""
+    """Of the pass under way; the number of passes: the displacement after them, where there is one; PassSettings.relief_index: the relief."""
     divided: int = 0
-    """How often each face was divided, after the passes; the index is then their number."""
+    """How often each face was divided, after the passes."""
     camera_from_world: Float64[Tensor, "view 4 4"] | None = None
     """As cameras were moved; None: they are where the views have them."""
     cameras_asked: int = 0
@@ -132,6 +146,24 @@ def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
     )
 
 
+def settings_of_displacement(settings: PassSettings) -> SurfaceSettings:
+    """Of the steps in which positions follow what pixels show: they go on where the last pass ended, with rates that fall from the first."""
+    last = settings_of_pass(settings, settings.passes - 1)
+    return replace(
+        last,
+        rounds=1,
+        steps_a_round=settings.displacement_steps,
+        rates=settings.displacement_rates,
+        fall_from=0.0,
+        weight_bend=settings.weight_bend_displaced,
+        weight_bend_end=settings.weight_bend_displaced,
+        weight_smooth=last.weight_smooth_end,
+        looks_for_light=False,
+        displaces=True,
+        seed=last.seed + 1,
+    )
+
+
 def settings_of_relief(settings: PassSettings) -> SurfaceSettings:
     """Of the steps on divided faces: they go on where the last pass ended."""
     last = settings_of_pass(settings, settings.passes - 1)
@@ -142,7 +174,7 @@ def settings_of_relief(settings: PassSettings) -> SurfaceSettings:
         weight_bend=last.weight_bend_end,
         weight_smooth=last.weight_smooth_end,
         still=True,
-        seed=last.seed + 1,
+        seed=last.seed + 2,
     )
 
 
@@ -226,6 +258,12 @@ def start_next_pass(fit: SurfaceFit, settings: PassSettings, radius: float) -> N
     _start_pass(fit, values, own, radius)
 
 
+def start_displacement(fit: SurfaceFit, settings: PassSettings, radius: float) -> None:
+    """Start the steps in which positions follow what pixels show, on the faces of the last pass."""
+    values = {name: value.detach() for name, value in fit.state.parameters.items()}
+    _start_pass(fit, values, settings_of_displacement(settings), radius)
+
+
 def start_relief(fit: SurfaceFit, times: int, settings: PassSettings, radius: float) -> None:
     """Divide each face `times` times into four and start the steps on them: relief and paint that are finer than the faces of the passes are in the
     photographs, and the surface's shape need not be solved for them."""
@@ -262,7 +300,8 @@ def fit_surface_in_passes(
     between = [(after, settings.trials.iterations) for after in settings.try_after]
     turns = views.light_from_world is not None and settings.passes > KINDS_AFTER
     between += [(KINDS_AFTER, iterations_of_kinds(settings_of_pass(settings, KINDS_AFTER)))] if turns else []
-    total = settings.passes * steps + sum(more for _, more in between) + settings.relief_steps * (settings.division.most_faces > 0)
+    total = settings.passes * steps + sum(more for _, more in between) + settings.displacement_steps
+    total += settings.relief_steps * (settings.division.most_faces > 0)
 
     def tell(done: int, r: FitReport) -> None:
         if report is not None:
@@ -277,10 +316,6 @@ def fit_surface_in_passes(
         if fit.state.iteration < steps:
             return False
         if number == settings.passes:
-            times = divisions(fit.mesh, views.cameras, settings.division) if settings.relief_steps else 0
-            if not times:
-                return True
-            start_relief(fit, times, settings, radius)
             break
         if number in settings.cameras_after and fit.cameras_asked < number:
             fit.doing = "looking whether cameras are right"
@@ -293,6 +328,18 @@ def fit_surface_in_passes(
         ):
             return False
         start_next_pass(fit, settings, radius)
-    relief = settings_of_relief(settings)
+    relief, displacement = settings_of_relief(settings), settings_of_displacement(settings)
+    if fit.index < settings.relief_index and settings.displacement_steps:
+        if fit.index < settings.passes:
+            start_displacement(fit, settings, radius)
+        done = total - displacement.iterations - relief.iterations * (settings.division.most_faces > 0)
+        fit_surface(views, fit.mesh, fit.state, displacement, partial(tell, done), should_stop)
+        if fit.state.iteration < displacement.iterations:
+            return False
+    if fit.index < settings.relief_index:
+        times = divisions(fit.mesh, views.cameras, settings.division) if settings.relief_steps else 0
+        if not times:
+            return True
+        start_relief(fit, times, settings, radius)
     fit_surface(views, fit.mesh, fit.state, relief, partial(tell, total - relief.iterations), should_stop)
     return fit.state.iteration >= relief.iterations

@@ -11,7 +11,7 @@ import drgs.reconstruct.fit.surface.fit_surface as fit_surface_module
 from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
-from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings, fit_surface, start_surface
+from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings, fit_surface, start_surface
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, seen_twice
 from drgs.reconstruct.fit.view_targets import ViewTarget
@@ -124,3 +124,45 @@ def test_light_is_looked_for_by_paint_before_the_first_step_or_half_way_where_it
     monkeypatch.setattr(MovingSurface, "look_for_light", lambda surface, targets, moves: asked.append(state.iteration))
     fitted(with_light_of_camera(views) if turns else views, settings, state=state)
     assert asked == expected
+
+
+@pytest.mark.slow
+def test_a_dent_is_moved_back_by_what_pixels_show(views: Views):
+    """Of paint that is known already, under even light, which shades nothing: what tells of the dent is where pixels see the paint's pattern."""
+    rates = SurfaceRates(normals=0.0, albedo_logits=0.0, roughness_logits=0.0, metallic_logits=0.0, environment=0.0, offsets=0.1)
+    settings = short(
+        rounds=1, steps_a_round=60, settle_every=10, displaces=True, fall_from=0.0, rates=rates, weight_bend=0.003, weight_bend_end=0.003
+    )
+    sphere = placed_sphere()
+    outward = (sphere.vertices - CENTER) / SPHERE_RADIUS
+    dent = 0.08 * SPHERE_RADIUS * torch.exp(-8 * (1 - outward @ torch.tensor([0.8, 0.0, 0.6])))
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    painting = short(rounds=1, steps_a_round=40, still=True, rates=SurfaceRates(normals=0.0, albedo_logits=0.1))
+    depths = []
+    for share in (0.0, 1.0):
+        state = start_surface(surfels, sphere, grey_light(), settings, SPHERE_RADIUS)
+        fit_surface(views, sphere, state, painting)
+        with torch.no_grad():
+            state.parameters["vertices"] -= share * dent[:, None] * outward
+        state.iteration = 0
+        fit_surface(views, sphere, state, settings)
+        assert not state.parameters["offsets"].any()
+        depths.append(SPHERE_RADIUS - (state.parameters["vertices"] - CENTER).norm(dim=1))
+    deep = dent > 0.5 * float(dent.max())
+    assert float((depths[1] - depths[0])[deep].abs().mean()) < 0.5 * float(dent[deep].mean())
+
+
+@pytest.mark.slow
+def test_a_displacement_resumed_between_two_settlings_ends_with_the_same_numbers(views: Views, tmp_path: Path):
+    settings = short(rounds=1, steps_a_round=7, settle_every=3, displaces=True, rates=SurfaceRates(normals=0.0, offsets=0.02))
+    whole, _ = fitted(views, settings)
+    assert not torch.equal(whole.parameters["vertices"], placed_sphere(SHRUNK).vertices)
+    stopped, _ = fitted(views, settings, stop_at=5)
+    assert stopped.iteration == 5 and stopped.parameters["offsets"].any()
+    write_tensors(tmp_path / "x", fit_tensors(stopped), {})
+    resumed = started(settings)
+    restore_fit(read_tensors(tmp_path / "x", torch.device("cpu"))[0], resumed)
+    fitted(views, settings, state=resumed)
+    assert resumed.iteration == 7
+    for name, value in whole.parameters.items():
+        assert torch.equal(resumed.parameters[name], value), name

@@ -1,10 +1,14 @@
 """What pixels show of a surface: two places each, apart within the pixel; and what is finer than a pixel stays as it is."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from drgs.reconstruct.fit.light.mesh_light import MeshLight
+from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves
-from drgs.reconstruct.fit.surface.shade_surface import SeenPlaces, seen_places, seen_twice, steep_enough
+from drgs.reconstruct.fit.surface.shade_surface import SeenPlaces, seen_places, seen_twice, shade_places, steep_enough
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
@@ -80,3 +84,36 @@ def test_what_is_finer_than_a_pixel_is_not_flattened(target: ViewTarget):
 
     assert mean_gradient((0, 0)) > 0.3
     assert abs(mean_gradient((0, 1))) < 0.1
+
+
+def test_colours_change_with_the_place_as_differences_say(target: ViewTarget, tracer: AbstractTracer):
+    """Weights that want a gradient get that of the colour's change along the face, and leave the colour what it is."""
+    generator = torch.Generator().manual_seed(3)
+    count = len(tracer.mesh.vertices)
+    outward = torch.nn.functional.normalize(tracer.mesh.vertices - tracer.mesh.vertices.mean(0), dim=-1)
+    packed = torch.cat([outward, 0.4 + 0.5 * torch.rand(count, 4, generator=generator), torch.zeros(count, 1)], 1)
+    around = torch.linspace(0, 2 * torch.pi, 257)[:-1].expand(128, 256)
+    smooth = 1 + 0.6 * torch.stack([around.cos(), around.sin(), (2 * around).cos()], -1)
+    light = MeshLight(filter_environment(smooth), torch.full((count, 3), 0.8))
+    seen = seen_places(target, solid(target)[::7], tracer)
+
+    def colors(weights: torch.Tensor, surface: torch.Tensor) -> torch.Tensor:
+        moved = replace(seen, weights=weights)
+        return shade_places(moved, target, tracer, surface, light, torch.Generator().manual_seed(4))
+
+    wanted, surface = seen.weights.clone().requires_grad_(), packed.clone().requires_grad_()
+    known = packed.clone().requires_grad_()
+    by_place, by_kernel = colors(wanted, surface), colors(seen.weights, known)
+    assert torch.allclose(by_place, by_kernel, atol=1e-5)
+    factor = torch.rand(by_place.shape, generator=generator)
+    (by_place * factor).sum().backward()
+    (by_kernel * factor).sum().backward()
+    assert surface.grad is not None and known.grad is not None and wanted.grad is not None
+    assert torch.allclose(surface.grad, known.grad, rtol=1e-3, atol=1e-4)
+    step = 2e-3 * torch.tensor([1.0, -1.0, 0.0])
+    with torch.no_grad():
+        difference = ((colors(seen.weights + step, packed) - colors(seen.weights - step, packed)) * factor).sum(1)
+    slope = 2 * (wanted.grad * step).sum(1)
+    assert float(difference.abs().mean()) > 1e-4
+    # what blocks light, and where, is taken as known: here it is the same everywhere
+    assert float((difference - slope).abs().mean()) < 0.01 * float(difference.abs().mean())

@@ -15,7 +15,9 @@ from drgs.reconstruct.fit.surface.surface_passes import (
     PassSettings,
     SurfaceFit,
     fit_surface_in_passes,
+    settings_of_displacement,
     settings_of_pass,
+    settings_of_relief,
     start_next_pass,
 )
 from drgs.reconstruct.fit.surface.try_depths import TriedDepths
@@ -247,3 +249,41 @@ def test_a_surface_that_cannot_be_meshed_anew_stays_as_it_was_and_the_user_is_to
     assert fit.remark == (
         "after pass 1 the mesh before was kept, for the mesh of 8 faces encloses nothing at 40 cells; expected a closed surface"
     )
+
+
+@pytest.mark.slow
+def test_after_the_passes_the_surface_is_displaced_before_its_faces_are_divided(tmp_path):
+    settings = replace(
+        SHORT,
+        passes=1,
+        displacement_steps=3,
+        division=DivisionSettings(edge_pixels=1.0, most_faces=5120),
+        relief_steps=2,
+    )
+    surfels = surfel_sphere(600, radius=SPHERE_RADIUS, center=tuple(CENTER.tolist()))
+    start, views, told = placed_sphere(), painted_views(tmp_path), []
+
+    def begun() -> SurfaceFit:
+        return SurfaceFit(start_surface(surfels, start, grey_light(), settings.surface, SPHERE_RADIUS), start.faces)
+
+    fit, at_once = begun(), begun()
+    assert not fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, should_stop=lambda: (fit.index, fit.state.iteration) == (1, 2))
+    assert (fit.index, fit.divided, fit.state.iteration) == (1, 0, 2) and fit.state.parameters["offsets"].any()
+    assert fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, lambda r: told.append((r.iteration, r.iterations)))
+    assert (fit.index, fit.divided) == (2, 1) and told == [(5, 7), (6, 7), (7, 7)]
+    assert fit_surface_in_passes(views, at_once, settings, SPHERE_RADIUS)
+    for name, value in at_once.state.parameters.items():
+        assert torch.equal(fit.state.parameters[name], value), name
+    # Done, it is not done again.
+    assert fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS) and (fit.index, fit.divided) == (2, 1)
+
+
+def test_a_displacement_goes_on_with_the_last_passes_weights_and_without_looking_for_light():
+    settings = PassSettings(3, displacement_steps=5, light_before=(3,))
+    last, displaced = settings_of_pass(settings, 2), settings_of_displacement(settings)
+    assert last.looks_for_light and not displaced.looks_for_light
+    assert displaced.displaces and displaced.iterations == 5 and displaced.fall_from == 0
+    assert displaced.weight_smooth == displaced.weight_smooth_end == last.weight_smooth_end
+    assert displaced.rates.offsets > 0 and displaced.rates.normals == 0
+    assert len({last.seed, displaced.seed, settings_of_relief(settings).seed}) == 3
+    assert (settings.relief_index, replace(settings, displacement_steps=0).relief_index) == (4, 3)
