@@ -65,7 +65,7 @@ class DisplacedSurface:
         return torch.nn.functional.normalize(normals + own - self._own, dim=-1)
 
     @torch.no_grad()
-    def hold_steps(self, optimizer: Adam) -> None:
+    def damp_steps(self, optimizer: Adam) -> None:
         """Between gradients and the step by them: what few pixels see would else go as far as what many do, by noise."""
         group = next(group for group in optimizer.param_groups if group["name"] == "offsets")
         group["betas"] = OFFSET_BETAS

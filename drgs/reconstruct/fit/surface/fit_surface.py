@@ -161,7 +161,7 @@ def fit_surface(
         # Of these settings, not of those that the optimizer was made with: each pass has its own.
         return {group["name"]: rate_of_group(group["name"], settings.rates) * share for group in state.optimizer.param_groups}
 
-    fit = FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, steps.hold_steps, steps.end_round)
+    fit = FitLoop(state, settings.iterations, len(views.cameras), steps.step, rates, steps.damp_steps, steps.end_round)
     return run_fit(fit, report, should_stop)
 
 
@@ -178,10 +178,10 @@ class _Steps:
         # What photographs say of light that turns (light_from_turns) they say by normals, which a move has returned to the surface's own.
         self._light_at = settings.iterations // 2 if self.surface.light_turns else 0
 
-    def hold_steps(self, _: StepLoss) -> None:
+    def damp_steps(self, _: StepLoss) -> None:
         """Between gradients and the step by them."""
         if self.displaced is not None:
-            self.displaced.hold_steps(self.state.optimizer)
+            self.displaced.damp_steps(self.state.optimizer)
 
     def end_round(self, done: int) -> None:
         if self.displaced is not None:

@@ -147,34 +147,33 @@ def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
 
 
 def settings_of_displacement(settings: PassSettings) -> SurfaceSettings:
-    """Of the steps in which positions follow what pixels show: they go on where the last pass ended, with rates that fall from the first."""
-    last = settings_of_pass(settings, settings.passes - 1)
+    """Of the steps in which positions follow what pixels show: rates fall from the first."""
     return replace(
-        last,
-        rounds=1,
-        steps_a_round=settings.displacement_steps,
+        _settings_after_passes(settings, settings.passes, settings.displacement_steps),
         rates=settings.displacement_rates,
         fall_from=0.0,
         weight_bend=settings.weight_bend_displaced,
         weight_bend_end=settings.weight_bend_displaced,
-        weight_smooth=last.weight_smooth_end,
         looks_for_light=False,
         displaces=True,
-        seed=last.seed + 1,
     )
 
 
 def settings_of_relief(settings: PassSettings) -> SurfaceSettings:
-    """Of the steps on divided faces: they go on where the last pass ended."""
+    """Of the steps on divided faces."""
+    return replace(_settings_after_passes(settings, settings.relief_index, settings.relief_steps), still=True)
+
+
+def _settings_after_passes(settings: PassSettings, index: int, steps: int) -> SurfaceSettings:
+    """They go on where the last pass ended."""
     last = settings_of_pass(settings, settings.passes - 1)
     return replace(
         last,
         rounds=1,
-        steps_a_round=settings.relief_steps,
+        steps_a_round=steps,
         weight_bend=last.weight_bend_end,
         weight_smooth=last.weight_smooth_end,
-        still=True,
-        seed=last.seed + 2,
+        seed=settings.surface.seed + index,
     )
 
 

@@ -66,17 +66,25 @@ def test_the_same_seed_gives_the_same_bits(views: Views):
     assert not torch.equal(results[0]["albedo_logits"], other["albedo_logits"])
 
 
+DISPLACES = {"rounds": 1, "steps_a_round": 6, "settle_every": 3, "displaces": True, "rates": SurfaceRates(normals=0.0, offsets=0.02)}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("stop_at", [2, 3])
-def test_a_fit_resumed_inside_a_round_or_between_two_ends_with_the_same_numbers(views: Views, tmp_path: Path, stop_at: int):
-    settings = short()
-    whole, _ = fitted(views, settings)
-    stopped, _ = fitted(views, settings, stop_at)
+@pytest.mark.parametrize("turns", [False, True])
+@pytest.mark.parametrize(("changes", "stop_at"), [({}, 2), ({}, 3), (DISPLACES, 2), (DISPLACES, 3)])
+def test_a_fit_resumed_inside_a_round_or_between_two_ends_with_the_same_numbers(
+    views: Views, tmp_path: Path, changes: dict, stop_at: int, turns: bool
+):
+    settings, seen = short(**changes), with_light_of_camera(views) if turns else views
+    whole, _ = fitted(seen, settings)
+    assert not torch.equal(whole.parameters["vertices"], placed_sphere(SHRUNK).vertices) and not whole.parameters["offsets"].any()
+    stopped, _ = fitted(seen, settings, stop_at)
     assert stopped.iteration == stop_at
+    assert bool(stopped.parameters["offsets"].any()) == (settings.displaces and stop_at % settings.settle_every > 0)
     write_tensors(tmp_path / "x", fit_tensors(stopped), {})
     resumed = started(settings)
     restore_fit(read_tensors(tmp_path / "x", torch.device("cpu"))[0], resumed)
-    fitted(views, settings, state=resumed)
+    fitted(seen, settings, state=resumed)
     assert resumed.iteration == 6
     for name, value in whole.parameters.items():
         assert torch.equal(resumed.parameters[name], value), name
@@ -150,19 +158,3 @@ def test_a_dent_is_moved_back_by_what_pixels_show(views: Views):
         depths.append(SPHERE_RADIUS - (state.parameters["vertices"] - CENTER).norm(dim=1))
     deep = dent > 0.5 * float(dent.max())
     assert float((depths[1] - depths[0])[deep].abs().mean()) < 0.5 * float(dent[deep].mean())
-
-
-@pytest.mark.slow
-def test_a_displacement_resumed_between_two_settlings_ends_with_the_same_numbers(views: Views, tmp_path: Path):
-    settings = short(rounds=1, steps_a_round=7, settle_every=3, displaces=True, rates=SurfaceRates(normals=0.0, offsets=0.02))
-    whole, _ = fitted(views, settings)
-    assert not torch.equal(whole.parameters["vertices"], placed_sphere(SHRUNK).vertices)
-    stopped, _ = fitted(views, settings, stop_at=5)
-    assert stopped.iteration == 5 and stopped.parameters["offsets"].any()
-    write_tensors(tmp_path / "x", fit_tensors(stopped), {})
-    resumed = started(settings)
-    restore_fit(read_tensors(tmp_path / "x", torch.device("cpu"))[0], resumed)
-    fitted(views, settings, state=resumed)
-    assert resumed.iteration == 7
-    for name, value in whole.parameters.items():
-        assert torch.equal(resumed.parameters[name], value), name
