@@ -37,7 +37,7 @@ from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.surface.surface_passes import SurfaceFit
-from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, gaussians_from_state
+from drgs.reconstruct.fit.surfels.fit_gaussians import drawn_object, gaussians_from_state
 from drgs.reconstruct.fit.surfels.fit_materials import gaussians_from_materials
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import gaussians_from_mesh_fit
 from drgs.reconstruct.fit.surfels.try_light_frames import light_by_trial
@@ -186,9 +186,8 @@ def build_stages(
         place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, stop)
         if not settings.resume:
             forget_checkpoints(place)
-        fit_settings = replace(preset.fit, seed=settings.seed)
         if not views.has_masks:
-            views, masked, points = _with_found_masks(place, views, points, fit_settings, device, settings, preset)
+            views, masked, points = _with_found_masks(place, views, points, device, settings, preset)
             found_by = {"object_found_by": "surroundings" if views.ground is None else "ground"}
         else:
             masked = views
@@ -198,6 +197,8 @@ def build_stages(
             light = light_by_trial(light, *light_stage(place, masked, points, settings.seed, device))
         if light.frame == "camera":
             views, masked, place = with_light_of_camera(views), with_light_of_camera(masked), place.of(light="camera")
+        preset = preset.under(light_turns=light.frame == "camera")
+        fit_settings = replace(preset.fit, seed=settings.seed)
         points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
         if light.frame == "camera" and not gains_of_files:
             # with_gains_of_points took for exposures what the light's turns do. It helps to look for hollows as if light stood still; a fit has the light.
@@ -278,12 +279,12 @@ def _with_found_masks(
     place: Workplace,
     views: Views,
     points: InitialPoints,
-    fit_settings: FitSettings,
     device: torch.device,
     settings: BuildSettings,
     preset: Preset,
 ) -> tuple[Views, Views, InitialPoints]:
     """Views without masks, but with the ground where there is one; the same with masks, for what looks at the object; points on those."""
+    fit_settings = replace(preset.fit, seed=settings.seed)
     views = ground_stage(place, views, settings.seed)
     points = points_on_ground(views, points, preset.points, settings.seed, settings.box, preset.hull)
     masked = masks_stage(place, views, points, fit_settings, device, settings.box)
@@ -339,7 +340,7 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
     where these were moved to."""
     place, views, seed, timed = built.place, built.views, built.settings.seed, built.timed
     with timed("surface"):
-        passes = built.preset.surface.under(light_turns=views.light_from_world is not None)
+        passes = built.preset.surface
         moves = replace(passes.surface.moves, texture_radius=built.radius, box=built.settings.box)
         passes = replace(passes, surface=replace(passes.surface, seed=seed, moves=moves))
         passes = passes if built.settings.cameras == "auto" else replace(passes, cameras_after=())

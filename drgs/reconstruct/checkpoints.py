@@ -15,7 +15,7 @@ from torch import Tensor
 from drgs.reconstruct.fit.densify import ScreenGradientStats
 from drgs.reconstruct.fit.fit_loop import FitState
 
-CHECKPOINT_VERSION = "25"
+CHECKPOINT_VERSION = "26"
 """Of names and meaning of what is kept: raise it with every change after which older checkpoints would go on otherwise than they began."""
 
 

@@ -23,6 +23,18 @@ from drgs.render.records import SampleCounts
 
 
 @dataclass(frozen=True)
+class UnderTurningLight:
+    """What a build takes more of where light turns with the camera. Shadows move there, and stage 1, which has none, leaves a worse shape."""
+
+    times_stage_one: int = 1
+    """Its iterations, times so many."""
+    passes: int = 0
+    """More of them."""
+    displacement_steps: int = 0
+    """At least so many (PassSettings.displacement_steps)."""
+
+
+@dataclass(frozen=True)
 class Preset:
     """All numbers that differ between draft, fast and full."""
 
@@ -47,6 +59,16 @@ class Preset:
     """Of the masks, on whose surface points begin."""
     vessels: VesselSettings = field(default_factory=VesselSettings)
     """Whose insides that surface is to have."""
+    turning: UnderTurningLight = field(default_factory=UnderTurningLight)
+
+    def under(self, light_turns: bool) -> "Preset":
+        """What a build does under such light."""
+        if not light_turns:
+            return self
+        more, surface = self.turning, self.surface
+        surface = surface.with_more_passes(more.passes)
+        surface = replace(surface, displacement_steps=max(surface.displacement_steps, more.displacement_steps))
+        return replace(self, surface=surface, fit=replace(self.fit, iterations=more.times_stage_one * self.fit.iterations))
 
 
 FINE_MATERIALS = MeshMaterialSettings(rates=SurfaceRates(normals=0.0015), gradient_rings=2, times_light=2)
@@ -62,7 +84,6 @@ PRESETS = {
             3,
             SurfaceSettings(rounds=1, steps_a_round=50),
             replace(PASS_MESH, resolution=120, face_limit=30_000),
-            more_where_light_turns=2,
             cameras_after=(1, 2),
             division=DivisionSettings(most_faces=0),
         ),
@@ -76,7 +97,7 @@ PRESETS = {
         512,
         FitSettings(iterations=660, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
-        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), more_where_light_turns=2, cameras_after=(1, 2, 3)),
+        PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70), cameras_after=(1, 2, 3)),
         replace(FINE_MATERIALS, iterations=360, rounds=3),
         DetailSettings(),
         mesh_surfels=MeshFitSettings(iterations=300),

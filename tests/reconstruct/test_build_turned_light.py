@@ -15,7 +15,7 @@ from drgs.reconstruct.capture import exposures
 from drgs.reconstruct.capture.turning_light import LightChoice
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
-from drgs.reconstruct.presets import PRESETS
+from drgs.reconstruct.presets import PRESETS, UnderTurningLight
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
 from drgs.scene.asset import Asset, light_from_world, load_asset, save_asset
@@ -125,16 +125,28 @@ def test_with_the_right_frame_pictures_are_explained_and_with_the_wrong_one_not(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("light", "exposed", "passes"), [("camera", False, 2), ("object", True, 1)])
-def test_what_light_that_turns_changes_is_not_taken_for_exposures_and_it_has_more_passes(
+def test_what_light_that_turns_changes_is_not_taken_for_exposures_and_it_has_more_passes_and_displacement(
     light: LightChoice, exposed: bool, passes: int, half_turntable: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(exposures, "VARIED_STOPS", 0.0)  # so that points find exposures in any capture, ...
     monkeypatch.setattr(exposures, "LEFT_STOPS", 1e9)  # ... and so short a fit, which explains little, in none
-    monkeypatch.setitem(PRESETS, "tiny", replace(SMALL, surface=replace(SMALL.surface, passes=1, more_where_light_turns=1)))
+    once = replace(SMALL.surface, passes=1)
+    monkeypatch.setitem(PRESETS, "tiny", replace(SMALL, surface=once, turning=UnderTurningLight(passes=1, displacement_steps=2)))
     told: list[str] = []
     asset = build_asset(half_turntable, tmp_path / "a", replace(SETTINGS, light=light), lambda p: told.append(p.message))
     assert ("exposure_stops" in asset.provenance) == exposed
     assert any(f"pass {passes} of {passes}," in message for message in told)
+    assert any(message.startswith("displacement") for message in told) == (light == "camera")
+
+
+def test_where_light_turns_more_is_done_and_nothing_less() -> None:
+    given = replace(PRESETS["full"], turning=UnderTurningLight(times_stage_one=2, passes=1, displacement_steps=50))
+    assert given.under(light_turns=False) is given
+    more = given.under(light_turns=True)
+    assert more.fit == replace(given.fit, iterations=2 * given.fit.iterations)
+    assert more.surface == given.surface.with_more_passes(1)  # which has more than 50 already
+    few = replace(given, surface=replace(given.surface, displacement_steps=0)).under(light_turns=True)
+    assert few.surface.displacement_steps == 50
 
 
 @pytest.mark.slow

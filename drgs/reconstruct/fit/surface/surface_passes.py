@@ -67,16 +67,12 @@ class PassSettings:
     """How fine faces are divided after the last pass."""
     relief_steps: int = 70
     """On divided faces: of normals, materials and light, while the surface stays where it is."""
-    more_where_light_turns: int = 0
-    """Passes, in all of which light, shadows and shape have farther to go together: stage 1 leaves a worse shape where light turns with the camera."""
     cameras_after: tuple[int, ...] = ()
     """Passes, counted from 1, after which cameras are moved to where their photographs fit the surface, where they are off (register_cameras)."""
 
-    def under(self, light_turns: bool) -> "PassSettings":
-        """With as many passes as such light needs; normals then go less far in each, and as far in all of them."""
-        if not light_turns or not self.more_where_light_turns:
-            return self
-        passes, given = self.passes + self.more_where_light_turns, self.surface
+    def with_more_passes(self, more: int) -> "PassSettings":
+        """Normals go less far in each pass, and as far in all of them."""
+        passes, given = self.passes + more, self.surface
         share = self.passes / passes
         rates = replace(given.rates, normals=given.rates.normals * share)
         return replace(self, passes=passes, surface=replace(given, rates=rates, normals_end=given.normals_end * share))

@@ -39,18 +39,15 @@ SHORT = PassSettings(
 """Of which only is asked that they go through, stop and go on."""
 
 
-def test_more_passes_where_light_turns_take_normals_as_far_as_the_few() -> None:
-    settings = PassSettings(3, more_where_light_turns=2)
-    assert settings.under(light_turns=False) is settings
-    turned = settings.under(light_turns=True)
-    assert turned.passes == 5
+def test_more_passes_take_normals_as_far_as_the_few() -> None:
+    settings = PassSettings(3)
+    more = settings.with_more_passes(2)
+    assert more.passes == 5 and settings.with_more_passes(0) == settings
 
     def path(plan: PassSettings) -> float:
         return sum(settings_of_pass(plan, index).rates.normals for index in range(plan.passes))
 
-    assert path(turned) == pytest.approx(path(settings), rel=0.02)
-    few = PassSettings(3)
-    assert few.under(light_turns=True) is few
+    assert path(more) == pytest.approx(path(settings), rel=0.02)
 
 
 def test_weights_go_on_where_the_pass_before_ended_and_rates_fall():
