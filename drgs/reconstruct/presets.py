@@ -91,6 +91,7 @@ PRESETS = {
         DetailSettings(most_samples=500_000, side=1024),
         mesh_surfels=MeshFitSettings(iterations=150),
         surfel_materials=MaterialSettings(iterations=80, points_a_step=512),
+        turning=UnderTurningLight(times_stage_one=2, passes=2, displacement_steps=400),
     ),
     "fast": Preset(
         15_000,
@@ -102,6 +103,7 @@ PRESETS = {
         DetailSettings(),
         mesh_surfels=MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
+        turning=UnderTurningLight(passes=2, displacement_steps=300),
     ),
     "full": Preset(
         25_000,
