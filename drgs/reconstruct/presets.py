@@ -103,7 +103,7 @@ PRESETS = {
         DetailSettings(),
         mesh_surfels=MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
-        turning=UnderTurningLight(passes=2, displacement_steps=300),
+        turning=UnderTurningLight(times_stage_one=2, passes=2, displacement_steps=150),
     ),
     "full": Preset(
         25_000,
