@@ -198,7 +198,6 @@ def build_stages(
         if light.frame == "camera":
             views, masked, place = with_light_of_camera(views), with_light_of_camera(masked), place.of(light="camera")
         preset = preset.under(light_turns=light.frame == "camera")
-        fit_settings = replace(preset.fit, seed=settings.seed)
         points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
         if light.frame == "camera" and not gains_of_files:
             # with_gains_of_points took for exposures what the light's turns do. It helps to look for hollows as if light stood still; a fit has the light.
@@ -206,12 +205,12 @@ def build_stages(
     yield "read", None
 
     with timed("fit"):
-        fit = fit_stage(place, views, points, fit_settings, device)
+        fit = fit_stage(place, views, points, replace(preset.fit, seed=settings.seed), device)
         if not views.has_masks:
             views = masked_by_surfels(views, gaussians_from_state(fit), points.bounds_radius, settings.box)
             views = sharpen_masks(views) if settings.masks == "auto" else views
             photographs = views_of(photographs, views)
-        views = with_gains_of_fit(views, drawn_object(fit.parameters, points.bounds_radius, fit_settings.sh_degree))
+        views = with_gains_of_fit(views, drawn_object(fit.parameters, points.bounds_radius, preset.fit.sh_degree))
     yield "fit", None
 
     with timed("mesh"):

@@ -13,9 +13,12 @@ from PIL import Image
 from drgs.reconstruct.build_asset import BuildSettings, BuildStopped, build_asset
 from drgs.reconstruct.capture import exposures
 from drgs.reconstruct.capture.turning_light import LightChoice
+from drgs.reconstruct.fit.surface import surface_passes
 from drgs.reconstruct.fit.surface.fit_mesh_materials import MeshMaterialSettings
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceSettings
+from drgs.reconstruct.fit.surface.surface_passes import PassSettings, SurfaceFit
 from drgs.reconstruct.presets import PRESETS, UnderTurningLight
+from drgs.reconstruct.progress import Progress
 from drgs.render.records import RenderSettings
 from drgs.render.render_cameras import render_cameras
 from drgs.scene.asset import Asset, light_from_world, load_asset, save_asset
@@ -125,18 +128,27 @@ def test_with_the_right_frame_pictures_are_explained_and_with_the_wrong_one_not(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("light", "exposed", "passes"), [("camera", False, 2), ("object", True, 1)])
-def test_what_light_that_turns_changes_is_not_taken_for_exposures_and_it_has_more_passes_and_displacement(
+def test_what_light_that_turns_changes_is_not_taken_for_exposures_and_it_has_more_of_what_shape_needs(
     light: LightChoice, exposed: bool, passes: int, half_turntable: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(exposures, "VARIED_STOPS", 0.0)  # so that points find exposures in any capture, ...
     monkeypatch.setattr(exposures, "LEFT_STOPS", 1e9)  # ... and so short a fit, which explains little, in none
     once = replace(SMALL.surface, passes=1)
-    monkeypatch.setitem(PRESETS, "tiny", replace(SMALL, surface=once, turning=UnderTurningLight(passes=1, displacement_steps=2)))
-    told: list[str] = []
-    asset = build_asset(half_turntable, tmp_path / "a", replace(SETTINGS, light=light), lambda p: told.append(p.message))
+    monkeypatch.setitem(PRESETS, "tiny", replace(SMALL, surface=once, turning=UnderTurningLight(2, passes=1, displacement_steps=2)))
+    displaced: list[int] = []
+    begun = surface_passes.start_displacement
+
+    def start_displacement(fit: SurfaceFit, settings: PassSettings, radius: float) -> None:
+        displaced.append(settings.displacement_steps)
+        begun(fit, settings, radius)
+
+    monkeypatch.setattr(surface_passes, "start_displacement", start_displacement)
+    told: list[Progress] = []
+    asset = build_asset(half_turntable, tmp_path / "a", replace(SETTINGS, light=light), told.append)
     assert ("exposure_stops" in asset.provenance) == exposed
-    assert any(f"pass {passes} of {passes}," in message for message in told)
-    assert any(message.startswith("displacement") for message in told) == (light == "camera")
+    assert any(f"pass {passes} of {passes}," in p.message for p in told)
+    assert displaced == ([2] if light == "camera" else [])
+    assert max(p.iterations for p in told if p.stage == "fit") == SMALL.fit.iterations * passes
 
 
 def test_where_light_turns_more_is_done_and_nothing_less() -> None:
