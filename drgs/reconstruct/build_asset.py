@@ -197,7 +197,7 @@ def build_stages(
             light = light_by_trial(light, *light_stage(place, masked, points, settings.seed, device))
         if light.frame == "camera":
             views, masked, place = with_light_of_camera(views), with_light_of_camera(masked), place.of(light="camera")
-        preset = preset.under(light_turns=light.frame == "camera")
+            preset = preset.under_turning_light()
         points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
         if light.frame == "camera" and not gains_of_files:
             # with_gains_of_points took for exposures what the light's turns do. It helps to look for hollows as if light stood still; a fit has the light.

@@ -60,13 +60,11 @@ class Preset:
     vessels: VesselSettings = field(default_factory=VesselSettings)
     """Whose insides that surface is to have."""
     turning: UnderTurningLight = field(default_factory=UnderTurningLight)
+    """What under_turning_light adds."""
 
-    def under(self, light_turns: bool) -> "Preset":
-        """What a build does under such light."""
-        if not light_turns:
-            return self
-        more, surface = self.turning, self.surface
-        surface = surface.with_more_passes(more.passes)
+    def under_turning_light(self) -> "Preset":
+        """The same where light turns with the camera."""
+        more, surface = self.turning, self.surface.with_more_passes(self.turning.passes)
         surface = replace(surface, displacement_steps=max(surface.displacement_steps, more.displacement_steps))
         return replace(self, surface=surface, fit=replace(self.fit, iterations=more.times_stage_one * self.fit.iterations))
 

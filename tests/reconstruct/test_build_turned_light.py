@@ -153,11 +153,10 @@ def test_what_light_that_turns_changes_is_not_taken_for_exposures_and_it_has_mor
 
 def test_where_light_turns_more_is_done_and_nothing_less() -> None:
     given = replace(PRESETS["full"], turning=UnderTurningLight(times_stage_one=2, passes=1, displacement_steps=50))
-    assert given.under(light_turns=False) is given
-    more = given.under(light_turns=True)
+    more = given.under_turning_light()
     assert more.fit == replace(given.fit, iterations=2 * given.fit.iterations)
     assert more.surface == given.surface.with_more_passes(1)  # which has more than 50 already
-    few = replace(given, surface=replace(given.surface, displacement_steps=0)).under(light_turns=True)
+    few = replace(given, surface=replace(given.surface, displacement_steps=0)).under_turning_light()
     assert few.surface.displacement_steps == 50
 
 
