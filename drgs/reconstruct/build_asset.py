@@ -210,7 +210,7 @@ def build_stages(
             views = masked_by_surfels(views, gaussians_from_state(fit), points.bounds_radius, settings.box)
             views = sharpen_masks(views) if settings.masks == "auto" else views
             photographs = views_of(photographs, views)
-        views = with_gains_of_fit(views, drawn_object(fit.parameters, points.bounds_radius, preset.fit.sh_degree))
+        views = with_gains_of_fit(views, drawn_object(fit, points.bounds_radius, preset.fit.sh_degree))
     yield "fit", None
 
     with timed("mesh"):

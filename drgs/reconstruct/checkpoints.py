@@ -14,8 +14,9 @@ from torch import Tensor
 
 from drgs.reconstruct.fit.densify import ScreenGradientStats
 from drgs.reconstruct.fit.fit_loop import FitState
+from drgs.reconstruct.fit.surfels.surfel_shadows import SurfelShadows
 
-CHECKPOINT_VERSION = "26"
+CHECKPOINT_VERSION = "27"
 """Of names and meaning of what is kept: raise it with every change after which older checkpoints would go on otherwise than they began."""
 
 
@@ -57,6 +58,8 @@ def fit_tensors(state: FitState) -> dict[str, Tensor]:
         tensors |= {"screen_gradients.total": state.screen_gradients.total, "screen_gradients.seen": state.screen_gradients.seen}
     if state.exposures is not None:
         tensors["exposures"] = state.exposures
+    if state.shadows is not None:
+        tensors |= {f"shadows.{name}": value for name, value in state.shadows.columns.items()}
     for group in state.optimizer.param_groups:
         moments = state.optimizer.state.get(group["params"][0])
         if moments:
@@ -87,5 +90,7 @@ def restore_fit(tensors: dict[str, Tensor], state: FitState) -> None:
     state.generator.set_state(tensors["generator"].cpu())
     state.iteration = int(tensors["iteration"])
     state.exposures = tensors["exposures"].cpu() if "exposures" in tensors else None
+    shadows = {name.removeprefix("shadows."): value for name, value in tensors.items() if name.startswith("shadows.")}
+    state.shadows = SurfelShadows(**shadows) if shadows else None
     if state.screen_gradients is not None:
         state.screen_gradients = ScreenGradientStats(tensors["screen_gradients.total"].clone(), tensors["screen_gradients.seen"].clone())

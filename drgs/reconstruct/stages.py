@@ -245,7 +245,7 @@ def fit_stage(place: Workplace, views: Views, points: InitialPoints, settings: F
             FIT,
             state,
             settings.iterations,
-            lambda report: fit_gaussians(views, state, settings, radius, report, place.should_stop),
+            lambda report: fit_gaussians(views, state, settings, radius, report, place.should_stop, points.bounds_center),
             lambda r: f"{r.elements} surfels",
             lambda: stage_one_preview(state.parameters, views.cameras, radius, settings.sh_degree),
         ),

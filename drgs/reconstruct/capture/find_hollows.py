@@ -4,7 +4,7 @@ Silhouettes do not show hollows: the hull of things on a plate is a hill. Everyt
 So a coarse radiance field (radiance_grid) is fitted first; it finds the floor between the things, but mistakes mirrors and gloss, which it
 sees below their surfaces. Each ray therefore says whether what it sees behind the hull's surface deserves belief: the place looks alike from all
 sides, more so than the hull's surface before it, and the ray is stopped there rather than on its way. Where the light turns with the
-camera, alike is what does not go with its turns (as_if_still). Rays vote for the place of the hull that they
+camera, alike is what that light does not explain (looks_under_turns). Rays vote for the place of the hull that they
 pass through; where enough do, depth is the field's, else the hull's, and all depths are fused to one surface. Where something was found all is done once
 more behind that: between leaves the first look reaches the next leaf, where it is coarse.
 
@@ -28,7 +28,7 @@ from drgs.reconstruct.capture.hull_rays import (
     rays_into,
     surface_of,
     surface_of_hull,
-    unlikeness,
+    unlikenesses,
 )
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
 from drgs.reconstruct.capture.visual_hull import VisualHull
@@ -201,15 +201,17 @@ def _believed(
     seen: list[_Seen], targets: list[ViewTarget], outer: AbstractTracer, inner: AbstractTracer, radius: float, settings: HollowSettings
 ) -> Float[Tensor, "vertex"]:
     """Of the hull's vertices, the share of rays through them that believe what they see behind, averaged around."""
-    outside, behind = (unlikeness(surface, targets, settings.cost_rings) for surface in (outer, inner))
-    votes = torch.zeros(len(outer.mesh.vertices), 2, device=outside.device)
+    compared = tuple(zip(*(unlikenesses(surface, targets, settings.cost_rings) for surface in (outer, inner)), strict=True))
+    votes = torch.zeros(len(outer.mesh.vertices), 2, device=outer.mesh.vertices.device)
     for view in seen:
         distance, face, hit = view.behind(inner)
-        there, here = behind[inner.mesh.faces[face].long()].mean(1), outside[view.corners].mean(1)
         brightness = view.target.saturation.reshape(-1, 3)[view.pixels].mean(1)
         depth = distance - view.rays.near
-        believes = hit & (depth > settings.least_depth * radius) & (there < settings.alike * (brightness + 0.05))
-        believes &= (there < settings.better * here) & (view.spread < settings.stopped * depth)
+        alike = torch.zeros_like(hit)
+        for outside, behind in compared:
+            there, here = behind[inner.mesh.faces[face].long()].mean(1), outside[view.corners].mean(1)
+            alike |= (there < settings.alike * (brightness + 0.05)) & (there < settings.better * here)
+        believes = hit & alike & (depth > settings.least_depth * radius) & (view.spread < settings.stopped * depth)
         cast = torch.stack([believes.float(), torch.ones_like(depth)], -1)
         for corner in view.corners.unbind(1):
             votes.index_add_(0, corner, cast)

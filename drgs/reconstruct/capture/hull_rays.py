@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from drgs.reconstruct.capture.looks_under_turns import unexplained_looks
 from drgs.reconstruct.capture.radiance_grid import Rays
 from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
@@ -35,8 +36,6 @@ INSIDE = 0.9
 """Least coverage of a place in the photograph."""
 TRIMMED = 2 / 3
 """Share of the looks whose difference counts: highlights differ most."""
-HELD = 1.0
-"""Of each slope of looks by how the light is turned, against the sum over views of squared entries of the turns: few views do not say much of nine."""
 HULL_MESH = MeshSettings(face_limit=40_000, keep_component_fraction=0.0)
 """Every part of the hull: what its rays did not meet would count as seen through."""
 
@@ -156,20 +155,30 @@ def large_patches(chosen: Bool[Tensor, "vertex"], faces: Int[Tensor, "face 3"], 
 
 
 def unlikeness(surface: AbstractTracer, targets: list[ViewTarget], rings: int) -> Float[Tensor, "vertex"]:
-    """Mean difference (display values) between the views that see a vertex, averaged around; inf where hardly any does."""
-    mesh = surface.mesh
-    difference, views = _differences(surface, targets)
-    known = torch.where(views >= FEWEST_VIEWS, views, torch.zeros_like(views))
-    sums = torch.stack([difference.nan_to_num(0.0) * known, known], -1)
-    total, weight = averaged(averaging_matrix(mesh_edges(mesh.faces), len(mesh.vertices)), sums, rings).unbind(1)
-    return torch.where(weight > 0.1 * FEWEST_VIEWS, total / weight.clamp(min=1e-6), torch.full_like(total, torch.inf))
+    """Mean difference (display values) between the views that see a vertex, averaged around; inf where hardly any does.
 
-
-def _differences(surface: AbstractTracer, targets: list[ViewTarget]) -> tuple[Float[Tensor, "vertex"], Float[Tensor, "vertex"]]:
-    """Of each vertex the mean difference from the median colour among the views that see it, without the third that differs most, and how many those are.
-
-    Where the light turns with the camera, of what does not go with its turns.
+    Where the light turns with the camera, of what that light does not explain, with as much forgiven as ever is.
     """
+    return unlikenesses(surface, targets, rings)[0]
+
+
+def unlikenesses(surface: AbstractTracer, targets: list[ViewTarget], rings: int) -> list[Float[Tensor, "vertex"]]:
+    """`unlikeness`, and where the light turns with the camera the same with less forgiven (looks_under_turns.HELD)."""
+    mesh, shown = surface.mesh, _looks(surface, targets)
+    turns = [target.light_from_world for target in targets if target.light_from_world is not None]
+    compared = unexplained_looks(surface, shown, torch.stack(turns)) if turns else [shown]
+    around, found = averaging_matrix(mesh_edges(mesh.faces), len(mesh.vertices)), []
+    for looks in compared:
+        difference, views = _differences(looks)
+        known = torch.where(views >= FEWEST_VIEWS, views, torch.zeros_like(views))
+        sums = torch.stack([difference.nan_to_num(0.0) * known, known], -1)
+        total, weight = averaged(around, sums, rings).unbind(1)
+        found.append(torch.where(weight > 0.1 * FEWEST_VIEWS, total / weight.clamp(min=1e-6), torch.full_like(total, torch.inf)))
+    return found
+
+
+def _looks(surface: AbstractTracer, targets: list[ViewTarget]) -> Float[Tensor, "view vertex 3"]:
+    """What each photograph shows at each vertex (display values); nan where it does not see it."""
     place, normals = surface.mesh.vertices, surface.mesh.normals
     shown = torch.full((len(targets), len(place), 3), torch.nan, device=place.device)
     for index, target in enumerate(targets):
@@ -190,27 +199,14 @@ def _differences(surface: AbstractTracer, targets: list[ViewTarget]) -> tuple[Fl
         sampled = torch.nn.functional.grid_sample(picture, grid, mode="bilinear", align_corners=False)[0, :, 0].T
         inside = sampled[:, 3] > INSIDE
         shown[index, seen[inside]] = sampled[inside, :3]
-    turns = [target.light_from_world for target in targets if target.light_from_world is not None]
-    if turns:
-        shown = as_if_still(shown, torch.stack(turns))
+    return shown
+
+
+def _differences(shown: Float[Tensor, "view vertex 3"]) -> tuple[Float[Tensor, "vertex"], Float[Tensor, "vertex"]]:
+    """Of each vertex the mean difference from the median colour among the views that see it, without the third that differs most, and how many those are."""
     difference = (shown - shown.nanmedian(0).values).abs().mean(-1)
     count = (~torch.isnan(difference)).sum(0)
     ordered = difference.nan_to_num(nan=torch.inf).sort(0).values
-    kept = torch.arange(len(targets), device=place.device)[:, None] < (TRIMMED * count).ceil()
+    kept = torch.arange(len(shown), device=shown.device)[:, None] < (TRIMMED * count).ceil()
     total = torch.where(kept, ordered, torch.zeros_like(ordered)).sum(0)
     return total / kept.sum(0).clamp(min=1), count.float()
-
-
-def as_if_still(shown: Float[Tensor, "view vertex 3"], light_from_world: Float[Tensor, "view 3 3"]) -> Float[Tensor, "view vertex 3"]:
-    """Looks (nan: none) without what goes linearly with how the light is turned: irradiance of degree 1 does, whatever shadows the place lies in.
-
-    A place that is not on the surface shows another one from each side, which no nine slopes explain.
-    """
-    basis = torch.cat([torch.ones_like(light_from_world[:, 0, :1]), light_from_world.flatten(1)], 1)
-    count = basis.shape[1]
-    seen = (~shown.isnan().any(-1)).float()
-    squares = (seen.T @ (basis[:, :, None] * basis[:, None]).flatten(1)).reshape(-1, count, count)
-    held = torch.full_like(basis[0], HELD).diag()
-    held[0, 0] = 1e-4  # the constant is free; of places that nobody sees there is none
-    fitted = torch.linalg.solve(squares + held, (shown.nan_to_num(0.0).permute(1, 2, 0) @ basis).mT)
-    return shown - torch.einsum("ki,vic->kvc", basis[:, 1:], fitted[:, 1:])

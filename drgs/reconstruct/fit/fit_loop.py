@@ -17,6 +17,7 @@ from torch import Tensor
 
 from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.densify import ScreenGradientStats
+from drgs.reconstruct.fit.surfels.surfel_shadows import SurfelShadows
 from drgs.scene.camera import Camera
 
 
@@ -34,6 +35,8 @@ class FitState:
     """Of surfels that are divided (stage 1); None elsewhere."""
     exposures: Float64[Tensor, "view 4"] | None = None
     """Of each view its gain and its tints, as the fit found them half way (stage 1); None before, and elsewhere."""
+    shadows: SurfelShadows | None = None
+    """Of surfels, where light turns with the camera and their shape has been looked at (stage 1); None elsewhere."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from drgs.reconstruct.capture.hull_rays import as_if_still, seen_from_elsewhere, unlikeness
+from drgs.reconstruct.capture.hull_rays import seen_from_elsewhere, unlikeness
 from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.fit.view_targets import view_targets
 from drgs.render.intersect.trace_rays import build_tracer
@@ -43,21 +43,6 @@ def test_paint_looks_alike_on_the_surface_and_not_before_it_nor_do_mirrors() -> 
     changed = (unlikeness(bowl, one, rings=1) - right)[seen].abs()
     assert float(changed.median()) < 0.02, "the looks that differ most are left out"
     assert torch.isinf(unlikeness(bowl, painted[:2], rings=1)).all(), "two views are too few"
-
-
-def test_what_goes_with_the_lights_turns_is_taken_out_and_nothing_else() -> None:
-    random = torch.Generator().manual_seed(0)
-    turns = torch.linalg.qr(torch.randn(40, 3, 3, generator=random))[0]
-    slopes, albedo = torch.randn(5, 3, 3, 3, generator=random), torch.rand(5, 3, generator=random)
-    lit = albedo + torch.einsum("vcij,kij->kvc", slopes, turns)
-    lit[::3, 0] = torch.nan
-    still = as_if_still(lit, turns)
-    assert torch.equal(still.isnan(), lit.isnan())
-    scatter = (still - still.nanmean(0)).abs().nanmean()
-    assert float(scatter) < 0.2 * float((lit - lit.nanmean(0)).abs().nanmean())
-    chance = torch.randn(40, 5, 3, generator=random)
-    left = as_if_still(chance, turns)
-    assert float((left - left.mean(0)).square().mean()) > 0.6 * float((chance - chance.mean(0)).square().mean())
 
 
 def test_under_light_that_turns_paint_looks_alike_where_it_is_and_mirrors_do_not() -> None:

@@ -42,6 +42,7 @@ from drgs.reconstruct.fit.surfel_parameters import (
     residual_sh,
 )
 from drgs.reconstruct.fit.surfels.render_stage_one import StageOneMaps, render_stage_one
+from drgs.reconstruct.fit.surfels.surfel_shadows import shadows_of_surfels
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets, windowed
 from drgs.render.visible.rasterize.near_plane import near_plane
 from drgs.scene.camera import Camera
@@ -76,6 +77,8 @@ class FitSettings:
     """Radiance that only the residual explains costs this share of the error that it removes."""
     weight_white_light: float = 0.02
     weight_rough_light: float = 0.002
+    looks_at_shadows: int = 3
+    """Times that the surfels' shape is looked at for the shadows that it casts, where light turns with the camera."""
     seed: int = 0
 
 
@@ -106,13 +109,15 @@ def fit_gaussians(
     radius: float,
     report: Callable[[FitReport], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    center: Float[Tensor, "3"] | None = None,
 ) -> FitState:
     """Run (or go on with) stage 1; see run_fit.
 
     Args:
-        radius: of the object's bounding sphere [world units]; scales learning rates and the near plane.
+        radius: of the object's bounding sphere [world units]; scales learning rates and the near plane. center: of that sphere, by which surfels cast
+            shadows where the light turns with the camera; None: they cast none.
     """
-    steps = _Steps(views, state, settings, radius)
+    steps = _Steps(views, state, settings, radius, center if views.light_from_world is not None else None)
     fit = FitLoop(state, settings.iterations, len(views.cameras), steps.step, steps.rates, steps.gather_gradients, steps.divide)
     return run_fit(fit, report, should_stop)
 
@@ -120,10 +125,12 @@ def fit_gaussians(
 class _Steps:
     """Final. Stage 1's part of the fit loop."""
 
-    def __init__(self, views: Views, state: FitState, settings: FitSettings, radius: float) -> None:
+    def __init__(self, views: Views, state: FitState, settings: FitSettings, radius: float, center: Tensor | None) -> None:
         self.views, self.state, self.radius = views if state.exposures is None else _exposed(views, state.exposures), state, radius
         on_ground = replace(settings, weight_coverage=settings.weight_coverage_on_ground)
         self.settings = settings if views.ground is None else on_ground
+        self.center = center
+        """Of the bounding sphere, where surfels cast shadows."""
         self.targets: list[ViewTarget] = []
         self.target_factor = 0.0
         """Size of the targets as a share of the photographs'."""
@@ -140,8 +147,9 @@ class _Steps:
         target = self._drawn_target(iteration)
         environment = environment_table(parameters)
         tables = filter_environment(environment)
+        share = open_share(self.state, tables, target.light_from_world)
         maps = render_stage_one(
-            parameters, tables, target.camera, near_plane(self.radius), self._sh_degree(progress), target.light_from_world
+            parameters, tables, target.camera, near_plane(self.radius), self._sh_degree(progress), target.light_from_world, share
         )
         image = displayed(maps, target, parameters, self.views.ground)
         terms = stage_one_terms(maps, image, target, environment, self.settings, self.views.has_masks, normal_share(progress))
@@ -160,6 +168,17 @@ class _Steps:
             state.screen_gradients = densify(state.optimizer, state.parameters, state.screen_gradients, plan, self.radius, state.generator)
         if plan.reset_every and done % plan.reset_every == 0 and progress <= plan.stop:
             reset_opacity(state.optimizer, state.parameters)
+        if self.center is not None:
+            self._look_at_shadows(done)
+
+    def _look_at_shadows(self, done: int) -> None:
+        centers, every = self.state.parameters["centers"], max(1, self.settings.iterations // (self.settings.looks_at_shadows + 1))
+        assert self.center is not None
+        if done % every == 0 and done < self.settings.iterations:
+            found = shadows_of_surfels(self.state.parameters, self.views.cameras, self.center, self.radius)
+            self.state.shadows = found or self.state.shadows
+        if self.state.shadows is not None and len(self.state.shadows.nearest) != len(centers):
+            self.state.shadows = self.state.shadows.of_surfels(centers)
 
     def _progress(self, iteration: int) -> float:
         return iteration / self.settings.iterations
@@ -177,7 +196,7 @@ class _Steps:
     def _look_at_exposures(self) -> None:
         """Tints, and better gains, for the second half, before radiance may depend on the view and explain them as well."""
         degree = self._sh_degree(self._progress(self.state.iteration))
-        found = with_gains_of_fit(self.views, drawn_object(self.state.parameters, self.radius, degree), finds_gains=False)
+        found = with_gains_of_fit(self.views, drawn_object(self.state, self.radius, degree), finds_gains=False)
         count = len(found.cameras)
         gains = torch.tensor(found.gains or (1.0,) * count, dtype=torch.float64)
         tints = torch.tensor(found.tints or ((1.0, 1.0, 1.0),) * count, dtype=torch.float64)
@@ -196,17 +215,27 @@ def _exposed(views: Views, exposures: Float64[Tensor, "view 4"]) -> Views:
     return replace(views, gains=gains, tints=tuple(zip(*tints, strict=True)))
 
 
+def open_share(
+    state: FitState, tables: Float[Tensor, "texel 3"], light_from_world: Float[Tensor, "3 3"] | None
+) -> Float[Tensor, "surfel 3"] | None:
+    """As render_stage_one takes it; None: surfels cast no shadows (yet)."""
+    if state.shadows is None or light_from_world is None:
+        return None
+    return state.shadows.share(torch.sigmoid(state.parameters["albedo_logits"].detach()), tables, light_from_world)
+
+
 def drawn_object(
-    parameters: dict[str, Tensor], radius: float, sh_degree: int
+    state: FitState, radius: float, sh_degree: int
 ) -> Callable[[ViewTarget], tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]]:
     """What a view's camera sees of the surfels: linear radiance where they cover all, and coverage."""
+    parameters = state.parameters
     tables = filter_environment(environment_table(parameters)).detach()
 
     @torch.no_grad()
     def drawn(target: ViewTarget) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
         camera, turn = target.camera.to(tables.device), target.light_from_world
         turn = None if turn is None else turn.to(tables.device)
-        maps = render_stage_one(parameters, tables, camera, near_plane(radius), sh_degree, turn)
+        maps = render_stage_one(parameters, tables, camera, near_plane(radius), sh_degree, turn, open_share(state, tables, turn))
         return maps.radiance_linear, maps.coverage
 
     return drawn

@@ -39,8 +39,13 @@ def render_stage_one(
     near: float,
     sh_degree: int,
     light_from_world: Float[Tensor, "3 3"] | None = None,
+    open_share: Float[Tensor, "surfel 3"] | None = None,
 ) -> StageOneMaps:
-    """Blend, normalise by coverage, shade once a pixel; differentiable."""
+    """Blend, normalise by coverage, shade once a pixel; differentiable.
+
+    Args:
+        open_share: of the open sky's irradiance that arrives at each surfel; None: all of it.
+    """
     rotation = rotation_from_quat_wxyz(parameters["quats"])
     tangents = rotation[:, :, :2] * parameters["log_scales"].exp()[:, None, :]
     centers = parameters["centers"]
@@ -49,7 +54,8 @@ def render_stage_one(
     metallic = torch.sigmoid(parameters["metallic_logits"])
     sh = parameters["sh_dc"] if sh_degree == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"]], 1)
     albedo = torch.sigmoid(parameters["albedo_logits"])
-    surface = [albedo * (1 - metallic)[:, None], f0_from_base(albedo, metallic), torch.sigmoid(parameters["roughness_logits"])[:, None]]
+    lit = albedo if open_share is None else albedo * open_share
+    surface = [lit * (1 - metallic)[:, None], f0_from_base(albedo, metallic), torch.sigmoid(parameters["roughness_logits"])[:, None]]
     features = torch.cat([facing_normals(rotation[:, :, 2], centers, camera), *surface, evaluate_sh(sh, to_surfel, sh_degree)], 1)
     maps = rasterize(centers, tangents, torch.sigmoid(parameters["opacity_logits"]), features, camera, RasterSettings(near=near))
     # Maps are divided by coverage; a pixel hardly covered keeps a bounded gradient.

@@ -17,6 +17,7 @@ from drgs.reconstruct.capture.hull_rays import SOLID
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.turning_light import LightFound, with_light_of_camera
 from drgs.reconstruct.fit.densify import DensifySettings
+from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.losses import display_image
 from drgs.reconstruct.fit.surfels.fit_gaussians import FitSettings, drawn_object, fit_gaussians, size_factor, start_fit
 from drgs.reconstruct.fit.view_targets import view_targets
@@ -59,7 +60,7 @@ def try_light_frames(
         fit_gaussians(chosen_views(lit, kept), state, settings, points.bounds_radius, told, should_stop)
         if state.iteration < settings.iterations:
             return None
-        errors.append(_error_of(chosen_views(lit, left_out), state.parameters, points.bounds_radius, device))
+        errors.append(_error_of(chosen_views(lit, left_out), state, points.bounds_radius, device))
     return errors[0], errors[1]
 
 
@@ -71,8 +72,8 @@ def light_by_trial(found: LightFound, of_object: float, of_camera: float) -> Lig
     return replace(found, frame="camera" if of_camera < BETTER * of_object else "object", why=f"{found.why}; {left}", wants_trial=False)
 
 
-def _error_of(views: Views, parameters: dict[str, torch.Tensor], radius: float, device: torch.device) -> float:
-    drawn, squared, pixels = drawn_object(parameters, radius, 0), 0.0, 0
+def _error_of(views: Views, state: FitState, radius: float, device: torch.device) -> float:
+    drawn, squared, pixels = drawn_object(state, radius, 0), 0.0, 0
     for target in view_targets(views, size_factor(views.cameras, SETTINGS.most_pixels), device):
         radiance, coverage = drawn(target)
         solid = target.mask > SOLID

@@ -172,7 +172,7 @@ def test_exposures_that_are_known_roughly_are_known_well_after_the_fit(views: Vi
     settings = dataclasses.replace(SHORT, iterations=90, half_size_share=0.5)
     state = start_fit(points, settings, CPU)
     fit_gaussians(rough, state, settings, points.bounds_radius)
-    found = with_gains_of_fit(rough, drawn_object(state.parameters, points.bounds_radius, settings.sh_degree))
+    found = with_gains_of_fit(rough, drawn_object(state, points.bounds_radius, settings.sh_degree))
     assert found.gains is not None
     off = np.abs(np.log2(found.gains) - stops)
     assert float(np.sqrt((off**2).mean())) < 0.5 * float(np.sqrt(((guess - guess.mean() - stops) ** 2).mean()))
