@@ -24,7 +24,7 @@ from drgs.render.records import SampleCounts
 
 @dataclass(frozen=True)
 class UnderTurningLight:
-    """What a build takes more of where light turns with the camera. Shadows move there, and stage 1, which has none, leaves a worse shape."""
+    """What a build takes more of where light turns with the camera. Shadows move there, of which stage 1 has coarse ones: it leaves a worse shape."""
 
     times_stage_one: int = 1
     """Its iterations, times so many."""

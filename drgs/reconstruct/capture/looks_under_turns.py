@@ -17,15 +17,14 @@ from torch import Tensor
 from drgs.maths.color import linear_from_srgb, srgb_from_linear
 from drgs.maths.sampling import sphere_lattice
 from drgs.maths.spherical_harmonics import sh_basis
-from drgs.reconstruct.fit.light.turned_light import SeenSky, seen_sky
+from drgs.reconstruct.fit.light.turned_light import BOUNCES, SeenSky, seen_sky
 from drgs.render.intersect.tracer import AbstractTracer
 
 HELD = (1.0, 30.0)
 """Of each slope of looks by how the light is turned, against the sum over views of squared entries of the turns: few views do not say much of nine.
-Where slopes may explain much, what lies before a surface looks alike as well, once it is near; where they may not, coarse normals must be right."""
+With little held, what lies close before a surface looks nearly as alike as the surface; with much, coarse normals of a right one make it unlike."""
 SENT_BACK = 0.5
 """Albedo of what is met instead of the sky; nothing is known of it yet."""
-BOUNCES = 2
 LIGHT_PLACES = 5000
 """Vertices that say what the light is."""
 LIGHT_ROUNDS = 8
@@ -118,7 +117,7 @@ def as_if_still(
 ) -> Float[Tensor, "view vertex 3"]:
     """Looks (nan: none) without what goes linearly with how the light is turned: irradiance of degree 1 does, whatever shadows the place lies in.
 
-    A place that is not on the surface shows another one from each side, which no nine slopes explain.
+    A place that is not on the surface shows another one from each side, of which nine slopes explain the less the more they are held.
     """
     basis = torch.cat([torch.ones_like(light_from_world[:, 0, :1]), light_from_world.flatten(1)], 1)
     count = basis.shape[1]

@@ -78,13 +78,7 @@ def mesh_from_gaussians(
     if box is not None and box.longest_half < radius:
         center, radius = torch.tensor(box.center), box.longest_half
     tangents, opacities = surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)
-    empty = torch.zeros(len(gaussians.centers), 1, device=gaussians.centers.device)
-    raster = RasterSettings(near_plane(points.bounds_radius), median=True)
-    maps = []
-    for camera in cameras:
-        drawn = rasterize(gaussians.centers, tangents, opacities, empty, camera.to(empty.device), raster)
-        assert drawn.median_depth is not None  # asked for by RasterSettings.median
-        maps.append(DepthMap(camera.to(empty.device), drawn.median_depth, drawn.coverage))
+    maps = median_depths(gaussians.centers, tangents, opacities, cameras, points.bounds_radius)
     if points.hull_vertices is None or points.hull_faces is None:
         vertices, faces = extract_mesh(maps, center, radius, settings, box)
         return _grey_mesh(whole_or_within(box, vertices), faces)
@@ -92,6 +86,26 @@ def mesh_from_gaussians(
     vertices, faces = extract_mesh(maps, center, radius, settings, box)
     vertices, faces = parts_in_hull(vertices, faces, points.hull_vertices, points.hull_faces, BEYOND_HULL * points.bounds_radius)
     return _grey_mesh(whole_or_within(box, vertices), faces)
+
+
+def median_depths(
+    centers: Float[Tensor, "surfel 3"],
+    tangents: Float[Tensor, "surfel 3 2"],
+    opacities: Float[Tensor, "surfel"],
+    cameras: tuple[Camera, ...],
+    radius: float,
+) -> list[DepthMap]:
+    """What each camera sees of the surfels.
+
+    Args:
+        radius: of the object's bounding sphere [world units].
+    """
+    empty, settings, maps = torch.zeros_like(centers[:, :1]), RasterSettings(near_plane(radius), median=True), []
+    for camera in cameras:
+        drawn = rasterize(centers, tangents, opacities, empty, camera.to(empty.device), settings)
+        assert drawn.median_depth is not None  # asked for by RasterSettings.median
+        maps.append(DepthMap(camera.to(empty.device), drawn.median_depth, drawn.coverage))
+    return maps
 
 
 def parts_in_hull(

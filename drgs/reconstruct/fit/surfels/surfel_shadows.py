@@ -16,13 +16,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.maths.frames import rotation_from_quat_wxyz
+from drgs.reconstruct.capture.hull_rays import surface_of
 from drgs.reconstruct.fit.light.turned_light import SeenSky, arriving_share, seen_sky
-from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, DepthMap, extract_mesh
-from drgs.render.intersect.trace_rays import build_tracer
-from drgs.render.visible.rasterize import RasterSettings, rasterize
-from drgs.render.visible.rasterize.near_plane import near_plane
+from drgs.reconstruct.geometry.extract_mesh import FAST_MESH, extract_mesh
+from drgs.reconstruct.geometry.mesh_from_gaussians import median_depths
 from drgs.scene.camera import Camera, scaled_camera
-from drgs.scene.mesh import TriangleMesh, vertex_normals
 
 SHADOW_MESH = replace(FAST_MESH, resolution=120, face_limit=12_000, keep_component_fraction=0.01)
 """Of all that stands apart; bits that float cast shadows only until the next look."""
@@ -48,11 +46,7 @@ class SurfelShadows:
 
     @cached_property
     def _sky(self) -> SeenSky:
-        grey = torch.full_like(self.vertices, UNPAINTED)
-        plain = grey[:, 0].contiguous()
-        return seen_sky(
-            build_tracer(TriangleMesh(self.vertices, self.faces, vertex_normals(self.vertices, self.faces), grey, plain, 0 * plain))
-        )
+        return seen_sky(surface_of(self.vertices, self.faces))
 
     @torch.no_grad()
     def share(
@@ -86,13 +80,8 @@ def shadows_of_surfels(
     """
     centers = parameters["centers"].detach()
     tangents = rotation_from_quat_wxyz(parameters["quats"])[:, :, :2] * parameters["log_scales"].exp()[:, None, :]
-    opacities, empty = torch.sigmoid(parameters["opacity_logits"]), torch.zeros_like(centers[:, :1])
-    settings, maps = RasterSettings(near_plane(radius), median=True), []
-    for camera in cameras:
-        smaller = scaled_camera(camera, SHADOW_PICTURES).to(centers.device)
-        drawn = rasterize(centers, tangents, opacities, empty, smaller, settings)
-        assert drawn.median_depth is not None  # asked for by RasterSettings.median
-        maps.append(DepthMap(smaller, drawn.median_depth, drawn.coverage))
+    smaller = tuple(scaled_camera(camera, SHADOW_PICTURES) for camera in cameras)
+    maps = median_depths(centers, tangents, torch.sigmoid(parameters["opacity_logits"]), smaller, radius)
     try:
         vertices, faces = extract_mesh(maps, center, radius, SHADOW_MESH)
     except ValueError:  # fog: nothing casts a shadow yet
