@@ -59,7 +59,7 @@ def unexplained_looks(
 def irradiance_by_harmonics(sky: SeenSky) -> Float[Tensor, "vertex 16"]:
     """Of each vertex the irradiance over pi that arrives from light of each harmonic, less what the surface hides, and with what it sends back."""
     each = sh_basis(sky.directions) * (4 / len(sky.directions))
-    unhidden = sky.cosine.T @ each
+    unhidden = (sky.normals @ sky.directions.T).clamp(min=0) @ each
     met = (sky.first_met[1:] - sky.first_met[:-1]).long()
     vertex = torch.repeat_interleave(torch.arange(len(met), device=met.device), met)
 

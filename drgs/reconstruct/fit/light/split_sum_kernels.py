@@ -110,6 +110,25 @@ def _mirrored(normal: wp.vec3, wo: wp.vec3, roughness: float) -> _Mirrored:
 
 
 @wp.func
+def looked_up(direction: wp.vec3, first: int, rows: int, tables: wp.array[wp.vec3]) -> wp.vec3:
+    """Of the table of so many rows that begins at `first`."""
+    uv = _uv(direction)
+    return texel_value(tables, texels_at(first, rows, uv[0], uv[1]))
+
+
+@wp.func
+def lookup_gradient(
+    g: wp.vec3, direction: wp.vec3, first: int, rows: int, tables: wp.array[wp.vec3], table_gradients: wp.array[wp.vec3]
+) -> wp.vec3:
+    """Of g times looked_up, by the direction; that of the table is added to `table_gradients`."""
+    uv = _uv(direction)
+    about = texels_at(first, rows, uv[0], uv[1])
+    by_uv = texel_slopes(tables, about, rows, g)
+    add_to_texels(table_gradients, about, g)
+    return _uv_gradient(direction, by_uv[0], by_uv[1])
+
+
+@wp.func
 def radiance_of_point(
     diffuse_albedo: wp.vec3,
     f0: wp.vec3,
@@ -126,8 +145,7 @@ def radiance_of_point(
     sky = texel_value(tables, mirror.near) * (1.0 - mirror.fraction) + texel_value(tables, mirror.far) * mirror.fraction
     reflected = sky * transmittance + hit_radiance
     factors = _factors(factor_table, wp.dot(normal, wo), roughness).value
-    about = _uv(normal)
-    irradiance = texel_value(tables, texels_at(_IRRADIANCE_START, _IRRADIANCE_ROWS, about[0], about[1]))
+    irradiance = looked_up(normal, _IRRADIANCE_START, _IRRADIANCE_ROWS, tables)
     specular = wp.cw_mul(reflected, f0 * factors[0] + wp.vec3(factors[1], factors[1], factors[1]))
     return wp.cw_mul(diffuse_albedo, wp.cw_mul(irradiance, open_share)) + specular
 
@@ -140,6 +158,7 @@ class PointGradients:
     f0: wp.vec3
     roughness: float
     normal: wp.vec3
+    open_share: wp.vec3
 
 
 @wp.func
@@ -165,10 +184,8 @@ def gradients_of_point(
     f = mirror.fraction
     reflected = (near * (1.0 - f) + far * f) * transmittance + hit_radiance
     factors = _factors(factor_table, n_dot_v, roughness)
-    about = _uv(normal)
-    overhead = texels_at(_IRRADIANCE_START, _IRRADIANCE_ROWS, about[0], about[1])
+    irradiance = looked_up(normal, _IRRADIANCE_START, _IRRADIANCE_ROWS, tables)
     g_open = wp.cw_mul(g, open_share)
-    g_irradiance = wp.cw_mul(g_open, diffuse_albedo)
 
     g_reflectance = wp.cw_mul(g, reflected)
     g_factors = wp.vec2(wp.dot(g_reflectance, f0), g_reflectance[0] + g_reflectance[1] + g_reflectance[2])
@@ -181,17 +198,18 @@ def gradients_of_point(
     within = wp.where(roughness >= _ROUGHNESS[0], 1.0, 0.0) * wp.where(roughness <= _ROUGHNESS[_LEVEL_COUNT - 1], 1.0, 0.0)
     by_uv = texel_slopes(tables, mirror.near, _ROWS[level], g_near) + texel_slopes(tables, mirror.far, _ROWS[level + 1], g_far)
     g_mirror = _uv_gradient(mirror.direction, by_uv[0], by_uv[1])
-    by_about = texel_slopes(tables, overhead, _IRRADIANCE_ROWS, g_irradiance)
     add_to_texels(table_gradients, mirror.near, g_near)
     add_to_texels(table_gradients, mirror.far, g_far)
-    add_to_texels(table_gradients, overhead, g_irradiance)
 
     found = PointGradients()
-    found.diffuse_albedo = wp.cw_mul(g_open, texel_value(tables, overhead))
+    found.diffuse_albedo = wp.cw_mul(g_open, irradiance)
+    found.open_share = wp.cw_mul(wp.cw_mul(g, diffuse_albedo), irradiance)
     found.f0 = g_reflectance * factors.value[0]
     found.roughness = wp.dot(g_factors, factors.by_roughness) + between * within
     g_cosine = wp.dot(g_factors, factors.by_cosine) + 2.0 * wp.dot(g_mirror, normal)
-    found.normal = 2.0 * n_dot_v * g_mirror + g_cosine * wo + _uv_gradient(normal, by_about[0], by_about[1])
+    g_irradiance = wp.cw_mul(g_open, diffuse_albedo)
+    by_irradiance = lookup_gradient(g_irradiance, normal, _IRRADIANCE_START, _IRRADIANCE_ROWS, tables, table_gradients)
+    found.normal = 2.0 * n_dot_v * g_mirror + g_cosine * wo + by_irradiance
     return found
 
 

@@ -24,6 +24,7 @@ from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
+from drgs.reconstruct.fit.light.turned_light import COARSE, FINE
 from drgs.reconstruct.fit.losses import crossed_halves
 from drgs.reconstruct.fit.surface.displaced_surface import DisplacedSurface, weights_where_seen
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
@@ -173,7 +174,7 @@ class _Steps:
     ) -> None:
         self.state, self.settings, self.faces = state, settings, faces
         self.targets = view_targets(views, 1.0, faces.device)
-        self.surface = MovingSurface(views, faces, state, same_place)
+        self.surface = MovingSurface(views, faces, state, same_place, COARSE if settings.still else FINE)
         self.displaced = DisplacedSurface(self.surface, state, settings.moves.box) if settings.displaces else None
         # What photographs say of light that turns (light_from_turns) they say by normals, which a move has returned to the surface's own.
         self._light_at = settings.iterations // 2 if self.surface.light_turns else 0
@@ -239,13 +240,14 @@ class _Steps:
         """
         tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
         tables = filter_environment(environment)
-        light_of = self.surface.light_of(tables)
+        _ = self.surface.sky  # traced once, before threads ask for it
         chosen = [self._some_pixels(target, len(targets)) for target in targets]
 
         def cost(first: int, last: int, leaves: tuple[Tensor, ...], generator: torch.Generator) -> tuple[Tensor, Tensor]:
             seen = zip(chosen[first:last], targets[first:last], strict=True)
             # Light that turns is found here, by the thread that needs it.
-            parts = [_cost_of_pixels(pixels, target, tracer, light_of(target), leaves, generator) for pixels, target in seen]
+            light_of = self.surface.light_of(leaves[0], leaves[1][:, :3].contiguous())
+            parts = [_cost_of_pixels(pixels, target, tracer, light_of(target), leaves[1:], generator) for pixels, target in seen]
             if not parts:  # fewer photographs than threads
                 return leaves[0].sum() * 0, torch.zeros(2, device=surface.device)
             errors, others = zip(*parts, strict=True)
@@ -272,10 +274,10 @@ def _cost_of_pixels(
     """Of the `pixels` (flat) the error, summed; the squared one and the number of channels that were compared.
 
     Args:
-        leaves: the light's tables, packed_surface and, of a displaced surface, positions.
+        leaves: packed_surface and, of a displaced surface, positions.
     """
-    tables, surface, *positions = leaves
-    normals, light = surface.detach()[:, :3].contiguous(), replace(light, tables=tables)
+    surface, *positions = leaves
+    normals = surface.detach()[:, :3].contiguous()
     twice = seen_twice(target, pixels, tracer, generator)
     steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
     compared = [seen[steep] for seen in twice]
@@ -284,5 +286,5 @@ def _cost_of_pixels(
     halves = [shade_places(seen, target, tracer, surface, light, generator) for seen in compared]
     photo = target.saturation.reshape(-1, 3)[compared[0].pixels]
     count = photo.numel()
-    error = crossed_halves(halves[0], halves[1], photo) * count if count else tables.sum() * 0
-    return error, torch.stack([(halves[0].detach().clamp(0, 1) - photo).square().sum(), tables.new_tensor(count)])
+    error = crossed_halves(halves[0], halves[1], photo) * count if count else surface.sum() * 0
+    return error, torch.stack([(halves[0].detach().clamp(0, 1) - photo).square().sum(), surface.new_tensor(count)])

@@ -21,7 +21,7 @@ from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import ENVIRONMENT_PYRAMID, environment_table, upsampled
 from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, irradiance_share
 from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
-from drgs.reconstruct.fit.light.turned_light import SeenSky, light_of_views, seen_sky
+from drgs.reconstruct.fit.light.turned_light import COARSE, Fineness, SeenSky, light_of_views, seen_sky
 from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.alike_systems import AlikeSystems
@@ -65,21 +65,25 @@ class MoveSettings:
 class MovingSurface:
     """Final. The mesh of a fit, with the tracer of where it is now."""
 
-    def __init__(self, views: Views, faces: Tensor, state: FitState, same_place: "MovingSurface | None" = None) -> None:
+    def __init__(
+        self, views: Views, faces: Tensor, state: FitState, same_place: "MovingSurface | None" = None, fineness: Fineness = COARSE
+    ) -> None:
         """
         Args:
             same_place: a surface whose vertices lie where the state's do, and whose faces these are: what rays find there need not be found anew.
+            fineness: of what each vertex sees of light that turns.
         """
         self._state, self.faces = state, faces
         self._cameras = tuple(camera.to(faces.device) for camera in views.cameras)
         self._views = views
         self.light_turns = views.light_from_world is not None
+        self._fineness = fineness
         self._seen_sky: SeenSky | None = None
         self._around: csr_matrix | None = None
         if same_place is None:
             self.edges, self.tracer = mesh_edges(faces), self._tracer()
         else:
-            self.edges, self._seen_sky = same_place.edges, same_place._sky
+            self.edges, self._seen_sky = same_place.edges, same_place.sky
             self.tracer = same_place.tracer.with_materials(mesh_from_surface_fit(state, faces))
 
     @cached_property
@@ -88,10 +92,10 @@ class MovingSurface:
         return outline_rays(self._cameras if outlines else (), outlines, self.faces.device)
 
     @property
-    def _sky(self) -> SeenSky | None:
+    def sky(self) -> SeenSky | None:
         """What the vertices see, where the light turns: traced when it is first asked for after relight, as fits do many times between two moves."""
         if self.light_turns and self._seen_sky is None:
-            self._seen_sky = seen_sky(self.tracer)
+            self._seen_sky = seen_sky(self.tracer, self._fineness)
         return self._seen_sky
 
     def _tracer(self) -> AbstractTracer:
@@ -227,14 +231,14 @@ class MovingSurface:
         )  # fmt: skip
         return white - none
 
-    def light_of(self, tables: Tensor) -> LightOf:
+    def light_of(self, tables: Tensor, normals: Tensor | None = None) -> LightOf:
         """What light arrives at the surface in each photograph.
 
         Args:
-            tables: of filter_environment.
+            tables: of filter_environment. normals: of light_of_views.
         """
         parameters = self._state.parameters
-        return light_of_views(tables, parameters["open_share"], torch.sigmoid(parameters["albedo_logits"].detach()), self._sky)
+        return light_of_views(tables, parameters["open_share"], torch.sigmoid(parameters["albedo_logits"].detach()), self.sky, normals)
 
     @torch.no_grad()
     def look_for_metal(self, targets: list[ViewTarget], settings: MoveSettings) -> ViewSums:

@@ -4,7 +4,7 @@ A step of the surface's fit shades some ten thousand places and goes back throug
 took three times as long. Gradients are written out (split_sum_kernels.py) and added where vertices and the light's tables are.
 
 In: places of pixels on the mesh, numbers of its vertices, the filtered light. Out: (place, 3) colours in display space; gradients reach the numbers
-of the vertices and the tables.
+of the vertices, the tables and, where it wants one, the share of the open sky's irradiance that arrives.
 """
 
 from typing import Any
@@ -147,9 +147,11 @@ def color_adjoint(
     radiance: wp.array[wp.vec3],
     uncut: wp.array[wp.vec3],
     color_gradient: wp.array[wp.vec3],
+    slopes_of_share: int,
     # outputs
     surface_gradients: wp.array2d[float],
     table_gradients: wp.array[wp.vec3],
+    share_gradients: wp.array[wp.vec3],
 ):
     """Many arguments because a struct of them would be filled anew, array by array, for each launch."""
     i = first + wp.tid()
@@ -176,6 +178,8 @@ def color_adjoint(
             wp.atomic_add(surface_gradients, c, 3 + axis, w * g_albedo[axis])
         wp.atomic_add(surface_gradients, c, 6, w * found.roughness)
         wp.atomic_add(surface_gradients, c, 7, w * g_metallic)
+        if slopes_of_share != 0:
+            wp.atomic_add(share_gradients, c, w * found.open_share)
 
 
 def surface_color(
@@ -189,22 +193,24 @@ def surface_color(
     surface: Float[Tensor, "vertex 8"],
     light: MeshLight,
 ) -> Float[Tensor, "place 3"]:
-    """Colours in display space, as display_image has them; differentiable in `surface` and in the light's tables.
+    """Colours in display space, as display_image has them; differentiable in `surface` and in the light's tables and share.
 
     Args:
         corners, weights: of each place. wo: unit, world. transmittance, met: of mirrored_light. photo: what the photograph shows there, for what is
             saturated. ceiling: its largest value. surface: of packed_surface.
     """
     given = (corners, weights, wo, transmittance, met, photo, light.open_share, factor_table(wo.device))
-    return _SurfaceColor.apply(surface, light.tables, given, rotation_of(light.light_from_world), ceiling)
+    return _SurfaceColor.apply(surface, light.tables, light.open_share, given, rotation_of(light.light_from_world), ceiling)
 
 
 _TYPES = (None, wp.vec3, wp.vec3, None, wp.vec3, wp.vec3, wp.vec3, wp.vec2)
+_SHARE = 6
+"""Place of the open sky's share among what is given."""
 
 
 class _SurfaceColor(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, surface, tables, given, rotation, ceiling):
+    def forward(ctx, surface, tables, open_share, given, rotation, ceiling):
         radiance, uncut, color = (torch.empty_like(given[2]) for _ in range(3))
         surface, tables = surface.detach().contiguous(), tables.detach().contiguous()
         ctx.given, ctx.rotation, ctx.ceiling = tuple(x.detach().contiguous() for x in given), rotation, ceiling
@@ -218,8 +224,10 @@ class _SurfaceColor(torch.autograd.Function):
         surface, tables, radiance, uncut = ctx.saved_tensors
         gradient = gradient.contiguous()
         inputs = [*_arguments(ctx, surface, tables), *(warp_argument(x, wp.vec3) for x in (radiance, uncut, gradient))]
-        added = [(surface, None), (tables, wp.vec3)]
-        return (*launch_adding(color_adjoint, len(gradient), inputs, [], added, warp_device(gradient)), None, None, None)
+        share, asked = ctx.given[_SHARE], ctx.needs_input_grad[2]
+        added = [(surface, None), (tables, wp.vec3), (share if asked else share[:0], wp.vec3)]
+        found = launch_adding(color_adjoint, len(gradient), [*inputs, int(asked)], [], added, warp_device(gradient))
+        return (*found[:2], found[2] if asked else None, None, None, None)
 
 
 def _arguments(ctx: Any, surface: Tensor, tables: Tensor) -> list:

@@ -7,19 +7,22 @@ import pytest
 import torch
 
 from drgs.maths.frames import rotation_from_quat_wxyz
-from drgs.reconstruct.fit.light.mesh_light import MeshLight, irradiance_share
-from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, filter_environment, level_table, shade_split_sum, texel_directions
+from drgs.reconstruct.fit.light.mesh_light import BRIGHTEST_SHARE, MeshLight, irradiance_share
+from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, filter_environment, shade_split_sum, texel_directions
 from drgs.reconstruct.fit.light.turned_light import (
     BOUNCES,
-    DIRECTIONS,
-    LOBE,
+    COARSE,
+    FINE,
+    Fineness,
     SeenSky,
     arriving_share,
     even_directions,
     light_of_views,
     seen_sky,
 )
+from drgs.reconstruct.fit.light.turned_light_kernels import SUM_ROWS
 from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.reference.split_sum import split_tables
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.camera import Camera
 from drgs.scene.environment import Environment, environment_radiance, turned_environment
@@ -59,28 +62,96 @@ def test_shares_are_those_that_are_sampled_for_the_light_as_it_is_turned(albedo:
     assert float((found - sampled).abs().mean()) < 0.015
 
 
-def share_twin(sky: SeenSky, albedo: torch.Tensor, tables: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
-    """The specification, by whole matrices: what is sent from vertex to vertex, and which directions are open."""
-    radiance = environment_radiance(Environment(level_table(tables, LOBE)), sky.directions @ turn.T).double()
-    cosine, count = sky.cosine.T.double(), len(albedo)
-    receiver = torch.repeat_interleave(torch.arange(count), sky.first_met.diff().long())
-    open_, sends = cosine > 0, torch.zeros(count, count, dtype=torch.float64)
-    open_[receiver, sky.met_direction.long()] = False
-    sends.index_put_((receiver, sky.sender.long()), cosine[receiver, sky.met_direction.long()], accumulate=True)
-    direct = (cosine * open_) @ radiance
-    arriving = direct
-    for _ in range(BOUNCES):
-        arriving = direct + sends @ (albedo.double() * arriving) * (4 / DIRECTIONS)
-    return arriving / (cosine @ radiance)
+def share_twin(
+    sky: SeenSky,
+    albedo: torch.Tensor,
+    tables: torch.Tensor,
+    turn: torch.Tensor,
+    normals: torch.Tensor | None = None,
+    *,
+    by_table: bool = True,
+) -> torch.Tensor:
+    """The specification, by whole matrices: what is sent from vertex to vertex, and which directions are open.
+
+    Args:
+        by_table: all of the sky about a normal is looked up in a table of such sums; False: summed itself.
+    """
+    own, tables, turn = sky.normals.double(), tables.double(), turn.double()
+    all_of_it, left = from_sky(sky, own if normals is None else normals, tables, turn, by_table)
+    sends = sky if sky.sends is None else sky.sends
+    with torch.no_grad():
+        direct, sent_back = from_sky(sends, own, tables, turn, by_table)[1], 0.0
+        for _ in range(BOUNCES):
+            sent_back = exchanged(sends) @ (albedo.double() * (direct + sent_back))
+    share = ((left + sent_back) / all_of_it).clamp(0, BRIGHTEST_SHARE)
+    return torch.where(sky.first_met.diff()[:, None] > 0, share, torch.ones_like(share))
 
 
-def test_shares_are_those_of_whole_matrices() -> None:
+def receivers(sky: SeenSky) -> torch.Tensor:
+    """Of each direction in which something is met."""
+    return torch.repeat_interleave(torch.arange(len(sky.normals)), sky.first_met.diff().long())
+
+
+def from_sky(
+    sky: SeenSky, normals: torch.Tensor, tables: torch.Tensor, turn: torch.Tensor, by_table: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Over pi, all of it and what is left of it."""
+    directions = sky.directions.double()
+    radiance = environment_radiance(Environment(split_tables(tables)[0][sky.fineness.lobe]), directions @ turn.T) * (4 / len(directions))
+    met = torch.zeros(len(normals), len(directions), dtype=torch.float64)
+    met[receivers(sky), sky.met_direction.long()] = 1
+    about = Environment((texel_directions(SUM_ROWS).double() @ directions.T).clamp(min=0) @ radiance)
+    cosines = (normals @ directions.T).clamp(min=0)
+    all_of_it = environment_radiance(about, normals) if by_table else cosines @ radiance
+    return all_of_it, (all_of_it - (cosines * met) @ radiance).clamp(min=0)
+
+
+def exchanged(sky: SeenSky) -> torch.Tensor:
+    """What vertices receive of others' radiance times pi."""
+    count, receiver = len(sky.normals), receivers(sky)
+    cosines = (sky.normals @ sky.directions.T).double()[receiver, sky.met_direction.long()] * (4 / len(sky.directions))
+    return torch.zeros(count, count, dtype=torch.float64).index_put((receiver, sky.sender.long()), cosines, accumulate=True)
+
+
+@pytest.mark.parametrize("fineness", [COARSE, FINE], ids=["coarse", "fine"])
+def test_shares_are_those_of_whole_matrices(fineness: Fineness) -> None:
     mesh = spheres(0.8)
     albedo = mesh.albedo * torch.linspace(0.2, 1.0, len(mesh.vertices))[:, None]
-    sky, tables = seen_sky(build_tracer(mesh)), filter_environment(smooth_sky().radiance)
+    sky, tables = seen_sky(build_tracer(mesh), fineness), filter_environment(smooth_sky().radiance)
     assert int(sky.first_met[-1]) == len(sky.sender) > 1000
     found = arriving_share(sky, albedo, tables, TURN)
     torch.testing.assert_close(found.double(), share_twin(sky, albedo, tables, TURN), atol=2e-6, rtol=0)
+
+
+def lamp_and_sky() -> Environment:
+    """smooth_sky with a lamp that spheres hide from each other where TURN takes it."""
+    sky = smooth_sky().radiance.clone()
+    direction = texel_directions(ENVIRONMENT_SIZE[0])
+    sky[(direction @ (TURN @ torch.tensor([1.0, 0.0, 0.1]))) > 0.95] += 20.0
+    return Environment(sky)
+
+
+@pytest.mark.parametrize("fineness", [COARSE, FINE], ids=["coarse", "fine"])
+def test_shares_of_fitted_normals_and_their_slopes_are_those_of_whole_matrices(device: str, fineness: Fineness) -> None:
+    mesh, generator = spheres(0.8), torch.Generator().manual_seed(3)
+    sky, tables = seen_sky(build_tracer(mesh), fineness), filter_environment(lamp_and_sky().radiance)
+    random = torch.randn(mesh.vertices.shape, generator=generator)
+    tilted = torch.nn.functional.normalize(mesh.normals + 0.2 * random, dim=-1)
+    pull = torch.rand(tilted.shape, generator=generator) - 0.4
+    leaves = [x.double().requires_grad_(True) for x in (tables, tilted)]
+    wanted = share_twin(sky, mesh.albedo, leaves[0], TURN, leaves[1])
+    wanted_slopes = torch.autograd.grad((wanted * pull).sum(), leaves)
+    assert float((wanted.detach() - share_twin(sky, mesh.albedo, tables, TURN)).abs().max()) > 0.1  # normals matter
+
+    own_sky = seen_sky(build_tracer(TriangleMesh(**{name: value.to(device) for name, value in mesh.columns.items()})), fineness)
+    own = [x.to(device).requires_grad_(True) for x in (tables, tilted)]
+    found = arriving_share(own_sky, mesh.albedo.to(device), own[0], TURN.to(device), own[1])
+    slopes = torch.autograd.grad((found * pull.to(device)).sum(), own)
+    torch.testing.assert_close(found.detach().cpu().double(), wanted.detach(), atol=5e-5, rtol=0)
+    for slope, expected in zip(slopes, wanted_slopes, strict=True):
+        assert float(expected.abs().max()) > 0
+        error = (slope.cpu().double() - expected).abs() / (expected.abs() + 1e-2 * expected.abs().max())
+        assert float(error.max()) < 1e-2 and float(error.median()) < 1e-4
 
 
 def test_without_a_turn_an_open_vertex_has_all_of_the_sky() -> None:

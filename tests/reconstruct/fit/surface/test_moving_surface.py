@@ -83,7 +83,7 @@ def test_what_is_seen_of_a_turning_sky_is_traced_once_for_a_place_and_anew_after
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traced = []
-    monkeypatch.setattr(moving_surface, "seen_sky", lambda tracer: traced.append(seen_sky(tracer)) or traced[-1])
+    monkeypatch.setattr(moving_surface, "seen_sky", lambda *given: traced.append(seen_sky(*given)) or traced[-1])
     state, faces = two_spheres()
     views = with_light_of_camera(replace(painted_views(tmp_path, count=3), has_masks=False))
     target = view_targets(views, 1.0, torch.device("cpu"))[1]

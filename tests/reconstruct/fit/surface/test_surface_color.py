@@ -34,7 +34,9 @@ def seen() -> dict[str, torch.Tensor]:
     }
 
 
-def twin(seen: dict[str, torch.Tensor], surface: torch.Tensor, tables: torch.Tensor, turn: torch.Tensor | None) -> torch.Tensor:
+def twin(
+    seen: dict[str, torch.Tensor], surface: torch.Tensor, tables: torch.Tensor, open_share: torch.Tensor, turn: torch.Tensor | None
+) -> torch.Tensor:
     """As surface_color, operation by operation."""
     at = lambda values: (values[seen["corners"]] * seen["weights"][..., None]).sum(1)  # noqa: E731
     normal, albedo, roughness, metallic = at(surface).split([3, 3, 1, 1], 1)
@@ -43,7 +45,7 @@ def twin(seen: dict[str, torch.Tensor], surface: torch.Tensor, tables: torch.Ten
         normal, wo = normal @ turn.T.to(normal), wo @ turn.T.to(wo)
     radiance = reference.shade_split_sum(
         albedo * (1 - metallic), torch.zeros_like(albedo), f0_from_base(albedo, metallic[:, 0]), roughness[:, 0], normal, wo, tables,
-        brdf_table(32), seen["transmittance"], seen["met"], at(seen["open_share"]),
+        brdf_table(32), seen["transmittance"], seen["met"], at(open_share),
     )  # fmt: skip
     return display_image(radiance, torch.ones_like(radiance[:, 0]), seen["photo"], CEILING)
 
@@ -51,17 +53,17 @@ def twin(seen: dict[str, torch.Tensor], surface: torch.Tensor, tables: torch.Ten
 @pytest.mark.parametrize("turn", [None, TURN], ids=["still", "turned"])
 def test_colours_and_gradients_equal_the_twin(seen: dict[str, torch.Tensor], device: str, turn: torch.Tensor | None):
     pull = torch.rand(PLACES, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64) - 0.4
-    leaves = [seen[name].clone().requires_grad_(True) for name in ("surface", "tables")]
+    leaves = [seen[name].clone().requires_grad_(True) for name in ("surface", "tables", "open_share")]
     expected = twin(seen, *leaves, turn)
     expected_gradients = torch.autograd.grad((expected * pull).sum(), leaves)
     assert 0.02 < float(((expected == CEILING) & (seen["photo"] == CEILING)).double().mean()) < 0.2  # some are cut
 
     own = {name: (value if name == "corners" else value.float()).to(device) for name, value in seen.items()}
-    surface, tables = (own[name].requires_grad_(True) for name in ("surface", "tables"))
-    light = MeshLight(tables, own["open_share"], None if turn is None else turn.to(device))
+    surface, tables, share = (own[name].requires_grad_(True) for name in ("surface", "tables", "open_share"))
+    light = MeshLight(tables, share, None if turn is None else turn.to(device))
     given = (own[name] for name in ("corners", "weights", "wo", "transmittance", "met", "photo"))
     color = surface_color(*given, CEILING, surface, light)
-    gradients = torch.autograd.grad((color * pull.float().to(device)).sum(), [surface, tables])
+    gradients = torch.autograd.grad((color * pull.float().to(device)).sum(), [surface, tables, share])
 
     assert float((color.detach().cpu().double() - expected.detach()).abs().max()) < 1e-4
     for found, wanted in zip(gradients, expected_gradients, strict=True):
