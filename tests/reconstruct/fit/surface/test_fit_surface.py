@@ -1,5 +1,6 @@
 """The surface's fit on the painted sphere: it finds size and colours, repeats itself, and goes on where it stopped."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -134,9 +135,16 @@ def test_light_is_looked_for_by_paint_before_the_first_step_or_half_way_where_it
     assert asked == expected
 
 
+def with_a_pattern(views: Views) -> Views:
+    """The same pictures, whose colours say which way the sphere faces, with waves of paint instead: what is smooth says little of where it lies."""
+    waves = (127.5 + 80 * torch.sin(6 * (image.float() / 127.5 - 1)) for image in views.images_srgb)
+    return replace(views, images_srgb=tuple(image.round().to(torch.uint8) for image in waves))
+
+
 @pytest.mark.slow
 def test_a_dent_is_moved_back_by_what_pixels_show(views: Views):
     """Of paint that is known already, under even light, which shades nothing: what tells of the dent is where pixels see the paint's pattern."""
+    views = with_a_pattern(views)
     rates = SurfaceRates(normals=0.0, albedo_logits=0.0, roughness_logits=0.0, metallic_logits=0.0, environment=0.0, offsets=0.1)
     settings = short(
         rounds=1, steps_a_round=60, settle_every=10, displaces=True, fall_from=0.0, rates=rates, weight_bend=0.003, weight_bend_end=0.003
@@ -157,4 +165,4 @@ def test_a_dent_is_moved_back_by_what_pixels_show(views: Views):
         assert not state.parameters["offsets"].any()
         depths.append(SPHERE_RADIUS - (state.parameters["vertices"] - CENTER).norm(dim=1))
     deep = dent > 0.5 * float(dent.max())
-    assert float((depths[1] - depths[0])[deep].abs().mean()) < 0.5 * float(dent[deep].mean())
+    assert float((depths[1] - depths[0])[deep].abs().mean()) < 0.3 * float(dent[deep].mean())
