@@ -58,18 +58,19 @@ def unexplained_looks(
 
 def irradiance_by_harmonics(sky: SeenSky) -> Float[Tensor, "vertex 16"]:
     """Of each vertex the irradiance over pi that arrives from light of each harmonic, less what the surface hides, and with what it sends back."""
-    each = sh_basis(sky.directions) * (4 / len(sky.directions))
-    unhidden = (sky.normals @ sky.directions.T).clamp(min=0) @ each
-    met = (sky.first_met[1:] - sky.first_met[:-1]).long()
+    coarse = sky.coarse
+    each = sh_basis(coarse.directions) * (4 / len(coarse.directions))
+    unhidden = (coarse.normals @ coarse.directions.T).clamp(min=0) @ each
+    met = (coarse.first_met[1:] - coarse.first_met[:-1]).long()
     vertex = torch.repeat_interleave(torch.arange(len(met), device=met.device), met)
 
     def gathered(values: Float[Tensor, "met 16"]) -> Float[Tensor, "vertex 16"]:
         return torch.zeros_like(unhidden).index_add_(0, vertex, sky.met_cosine[:, None] * values)
 
-    direct = unhidden - gathered(each[sky.met_direction.long()])
+    direct = unhidden - gathered(each[coarse.met_direction.long()])
     arriving = direct
     for _ in range(BOUNCES):
-        arriving = direct + gathered(SENT_BACK * 4 / len(sky.directions) * arriving[sky.sender.long()])
+        arriving = direct + gathered(SENT_BACK * 4 / len(coarse.directions) * arriving[sky.sender.long()])
     return arriving
 
 

@@ -67,11 +67,11 @@ def test_a_ball_alone_gets_the_cosine_lobes_share_of_each_degree() -> None:
 def test_shadows_and_what_is_sent_back_are_those_of_whole_matrices() -> None:
     """Of the even part."""
     sky = seen_sky(plate_and_balls())
-    found, count = irradiance_by_harmonics(sky)[:, :1], len(sky.normals)
+    found, count = irradiance_by_harmonics(sky)[:, :1], len(sky.coarse.normals)
     even = filter_environment(torch.ones(*ENVIRONMENT_SIZE, 3))
     share = share_twin(sky, torch.full((count, 3), SENT_BACK), even, torch.eye(3), by_table=False)[:, :1]
-    cosines = (sky.normals @ sky.directions.T).clamp(min=0).double()
-    open_sky = cosines.sum(1, keepdim=True) * (4 / len(sky.directions)) * float(sh_basis(sky.directions[0], 0))
+    cosines = (sky.coarse.normals @ sky.coarse.directions.T).clamp(min=0).double()
+    open_sky = cosines.sum(1, keepdim=True) * (4 / len(sky.coarse.directions)) * float(sh_basis(sky.coarse.directions[0], 0))
     torch.testing.assert_close(found.double(), open_sky * share, atol=1e-5, rtol=0)
     assert float(share.min()) < 0.6
 

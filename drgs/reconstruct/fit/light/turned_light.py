@@ -50,24 +50,32 @@ FINE = Fineness(768, 1)
 
 
 @dataclass(frozen=True, eq=False)
-class SeenSky:
-    """What each vertex sees of the sky, and what sends light back to it."""
+class HiddenSky:
+    """Where each vertex meets something instead of the sky."""
 
     fineness: Fineness
     directions: Float[Tensor, "direction 3"]
     """Unit, world: even_directions."""
     normals: Float[Tensor, "vertex 3"]
-    """Of the faces around each: below their horizon nothing is seen."""
+    """Of the faces around each: below their horizon nothing is looked for."""
     first_met: Int[Tensor, "vertex_and_end"]
     """Where in what follows, which is in the order of vertices, that of each vertex begins."""
     met_direction: Int16[Tensor, "met"]
     """In which something is met."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSky:
+    """What each vertex sees of the sky, and what sends light back to it."""
+
+    hidden: HiddenSky
+    """As fine as shadows are to be."""
+    coarse: HiddenSky
+    """COARSE, for what things send each other is softer than shadows; the same where shadows are as coarse."""
     met_cosine: Float[Tensor, "met"]
-    """At the vertex that meets it."""
+    """Of what `coarse` meets, at the vertex that meets it."""
     sender: Int[Tensor, "met"]
     """Vertex that is met: of a face the nearest corner."""
-    sends: "SeenSky | None" = None
-    """By which it is found what things send each other, which is softer than shadows; None: by this."""
 
 
 def even_directions(count: int) -> Float[Tensor, "{count} 3"]:
@@ -82,6 +90,12 @@ def even_directions(count: int) -> Float[Tensor, "{count} 3"]:
 @torch.no_grad()
 def seen_sky(tracer: AbstractTracer, fineness: Fineness = COARSE) -> SeenSky:
     """Of the tracer's mesh, by the normals of its faces: fitted ones change with each step, and a fit that is resumed must see the same."""
+    coarse, met_cosine, sender = _hidden_sky(tracer, COARSE)
+    return SeenSky(coarse if fineness == COARSE else _hidden_sky(tracer, fineness)[0], coarse, met_cosine, sender)
+
+
+def _hidden_sky(tracer: AbstractTracer, fineness: Fineness) -> tuple[HiddenSky, Tensor, Tensor]:
+    """With the cosines and senders of what is met."""
     mesh = tracer.mesh
     normals = vertex_normals(mesh.vertices, mesh.faces)
     directions = even_directions(fineness.directions).to(normals)
@@ -97,10 +111,8 @@ def seen_sky(tracer: AbstractTracer, fineness: Fineness = COARSE) -> SeenSky:
         directions_met.append(direction[met].to(torch.int16))
         cosines_met.append(cosines[at[met], direction[met]])
         senders.append(mesh.faces[hits.face[met].long()].gather(1, nearest).squeeze(1).to(torch.int32))
-    sends = None if fineness == COARSE else seen_sky(tracer)
     first_met = torch.cat([counts[0][:1] * 0, torch.cat(counts).cumsum(0)]).to(torch.int32)
-    met_direction, met_cosine, sender = (torch.cat(parts) for parts in (directions_met, cosines_met, senders))
-    return SeenSky(fineness, directions, normals, first_met, met_direction, met_cosine, sender, sends)
+    return HiddenSky(fineness, directions, normals, first_met, torch.cat(directions_met)), torch.cat(cosines_met), torch.cat(senders)
 
 
 @cache
@@ -123,16 +135,14 @@ def arriving_share(
         albedo: (vertex, 3) base colour of what sends light back; of metal it stands for what it mirrors. tables: of filter_environment.
         normals: (vertex, 3) unit, which way the surface faces where that is fitted; None: as its faces do.
     """
-    radiance, sums = _summed(sky, tables, light_from_world)
-    if sky.sends is None:
-        sent_back = _sent_back(sky, albedo, radiance.detach(), sums.detach())
-    else:
-        coarse = _sent_back(sky.sends, albedo, *_summed(sky.sends, tables.detach(), light_from_world))
-        sent_back = coarse * (len(sky.directions) / len(sky.sends.directions))
-    return _Share.apply(sky.normals if normals is None else normals, radiance, sums, sky, sent_back)
+    hidden, coarse = sky.hidden, sky.coarse
+    radiance, sums = _summed(hidden, tables, light_from_world)
+    softer = (radiance.detach(), sums.detach()) if coarse is hidden else _summed(coarse, tables.detach(), light_from_world)
+    sent_back = _sent_back(sky, albedo, *softer) * (len(hidden.directions) / len(coarse.directions))
+    return _Share.apply(hidden.normals if normals is None else normals, radiance, sums, hidden, sent_back)
 
 
-def _summed(sky: SeenSky, tables: Tensor, light_from_world: Tensor) -> tuple[Float[Tensor, "direction 3"], Float[Tensor, "texel 3"]]:
+def _summed(sky: HiddenSky, tables: Tensor, light_from_world: Tensor) -> tuple[Float[Tensor, "direction 3"], Float[Tensor, "texel 3"]]:
     """What the sky sends along the directions, and by a table of normals what it sends in all, summed over them. What hides nothing has all of the sky,
     whichever way it faces: so what is hidden is held against a sum over the same directions."""
     softened = Environment(level_table(tables, sky.fineness.lobe))
@@ -142,11 +152,16 @@ def _summed(sky: SeenSky, tables: Tensor, light_from_world: Tensor) -> tuple[Flo
 
 @torch.no_grad()
 def _sent_back(sky: SeenSky, albedo: Tensor, radiance: Tensor, sums: Tensor) -> Float[Tensor, "vertex 3"]:
-    """What arrives from what is met, summed over directions, where the surface faces as its faces do."""
-    albedo, direct = albedo.contiguous(), torch.empty_like(sky.normals)
+    """What arrives from what is met, summed over the coarse directions, where the surface faces as its faces do.
+
+    Args:
+        radiance, sums: of _summed along those.
+    """
+    coarse = sky.coarse
+    albedo, direct = albedo.contiguous(), torch.empty_like(coarse.normals)
     count, device, output = len(direct), warp_device(direct), warp_argument(direct, wp.vec3)
-    met = [warp_argument(sky.first_met), warp_argument(sky.met_direction), warp_argument(sky.met_cosine)]
-    launch(direct_kernel, count, [*met, *(warp_argument(x, wp.vec3) for x in (radiance, sky.normals, sums))], [output], device)
+    met = [warp_argument(coarse.first_met), warp_argument(coarse.met_direction), warp_argument(sky.met_cosine)]
+    launch(direct_kernel, count, [*met, *(warp_argument(x, wp.vec3) for x in (radiance, coarse.normals, sums))], [output], device)
     sent_back = torch.zeros_like(direct)
     for _ in range(BOUNCES):
         # A direction stands for 4 pi over their number; irradiance over pi times albedo is what is sent.
@@ -178,7 +193,7 @@ class _Share(torch.autograd.Function):
         return by_normals, by_radiance, by_sums, None, None
 
 
-def _share_arguments(sky: SeenSky, *vectors: Tensor) -> list:
+def _share_arguments(sky: HiddenSky, *vectors: Tensor) -> list:
     given = (warp_argument(x, wp.vec3) for x in (sky.directions, *vectors))
     return [warp_argument(sky.first_met), warp_argument(sky.met_direction), *given, BRIGHTEST_SHARE]
 

@@ -14,6 +14,7 @@ from drgs.reconstruct.fit.light.turned_light import (
     COARSE,
     FINE,
     Fineness,
+    HiddenSky,
     SeenSky,
     arriving_share,
     even_directions,
@@ -76,24 +77,23 @@ def share_twin(
     Args:
         by_table: all of the sky about a normal is looked up in a table of such sums; False: summed itself.
     """
-    own, tables, turn = sky.normals.double(), tables.double(), turn.double()
-    all_of_it, left = from_sky(sky, own if normals is None else normals, tables, turn, by_table)
-    sends = sky if sky.sends is None else sky.sends
+    own, tables, turn = sky.hidden.normals.double(), tables.double(), turn.double()
+    all_of_it, left = from_sky(sky.hidden, own if normals is None else normals, tables, turn, by_table)
     with torch.no_grad():
-        direct, sent_back = from_sky(sends, own, tables, turn, by_table)[1], 0.0
+        direct, sent_back = from_sky(sky.coarse, own, tables, turn, by_table)[1], 0.0
         for _ in range(BOUNCES):
-            sent_back = exchanged(sends) @ (albedo.double() * (direct + sent_back))
+            sent_back = exchanged(sky) @ (albedo.double() * (direct + sent_back))
     share = ((left + sent_back) / all_of_it).clamp(0, BRIGHTEST_SHARE)
-    return torch.where(sky.first_met.diff()[:, None] > 0, share, torch.ones_like(share))
+    return torch.where(sky.hidden.first_met.diff()[:, None] > 0, share, torch.ones_like(share))
 
 
-def receivers(sky: SeenSky) -> torch.Tensor:
+def receivers(sky: HiddenSky) -> torch.Tensor:
     """Of each direction in which something is met."""
     return torch.repeat_interleave(torch.arange(len(sky.normals)), sky.first_met.diff().long())
 
 
 def from_sky(
-    sky: SeenSky, normals: torch.Tensor, tables: torch.Tensor, turn: torch.Tensor, by_table: bool
+    sky: HiddenSky, normals: torch.Tensor, tables: torch.Tensor, turn: torch.Tensor, by_table: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Over pi, all of it and what is left of it."""
     directions = sky.directions.double()
@@ -108,8 +108,9 @@ def from_sky(
 
 def exchanged(sky: SeenSky) -> torch.Tensor:
     """What vertices receive of others' radiance times pi."""
-    count, receiver = len(sky.normals), receivers(sky)
-    cosines = (sky.normals @ sky.directions.T).double()[receiver, sky.met_direction.long()] * (4 / len(sky.directions))
+    coarse = sky.coarse
+    count, receiver = len(coarse.normals), receivers(coarse)
+    cosines = (coarse.normals @ coarse.directions.T).double()[receiver, coarse.met_direction.long()] * (4 / len(coarse.directions))
     return torch.zeros(count, count, dtype=torch.float64).index_put((receiver, sky.sender.long()), cosines, accumulate=True)
 
 
@@ -118,7 +119,7 @@ def test_shares_are_those_of_whole_matrices(fineness: Fineness) -> None:
     mesh = spheres(0.8)
     albedo = mesh.albedo * torch.linspace(0.2, 1.0, len(mesh.vertices))[:, None]
     sky, tables = seen_sky(build_tracer(mesh), fineness), filter_environment(smooth_sky().radiance)
-    assert int(sky.first_met[-1]) == len(sky.sender) > 1000
+    assert int(sky.coarse.first_met[-1]) == len(sky.sender) > 1000
     found = arriving_share(sky, albedo, tables, TURN)
     torch.testing.assert_close(found.double(), share_twin(sky, albedo, tables, TURN), atol=2e-6, rtol=0)
 
