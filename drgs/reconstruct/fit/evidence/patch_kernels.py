@@ -43,6 +43,7 @@ def pattern_kernel(
     shifts: wp.array[wp.vec3],
     sizes: wp.array[wp.vec3i],
     pictures: wp.array[float],
+    smooth: wp.array2d[float],
     faint: float,
     # outputs
     patterns: wp.array2d[float],
@@ -65,8 +66,6 @@ def pattern_kernel(
         middle = start + depths[d] * along
         row = (i * depths.shape[0] + d) * view.shape[1] + slot
         begun = float(0.0)
-        total = float(0.0)
-        square = float(0.0)
         for s in range(across.shape[1]):
             at = middle + turn * across[i, s]
             # Pixels' middles lie at halves.
@@ -82,17 +81,22 @@ def pattern_kernel(
             k += size[0]
             lower = pictures[k] + right * (pictures[k + 1] - pictures[k])
             value = upper + below * (lower - upper)
-            patterns[row, s] = value
-            # Sums over what differs from the first: of whole values they would lose the digits of faint patterns.
+            # What differs from the first: of whole values sums would lose the digits of faint patterns.
             if s == 0:
                 begun = value
-            total += value - begun
-            square += (value - begun) * (value - begun)
-        samples = float(across.shape[1])
-        mean = begun + total / samples
-        scale = 1.0 / (wp.sqrt(wp.max(square - total * total / samples, 0.0)) + faint)
+            patterns[row, s] = value - begun
+        for term in range(smooth.shape[0]):
+            share = float(0.0)
+            for s in range(across.shape[1]):
+                share += smooth[term, s] * patterns[row, s]
+            for s in range(across.shape[1]):
+                patterns[row, s] -= share * smooth[term, s]
+        square = float(0.0)
         for s in range(across.shape[1]):
-            patterns[row, s] = (patterns[row, s] - mean) * scale
+            square += patterns[row, s] * patterns[row, s]
+        scale = 1.0 / (wp.sqrt(square) + faint)
+        for s in range(across.shape[1]):
+            patterns[row, s] *= scale
 
 
 def patterns_of_patches(
@@ -103,19 +107,21 @@ def patterns_of_patches(
     view: Int[Tensor, "asked chosen"],
     counts: Bool[Tensor, "asked chosen"],
     pictures: PackedPictures,
+    smooth: Float[Tensor, "term sample"],
     faint: float,
 ) -> Float[Tensor, "asked depth chosen sample"]:
-    """Patches of mean 0 and length 1, at each depth and in each of the chosen views; 0 where these do not count.
+    """Patches of length 1 without what is `smooth` in them, at each depth and in each of the chosen views; 0 where these do not count.
 
     Args:
-        depths: along the normals [world units]. counts: only in views that are wider and higher than a pixel. across: from each vertex to the samples of its patch [world units]. faint: length of a patch that is noise.
+        depths: along the normals [world units]. counts: only in views that are wider and higher than a pixel. across: from each vertex to the samples of its patch [world units]. smooth: rows of length 1, perpendicular to each other, that are taken out of each patch.
+        faint: length of a patch that is noise.
     """
     patterns = vertices.new_zeros(len(vertices), len(depths), view.shape[1], across.shape[1])
     inputs = [
         warp_argument(vertices, wp.vec3), warp_argument(normals, wp.vec3), warp_argument(depths),
         warp_argument(across, wp.vec3), warp_argument(view), warp_argument(counts, wp.bool),
         warp_argument(pictures.turns, wp.mat33), warp_argument(pictures.shifts, wp.vec3), warp_argument(pictures.sizes, wp.vec3i),
-        warp_argument(pictures.values), faint,
+        warp_argument(pictures.values), warp_argument(smooth), faint,
     ]  # fmt: skip
     launch(pattern_kernel, view.numel(), inputs, [warp_argument(patterns.view(-1, across.shape[1]))], warp_device(patterns))
     return patterns

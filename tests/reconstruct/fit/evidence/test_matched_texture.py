@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import drgs.reconstruct.fit.evidence.matched_texture as module
 from drgs.reconstruct.fit.evidence.matched_texture import matched_texture
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
@@ -16,6 +17,8 @@ from drgs.scene.views import Views
 
 SIZE, FOCAL, FAR = 128, 240.0, 4.0
 DEPTH = 0.04
+RADIUS = 2.0
+"""Of what the floor is a part of."""
 
 
 def pattern(x: Tensor, y: Tensor) -> Tensor:
@@ -81,7 +84,7 @@ def depths_found(kind: str, metal: float = 0.0):
         torch.full((len(mesh.vertices),), metal),
         mesh_edges(mesh.faces),
         photographs_of_a_floor(kind),
-        1.0,
+        RADIUS,
     )
 
 
@@ -154,3 +157,48 @@ def test_a_tube_as_wide_as_patches_that_lies_right_is_left_there():
     off = ((found.places - mesh.vertices) * mesh.normals).sum(-1)[believed] / pixel
     assert float(believed.sum() / asked.sum()) > 0.8
     assert abs(float(off.median())) < 0.2 and float(off.abs().quantile(0.95)) < 0.5, (off.median(), off.abs().quantile(0.95))
+
+
+BALL = 0.4
+"""Radius; an image of far surroundings lies half of it below a mirror's surface."""
+
+
+def photographs_of_a_mirror() -> Views:
+    """A ball around the origin under a pattern that is infinitely far."""
+    cameras, images, coverage = cameras_above(), [], []
+    row, column = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    for camera in cameras:
+        rotation, center = camera.camera_from_world[:3, :3], camera.center_world
+        ray = torch.stack([(column - SIZE / 2) / FOCAL, (row - SIZE / 2) / FOCAL, torch.ones_like(row)], -1) @ rotation
+        ray = torch.nn.functional.normalize(ray, dim=-1)
+        half_b = (ray * center).sum(-1)
+        root = half_b.square() - (center.square().sum() - BALL**2)
+        normal = (center + ray * (-half_b - root.clamp(min=0).sqrt())[..., None]) / BALL
+        mirrored = torch.nn.functional.normalize(ray - 2 * (ray * normal).sum(-1, keepdim=True) * normal, dim=-1)
+        value = pattern(0.3 * mirrored[..., 0], 0.3 * mirrored[..., 1])
+        images.append(((root > 0) * (0.1 + 0.8 * value) * 255)[..., None].expand(-1, -1, 3).round().to(torch.uint8))
+        coverage.append(((root > 0) * 255).to(torch.uint8))
+    return Views(cameras, tuple(images), tuple(coverage), None, None, True, "test")
+
+
+def ball(along: int = 64, around: int = 96) -> TriangleMesh:
+    """The surface itself, without its poles."""
+    tilt, turn = torch.meshgrid(torch.linspace(0.02, 1.4, along), torch.arange(around) * (2 * math.pi / around), indexing="ij")
+    normals = torch.stack([tilt.sin() * turn.cos(), tilt.sin() * turn.sin(), tilt.cos()], -1).reshape(-1, 3)
+    ring, place = torch.meshgrid(torch.arange(along - 1), torch.arange(around), indexing="ij")
+    here, beside = (ring * around + place).flatten(), (ring * around + (place + 1) % around).flatten()
+    faces = torch.cat([torch.stack([here, here + around, beside], -1), torch.stack([beside, here + around, beside + around], -1)]).int()
+    count = len(normals)
+    return TriangleMesh(BALL * normals, faces, normals, torch.full((count, 3), 0.5), torch.full((count,), 0.5), torch.zeros(count))
+
+
+def test_the_image_that_a_ball_mirrors_is_not_believed(monkeypatch: pytest.MonkeyPatch):
+    mesh, nothing = ball(), torch.zeros(64 * 96)
+
+    def found():
+        return matched_texture(build_tracer(mesh), mesh.normals, nothing, mesh_edges(mesh.faces), photographs_of_a_mirror(), 2.0)
+
+    assert not found().weight.any()
+    monkeypatch.setattr(module, "NEAR", 1.0)
+    depth = ((found().places - mesh.vertices) * mesh.normals).sum(-1)[found().weight > 0.1]
+    assert len(depth) > 500 and abs(float(depth.median()) + BALL / 2) < 0.1 * BALL, (len(depth), depth.median())

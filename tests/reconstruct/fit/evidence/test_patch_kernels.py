@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from drgs.reconstruct.fit.evidence.matched_texture import PATCH, smooth_patches
 from drgs.reconstruct.fit.evidence.patch_kernels import PackedPictures, patterns_of_patches
 from drgs.scene.camera import Camera
 from tests.reconstruct.fit.evidence.test_matched_texture import cameras_above
@@ -19,6 +20,7 @@ def patterns_twin(
     counts: Tensor,
     cameras: list[Camera],
     pictures: list[Tensor],
+    smooth: Tensor,
 ) -> Tensor:
     """The specification."""
     patterns = torch.zeros(len(vertices), len(depths), view.shape[1], across.shape[1], dtype=torch.float64)
@@ -29,7 +31,7 @@ def patterns_twin(
         seen = (at @ transform[:3, :3].T + transform[:3, 3]) @ intrinsics.T
         grid = 2 * (seen[..., :2] / seen[..., 2:]) / torch.tensor([camera.width, camera.height]) - 1
         shown = torch.nn.functional.grid_sample(picture[None, None], grid[None], padding_mode="border", align_corners=False)[0, 0]
-        shown = shown - shown.mean(-1, keepdim=True)
+        shown = shown - torch.linalg.lstsq(smooth.double().T, shown.T).solution.T @ smooth.double()
         patterns[i, :, slot] = shown / (shown.norm(dim=-1, keepdim=True) + FAINT)
     return patterns
 
@@ -52,17 +54,27 @@ def made_patches(generator: torch.Generator) -> tuple[list[Camera], list[Tensor]
 
 
 def test_patterns_are_those_of_whole_tensors(device: str) -> None:
+    smooth = smooth_patches(torch.device("cpu"))
     cameras, pictures, patches = made_patches(torch.Generator().manual_seed(3))
-    expected = patterns_twin(*patches, cameras, pictures)
+    expected = patterns_twin(*patches, cameras, pictures, smooth)
     moved = [camera.to(torch.device(device)) for camera in cameras]
     packed = PackedPictures(moved, [picture.to(device) for picture in pictures])
-    found = patterns_of_patches(*(x.to(device) for x in patches), packed, FAINT).cpu().double()
+    found = patterns_of_patches(*(x.to(device) for x in patches), packed, smooth.to(device), FAINT).cpu().double()
     torch.testing.assert_close(found, expected, atol=2e-5, rtol=0)
     assert not found[4, :, 1].any()
 
 
 def test_faint_patches_keep_their_digits() -> None:
+    smooth = smooth_patches(torch.device("cpu"))
     cameras, pictures, patches = made_patches(torch.Generator().manual_seed(4))
     bright = [0.9 + 1e-4 * picture for picture in pictures]
-    found = patterns_of_patches(*patches, PackedPictures(cameras, bright), FAINT)
-    torch.testing.assert_close(found.double(), patterns_twin(*patches, cameras, bright), atol=2e-5, rtol=0)
+    found = patterns_of_patches(*patches, PackedPictures(cameras, bright), smooth, FAINT)
+    torch.testing.assert_close(found.double(), patterns_twin(*patches, cameras, bright, smooth), atol=2e-5, rtol=0)
+
+
+def test_smooth_patches_are_all_polynomials_of_degree_two():
+    smooth = smooth_patches(torch.device("cpu")).double()
+    torch.testing.assert_close(smooth @ smooth.T, torch.eye(6, dtype=torch.float64), atol=1e-6, rtol=0)
+    x, y = torch.cartesian_prod(*(2 * [torch.linspace(-1, 1, PATCH, dtype=torch.float64)])).unbind(-1)
+    made = 0.3 + 0.5 * x - 0.2 * y + 0.7 * x * x - 0.4 * x * y + 0.9 * y * y
+    torch.testing.assert_close((made @ smooth.T) @ smooth, made, atol=1e-6, rtol=0)
