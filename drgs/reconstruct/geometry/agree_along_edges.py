@@ -2,24 +2,24 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix, diags
 from torch import Tensor
 
 from drgs.reconstruct.geometry.alike_systems import factored
-from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 
 
 def agree_along_edges(
-    edges: MeshEdges, weight: Float[Tensor, "vertex"], wish: Float[Tensor, "vertex"], together: float | Float[Tensor, "edge"]
+    joined: Int[Tensor, "edge 2"], weight: Float[Tensor, "vertex"], wish: Float[Tensor, "vertex"], together: float | Float[Tensor, "edge"]
 ) -> Float[Tensor, "vertex"]:
     """The values s that minimise sum weight (s - wish)^2 + sum_edges together (s_i - s_j)^2.
 
     Args:
-        weight: at least one above 0 in each part of the mesh that hangs together, else the solve is singular.
+        joined: vertices that are to agree, of a mesh's edges or any other.
+        weight: at least one above 0 in each part that hangs together, else the solve is singular.
     """
     count = len(weight)
-    start, end = edges.vertices.cpu().numpy().T
+    start, end = joined.cpu().numpy().T
     row = np.arange(len(start))
     difference = csr_matrix(
         (np.concatenate([np.ones(len(start)), -np.ones(len(start))]), (np.tile(row, 2), np.concatenate([start, end]))),

@@ -15,14 +15,14 @@ def test_it_is_the_least_of_the_sum_that_it_names():
     row = torch.arange(len(start))
     difference[row, start], difference[row, end] = 1.0, -1.0
     expected = torch.linalg.solve(torch.diag(weight) + 0.7 * difference.T @ difference, weight * wish)
-    assert torch.allclose(agree_along_edges(edges, weight, wish, 0.7), expected, atol=1e-12)
+    assert torch.allclose(agree_along_edges(edges.vertices, weight, wish, 0.7), expected, atol=1e-12)
     together = torch.rand(len(start), generator=generator, dtype=torch.float64)
     expected = torch.linalg.solve(torch.diag(weight) + difference.T @ (together[:, None] * difference), weight * wish)
-    assert torch.allclose(agree_along_edges(edges, weight, wish, together), expected, atol=1e-12)
+    assert torch.allclose(agree_along_edges(edges.vertices, weight, wish, together), expected, atol=1e-12)
 
 
 def test_a_vertex_without_a_wish_takes_its_surroundings():
     edges = mesh_edges(sphere_mesh(subdivisions=2).faces)
     weight = torch.zeros(162)
     weight[5] = 1.0
-    assert torch.allclose(agree_along_edges(edges, weight, torch.full((162,), 0.4), 1.0), torch.full((162,), 0.4), atol=1e-5)
+    assert torch.allclose(agree_along_edges(edges.vertices, weight, torch.full((162,), 0.4), 1.0), torch.full((162,), 0.4), atol=1e-5)

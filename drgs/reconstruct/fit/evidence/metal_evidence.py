@@ -24,8 +24,10 @@ import math
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drgs.maths.constants import F0
@@ -72,6 +74,14 @@ BRIGHTNESS = 0.1
 """... where differences that all channels share count so much: what arrives in a hollow, and so how bright matter seems there, is known less well than its hue."""
 STRANGERS = 1e-3
 """At least."""
+ALIKE_ANYWHERE = 1.0
+"""As TOGETHER, of a place and of all that is painted as it, wherever it is: that is mostly of one kind, too, and where light is known badly others say of which."""
+EXPLAINED = 0.15
+"""Relative error of paint at which a place hears that a third as much as one without: of metal colours are what it mirrors there."""
+PAINTS_APART = 0.5
+"""Between colours that stand for a paint each, in differences of SAME_COLOUR of logarithms."""
+MOST_PAINTS, NEAREST_PAINTS = 200, 4
+"""Of an object, and those that a place is joined with."""
 DECISIVE = 0.3
 """Agreement of a place and its surroundings, -1..1, at which evidence is 0.76."""
 
@@ -191,8 +201,36 @@ def metal_evidence(sums: ViewSums, edges: MeshEdges, turned: bool, scale: float 
     doubt = (DOUBT_TURNED if turned else DOUBT) - TOO_DARK * dark * dark * (3 - 2 * dark)
     better = torch.log(plain.clamp(min=1e-12) / metal.clamp(min=1e-12)) + doubt * trust * unexplained
     strength = torch.where(views >= FEWEST_VIEWS, trust * better.abs().clamp(max=STRONGEST), torch.zeros_like(better))
-    kind = agree_along_edges(edges, strength + UNSEEN, torch.sign(better) * (strength > 0), TOGETHER * finer * alike)
+    weight, wish = strength + UNSEEN, torch.sign(better) * (strength > 0)
+    joined, held = _paints(sums, plain - floor)
+    paints = int(joined.max()) + 1 - len(weight) if len(joined) else 0
+    weight, wish = torch.cat([weight, weight.new_full((paints,), UNSEEN)]), torch.cat([wish, wish.new_zeros(paints)])
+    joined, held = torch.cat([edges.vertices, joined]), torch.cat([TOGETHER * finer * alike, held])
+    kind = agree_along_edges(joined, weight, wish, held)[: len(strength)]
     return torch.tanh(kind / DECISIVE)
+
+
+def _paints(sums: ViewSums, error: Float[Tensor, "vertex"]) -> tuple[Int[Tensor, "join 2"], Float[Tensor, "join"]]:
+    """Joins of vertices, which paint explains well, with paints: further nodes, numbered after the vertices, that stand for a colour each; and how strong they are.
+
+    Args:
+        error: that paint leaves a view, without noise.
+    """
+    seen = (sums.views >= FEWEST_VIEWS).nonzero().squeeze(1)
+    place = (sums.color[seen].clamp(min=1e-3).log() / SAME_COLOUR).double().cpu().numpy()
+    if len(place) == 0:
+        return seen.new_zeros(0, 2), error.new_zeros(0)
+    paints, apart = [place[0]], np.linalg.norm(place - place[0], axis=1)
+    while len(paints) < MOST_PAINTS and apart.max() > PAINTS_APART:
+        paints.append(place[apart.argmax()])
+        apart = np.minimum(apart, np.linalg.norm(place - paints[-1], axis=1))
+    nearest = min(NEAREST_PAINTS, len(paints))
+    distance, number = cKDTree(np.stack(paints)).query(place, k=range(1, nearest + 1))
+    near = np.exp(-np.square(distance / PAINTS_APART))
+    share = torch.from_numpy(near / near.sum(1, keepdims=True)).to(error)
+    explained = torch.exp(-error[seen].clamp(min=0) / (3 * EXPLAINED**2))
+    joined = torch.stack([seen.repeat_interleave(nearest), len(error) + torch.from_numpy(number.reshape(-1)).to(seen)], 1)
+    return joined, ALIKE_ANYWHERE * (share * explained[:, None]).reshape(-1)
 
 
 def light_scale(sums: ViewSums) -> float:

@@ -169,7 +169,9 @@ def try_depths(
     ratios = torch.stack([tried(reached(share, loose.to(most)), only)[1] for share in settings.depths], 1)
 
     depth = torch.minimum(
-        agreed_depth(ratios, loose, settings, lambda weight, wish: agree_along_edges(edges, weight, wish, settings.together * rings))
+        agreed_depth(
+            ratios, loose, settings, lambda weight, wish: agree_along_edges(edges.vertices, weight, wish, settings.together * rings)
+        )
         * radius,
         most,
     )
