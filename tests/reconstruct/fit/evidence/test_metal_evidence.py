@@ -135,6 +135,30 @@ def test_a_spot_of_another_colour_is_not_outvoted(monkeypatch: pytest.MonkeyPatc
     assert float(told[spot].max()) < -0.9 and float(told[~spot].min()) > 0.9
 
 
+@pytest.mark.parametrize("same_paint", [True, False])
+def test_where_light_is_known_badly_what_is_painted_alike_elsewhere_says_of_which_kind(monkeypatch: pytest.MonkeyPatch, same_paint: bool):
+    """Around a pole the photographs vary by a tenth as a dim mirror does; all else is paint without doubt."""
+    mesh, random = sphere_mesh(subdivisions=4), torch.Generator().manual_seed(0)
+    count, edges = len(mesh.vertices), mesh_edges(mesh.faces)
+    monkeypatch.setattr(module, "EDGES", len(edges.vertices))
+    odd = (mesh.vertices - torch.tensor([0.0, 0.0, 1.0])).norm(dim=1) < 0.5
+    paint, elsewhere = torch.tensor([0.4, 0.2, 0.15]), torch.tensor([0.4, 0.2, 0.15] if same_paint else [0.1, 0.2, 0.4])
+    e, b, terms = torch.ones(count, 3), torch.zeros(count, 3), []
+    for _ in range(12):
+        varies = 1 + 0.1 * torch.randn(1, 3, generator=random)
+        mirrored = torch.where(odd[:, None], 0.5 * varies, torch.rand(1, 3, generator=random))
+        terms.append((torch.where(odd[:, None], paint * varies, elsewhere + F0 * mirrored), e, mirrored, b))
+    products = [sum(term[k] * term[m] for term in terms) for k in range(4) for m in range(k, 4)]
+    sums = ViewSums(*products, torch.full((count,), 12.0))
+    told = metal_evidence(sums, edges, False)
+    assert float(told[~odd].max()) < -0.9
+    if same_paint:
+        assert float(told[odd].median()) < -0.7 and float((told[odd] < 0).float().mean()) > 0.9
+        monkeypatch.setattr(module, "ALIKE_ANYWHERE", 0.0)
+        told = metal_evidence(sums, edges, False)
+    assert float(told[mesh.vertices[:, 2].argmax()]) > 0.5
+
+
 def test_what_no_view_shows_is_left_open():
     mesh = sphere_mesh(subdivisions=3)
     tables = filter_environment(light())
