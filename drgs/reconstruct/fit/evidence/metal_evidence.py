@@ -10,7 +10,8 @@ Gradients never decide this: a darker light and a diffuse part trade places with
 
 Errors of shape and light spoil the predicted mirror S_v, not the constant E, so they count against metal alone: real paint hardly ever says
 "metal", real metal says "paint" wherever its normals are off. So the benefit of the doubt is metal's, and each place hears its surroundings, as far as they are
-of its colour, its hue above all: matter of one kind seldom changes colour at once, and often does where another kind begins.
+of its colour, its hue above all: matter of one kind seldom changes colour at once, and often does where another kind begins. What paint explains well
+hears all that is painted alike, too, wherever it is: where light is known badly, a dim mirror may explain as much.
 Where light turns with the camera, what arrives at paint changes from view to view as well, and is predicted nearly as badly: then there is less of it.
 And no metal is dark: what reflects less than a twelfth in its brightest channel is lacquer, however well a dark mirror explains it.
 
