@@ -78,7 +78,7 @@ STRANGERS = 1e-3
 ALIKE_ANYWHERE = 1.0
 """As TOGETHER, of a place and of all that is painted as it, wherever it is: that is mostly of one kind, too, and where light is known badly others say of which."""
 EXPLAINED = 0.15
-"""Relative error of paint at which a place hears that a third as much as one without: of metal colours are what it mirrors there."""
+"""Relative error that paint leaves at a place which hears them a third as much as one without error: metal's colour is what it mirrors, not what it is."""
 PAINTS_APART = 0.5
 """Between colours that stand for a paint each, in differences of SAME_COLOUR of logarithms."""
 MOST_PAINTS, NEAREST_PAINTS = 64, 2
@@ -204,7 +204,7 @@ def metal_evidence(sums: ViewSums, edges: MeshEdges, turned: bool, scale: float 
     strength = torch.where(views >= FEWEST_VIEWS, trust * better.abs().clamp(max=STRONGEST), torch.zeros_like(better))
     weight, wish = strength + UNSEEN, torch.sign(better) * (strength > 0)
     joined, held = edges.vertices, TOGETHER * finer * alike
-    if not turned:  # still_life's draft: relit 29.1 to 28.9 dB, its metal as before
+    if not turned:  # there it gains nothing (decisions/0003, "The same paint elsewhere")
         more, strengths = _paints(sums, plain - floor)
         paints = int(more.max()) + 1 - len(weight) if len(more) else 0
         weight, wish = torch.cat([weight, weight.new_full((paints,), UNSEEN)]), torch.cat([wish, wish.new_zeros(paints)])

@@ -134,16 +134,21 @@ def photographs_of_a_tube() -> Views:
     return Views(cameras, tuple(images), tuple(coverage), None, None, True, "test")
 
 
+def mesh_of_rings(vertices: Tensor, normals: Tensor, around: int) -> TriangleMesh:
+    """Of rings of `around` vertices, one after the other."""
+    ring, place = torch.meshgrid(torch.arange(len(vertices) // around - 1), torch.arange(around), indexing="ij")
+    here, beside = (ring * around + place).flatten(), (ring * around + (place + 1) % around).flatten()
+    faces = torch.cat([torch.stack([here, here + around, beside], -1), torch.stack([beside, here + around, beside + around], -1)]).int()
+    count = len(vertices)
+    return TriangleMesh(vertices, faces, normals, torch.full((count, 3), 0.5), torch.full((count,), 0.5), torch.zeros(count))
+
+
 def tube(along: int = 49, around: int = 96) -> TriangleMesh:
     """The surface itself over x in [-0.6, 0.6]."""
     x, turn = torch.meshgrid(torch.linspace(-0.6, 0.6, along), torch.arange(around) * (2 * math.pi / around), indexing="ij")
     normals = torch.stack([torch.zeros_like(x), turn.sin(), turn.cos()], -1).reshape(-1, 3)
     vertices = torch.stack([x, TUBE * turn.sin(), TUBE * turn.cos()], -1).reshape(-1, 3)
-    ring, place = torch.meshgrid(torch.arange(along - 1), torch.arange(around), indexing="ij")
-    here, beside = (ring * around + place).flatten(), (ring * around + (place + 1) % around).flatten()
-    faces = torch.cat([torch.stack([here, here + around, beside], -1), torch.stack([beside, here + around, beside + around], -1)]).int()
-    count = len(vertices)
-    return TriangleMesh(vertices, faces, normals, torch.full((count, 3), 0.5), torch.full((count,), 0.5), torch.zeros(count))
+    return mesh_of_rings(vertices, normals, around)
 
 
 def test_a_tube_as_wide_as_patches_that_lies_right_is_left_there():
@@ -185,11 +190,7 @@ def ball(along: int = 64, around: int = 96) -> TriangleMesh:
     """The surface itself, without its poles."""
     tilt, turn = torch.meshgrid(torch.linspace(0.02, 1.4, along), torch.arange(around) * (2 * math.pi / around), indexing="ij")
     normals = torch.stack([tilt.sin() * turn.cos(), tilt.sin() * turn.sin(), tilt.cos()], -1).reshape(-1, 3)
-    ring, place = torch.meshgrid(torch.arange(along - 1), torch.arange(around), indexing="ij")
-    here, beside = (ring * around + place).flatten(), (ring * around + (place + 1) % around).flatten()
-    faces = torch.cat([torch.stack([here, here + around, beside], -1), torch.stack([beside, here + around, beside + around], -1)]).int()
-    count = len(normals)
-    return TriangleMesh(BALL * normals, faces, normals, torch.full((count, 3), 0.5), torch.full((count,), 0.5), torch.zeros(count))
+    return mesh_of_rings(BALL * normals, normals, around)
 
 
 def test_the_image_that_a_ball_mirrors_is_not_believed(monkeypatch: pytest.MonkeyPatch):
