@@ -27,7 +27,7 @@ from drgs.scene.mesh import TriangleMesh, vertex_normals
 from drgs.scene.views import Views
 
 MOST_HIDDEN = 0.03
-"""Of what the box holds, as a view would see it: a view in which more is hidden by the rest is left out. Hulls outvote as many wrong masks."""
+"""Of what the box holds, as a view would see it: a view in which more is hidden by the rest is left out: its mask would carve that away."""
 FEWEST_LEFT = 8
 """Views that must show what the box holds; with fewer, hardly anything is seen from enough sides."""
 HALF = 127

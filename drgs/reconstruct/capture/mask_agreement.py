@@ -1,6 +1,6 @@
 """How far each mask is what all masks together imply: its agreement with the silhouette of their visual hull.
 
-The hull lies inside every silhouette, but for the few that are outvoted. So where poses and masks belong together, hull and mask fill the same pixels; a
+The hull lies inside every silhouette, but for those that are left out. So where poses and masks belong together, hull and mask fill the same pixels; a
 mask of something else holds what the hull cannot explain, and an object that moved leaves a hull that is too small for all masks
 (Laurentini 1994, docs/sources.md: laurentini1994). In: views, the hull's vertices. Out: 0..1 of each view.
 """

@@ -1,8 +1,8 @@
 """The visual hull: the largest shape that fits inside every silhouette, carved from masks.
 
 In: cameras and coverage. Out: a closed surface and the sphere that bounds it. Knows nothing of colours or Gaussians.
-The field at a point is the (k+1)-th smallest coverage over the views that see the point, so up to k wrong masks are outvoted;
-k is a few percent of the views. What hardly any view sees is not the object: where it fills their pictures, they would say that it reaches up to
+The field at a point is the smallest coverage over the views that see the point, but for views that carve away what the others need
+(wrong_masks.py). What hardly any view sees is not the object: where it fills their pictures, they would say that it reaches up to
 them. The surface is the field's level set, found coarse to fine.
 Source: Laurentini 1994, "The visual hull concept"; marching cubes by scikit-image.
 """
@@ -14,20 +14,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Bool, Float, Int, Int32, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped
 from numpy import ndarray
 from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox
+from drgs.reconstruct.capture.mask_stack import MaskStack
+from drgs.reconstruct.capture.wrong_masks import MOST_CARVERS, find_carved, wrong_masks
 from drgs.scene.views import Views
 from drgs.warp_torch import launch, warp_array, warp_device
 
 FEWEST_SEEN = 3
 """Views that must see a place of the object."""
-MOST_OUTVOTED = 3
-"""The kernel keeps the MOST_OUTVOTED + 1 smallest values in one wp.vec4."""
+BETWEEN = 1
+"""[pixels] farther that lookups see, which are bilinear."""
+FEWEST_FOR_DOUBT = 12
+"""Of fewer views none is left out: where one carves, too few others say that it should not."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,11 @@ class VisualHullSettings:
     cell_pixels: float = 0.5
     """No cell is smaller than this share of a pixel of the masks: those say no more."""
     wrong_mask_share: float = 0.03
-    """Share of the views whose masks may be wrong."""
+    """Share of the views whose masks may be wrong, at least one and at most MOST_CARVERS."""
+    wrong_mask_cells: int = 128
+    """Cells along the longest axis in which it is looked for wrong masks."""
+    wrong_mask_side: int = 256
+    """As mask_side, there."""
     mask_side: int = 512
     """Larger masks are averaged down to at most this [pixels]: finer ones outdo the grid."""
     seen_share: float = 0.5
@@ -66,24 +74,21 @@ class VisualHull:
 
 
 @wp.kernel
-def outvote(
+def smallest_coverage(
     first: int,
     points: wp.array[wp.vec3],
     pixel_from_world: wp.array[wp.vec4],
-    masks: wp.array3d[wp.uint8],
     sizes: wp.array[wp.vec2i],
-    outvoted: int,
+    masks: wp.array3d[wp.uint8],
     fewest_seen: int,
     # outputs
     field: wp.array[float],
-    seen_by: wp.array[wp.int32],
 ):
-    """One thread a point: the (outvoted+1)-th smallest coverage, looked up bilinearly, over the views that see the point; and how many those
-    are, where it is not 0."""
+    """One thread a point: the smallest coverage, looked up bilinearly, over the views that see the point; 0 where too few do."""
     i = first + wp.tid()
     point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
-    smallest = wp.vec4(1.0, 1.0, 1.0, 1.0)
-    seen = int(0)  # Warp: a variable that a loop changes must not be a constant
+    smallest = float(1.0)  # Warp: a variable that a loop changes must not be a constant
+    seen = int(0)
     for view in range(masks.shape[0]):
         depth = wp.dot(pixel_from_world[3 * view + 2], point)
         if depth > 0.0:
@@ -102,15 +107,10 @@ def outvote(
                 fv = v - float(row)
                 top = float(masks[view, row, column]) * (1.0 - fu) + float(masks[view, row, column + 1]) * fu
                 bottom = float(masks[view, row + 1, column]) * (1.0 - fu) + float(masks[view, row + 1, column + 1]) * fu
-                value = (top * (1.0 - fv) + bottom * fv) / 255.0
-                for rank in range(4):
-                    larger = wp.max(smallest[rank], value)
-                    smallest[rank] = wp.min(smallest[rank], value)
-                    value = larger
-                if smallest[outvoted] <= 0.0:
+                smallest = wp.min(smallest, (top * (1.0 - fv) + bottom * fv) / 255.0)
+                if smallest <= 0.0:
                     break
-    field[i] = wp.where(seen >= fewest_seen or smallest[outvoted] <= 0.0, smallest[outvoted], 0.0)
-    seen_by[i] = seen
+    field[i] = wp.where(seen >= fewest_seen, smallest, 0.0)
 
 
 def visual_hull(views: Views, settings: VisualHullSettings = HULL, box: BuildBox | None = None) -> VisualHull | None:
@@ -119,32 +119,59 @@ def visual_hull(views: Views, settings: VisualHullSettings = HULL, box: BuildBox
     Args:
         box: cuts it flat, and cells are the smaller; None where it holds nothing of the hull.
     """
-    views = _with_small_masks(views, settings.mask_side)
-    carver = _Carver(views, settings)
+    masks = MaskStack.of(_with_small_masks(views, settings.mask_side))
+    coarse = MaskStack.of(_with_small_masks(views, settings.wrong_mask_side))
     first = _first_box(views)
-    if first is None:
+    found = None if first is None else _box_of_object(coarse, *first, settings)
+    if found is None:
         return None
-    for _ in range(4):  # possibly the first guess cuts the object: grow it until nothing touches its sides
-        lower, upper = first
-        cell = float((upper - lower).max()) / settings.coarse_cells
-        shape = _grid_shape(lower, upper, cell)
-        occupied = carver.occupied(_grid_points(lower, cell, shape), cell, settings).reshape(shape)
-        if not occupied.any():
-            return None
-        sides = [occupied[0], occupied[-1], occupied[:, 0], occupied[:, -1], occupied[:, :, 0], occupied[:, :, -1]]
-        if not any(bool(side.any()) for side in sides):
-            break
-        center, half = (lower + upper) / 2, (upper - lower) / 2
-        first = center - 1.5 * half, center + 1.5 * half
-    indices = torch.nonzero(occupied)
-    lower = lower + (indices.min(0).values.double().numpy() - 1.0) * cell
-    upper = lower + (indices.max(0).values - indices.min(0).values + 3).double().numpy() * cell
+    lower, upper, fewest_seen = found
+    wrong = _wrong_masks(coarse, lower, upper, fewest_seen, settings)
+    carver = _Carver(masks.chosen([view for view in range(len(masks.masks)) if view not in wrong]), fewest_seen)
     if box is None:
         return _fine_surface(carver, lower, upper, settings)
     lower, upper = np.maximum(lower, box.low), np.minimum(upper, box.high)
     hull = _fine_surface(carver, lower, upper, settings) if (lower < upper).all() else None
     # Cells are whole, so the grid ends up to one of them behind the box.
     return hull and replace(hull, vertices_world=hull.vertices_world.clip(box.low, box.high).astype(np.float32))
+
+
+def _box_of_object(
+    masks: MaskStack, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], settings: VisualHullSettings
+) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"], int] | None:
+    """Where the object may be, and how many views must see a place of it; as many masks may be wrong as ever."""
+    for _ in range(4):  # possibly the first guess cuts the object: grow it until nothing touches its sides
+        cell = float((upper - lower).max()) / settings.coarse_cells
+        shape = _grid_shape(lower, upper, cell)
+        carved = find_carved(masks, _grid_points(lower, cell, shape), cell, settings.level)
+        occupied = (carved.carvers <= _most_wrong(masks, settings)) & (carved.seen >= FEWEST_SEEN)
+        if not bool(occupied.any()):
+            return None
+        fewest_seen = max(FEWEST_SEEN, math.ceil(settings.seen_share * int(carved.seen[occupied].max())))
+        occupied = (occupied & (carved.seen >= fewest_seen)).reshape(shape)
+        sides = [occupied[0], occupied[-1], occupied[:, 0], occupied[:, -1], occupied[:, :, 0], occupied[:, :, -1]]
+        if not any(bool(side.any()) for side in sides):
+            break
+        center, half = (lower + upper) / 2, (upper - lower) / 2
+        lower, upper = center - 1.5 * half, center + 1.5 * half
+    indices = torch.nonzero(occupied)
+    lower = lower + (indices.min(0).values.double().numpy() - 1.0) * cell
+    upper = lower + (indices.max(0).values - indices.min(0).values + 3).double().numpy() * cell
+    return lower, upper, fewest_seen
+
+
+def _most_wrong(masks: MaskStack, settings: VisualHullSettings) -> int:
+    """Masks that may be left out."""
+    count = len(masks.masks)
+    return min(MOST_CARVERS, math.ceil(settings.wrong_mask_share * count)) if count >= FEWEST_FOR_DOUBT else 0
+
+
+def _wrong_masks(
+    masks: MaskStack, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], fewest_seen: int, settings: VisualHullSettings
+) -> list[int]:
+    cell = float((upper - lower).max()) / settings.wrong_mask_cells
+    points = _grid_points(lower, cell, _grid_shape(lower, upper, cell))
+    return wrong_masks(masks, points, cell, settings.level, fewest_seen, _most_wrong(masks, settings))
 
 
 def axes_meeting_point(centers: Float[ndarray, "view 3"], directions: Float[ndarray, "view 3"]) -> Float[ndarray, "3"]:
@@ -208,84 +235,40 @@ def _first_box(views: Views) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]] 
 
 
 class _Carver:
-    """Masks and projections, prepared once for many queries."""
+    """Masks that are believed, for many queries."""
 
-    def __init__(self, views: Views, settings: VisualHullSettings) -> None:
-        count = len(views.cameras)
+    def __init__(self, masks: MaskStack, fewest_seen: int) -> None:
         # Neighbours in the file are neighbours in space; views far apart empty a point sooner.
-        order = np.argsort((np.arange(count) * 0.6180339887) % 1.0)
-        self.masks = [views.coverage[index].numpy() for index in order]
-        self.cameras = [views.cameras[index] for index in order]
-        self.pixel_from_world = torch.stack(
-            [(c.intrinsics.double() @ c.camera_from_world.double()[:3]).float().cpu() for c in self.cameras]
-        )
-        self.outvoted = min(MOST_OUTVOTED, math.ceil(settings.wrong_mask_share * count)) if count >= 12 else 0
-        self.fewest_seen = FEWEST_SEEN
-
-    def occupied(self, points: Float[Tensor, "point 3"], cell: float, settings: VisualHullSettings) -> Bool[Tensor, "point"]:
-        """(point,) where the object may be in a cell around each point (point, 3). From now on, what fewer views see than settings say is empty."""
-        self.fewest_seen = FEWEST_SEEN
-        field, seen = self._outvote(points, self._widened(points, cell, ndimage.maximum_filter))
-        occupied = field > settings.level
-        if bool(occupied.any()):
-            self.fewest_seen = max(FEWEST_SEEN, math.ceil(settings.seen_share * int(seen[occupied].max())))
-        return occupied & (seen >= self.fewest_seen)
+        order = np.argsort((np.arange(len(masks.masks)) * 0.6180339887) % 1.0)
+        self.masks, self.fewest_seen = masks.chosen(order.tolist()), fewest_seen
 
     def upper_field(self, points: Float[Tensor, "point 3"], cell: float) -> Float[Tensor, "point"]:
         """At least the field (n,) anywhere in a cell around each point (n, 3)."""
-        return self._outvote(points, self._widened(points, cell, ndimage.maximum_filter))[0]
+        return self._smallest(points, self._widened(points, cell, ndimage.maximum_filter))
 
     def lower_field(self, points: Float[Tensor, "point 3"], cell: float) -> Float[Tensor, "point"]:
         """At most the field (n,) anywhere in a cell around each point (n, 3)."""
-        return self._outvote(points, self._widened(points, cell, ndimage.minimum_filter))[0]
+        return self._smallest(points, self._widened(points, cell, ndimage.minimum_filter))
 
     def field(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
         """The field (n,) at `points` (n, 3)."""
-        return self._outvote(points, self.masks)[0]
+        return self._smallest(points, self.masks)
 
     def pixel_side(self, point: Float[ndarray, "3"]) -> float:
         """Of the finest pixel of all views, at that place in the world [world units]."""
-        depths = self.pixel_from_world[:, 2].double().numpy() @ np.append(point, 1.0)
-        sides = [depth / float(camera.intrinsics[0, 0]) for depth, camera in zip(depths, self.cameras, strict=True) if depth > 0]
+        depths = self.masks.pixel_from_world[:, 2].double().numpy() @ np.append(point, 1.0)
+        sides = [depth / focal for depth, focal in zip(depths, self.masks.focal.tolist(), strict=True) if depth > 0]
         return min(sides, default=0.0)
 
-    def _widened(
-        self, points: Float[Tensor, "point 3"], cell: float, widen: Callable[[ndarray, int], ndarray]
-    ) -> list[UInt8[ndarray, "_height _width"]]:
-        """Masks in which each pixel stands for all pixels that a cell's half diagonal covers around it."""
-        widened = []
-        middle = points.mean(0)
-        for mask, camera, projection in zip(self.masks, self.cameras, self.pixel_from_world, strict=True):
-            depth = max(float(projection[2, :3] @ middle + projection[2, 3]), 2 * cell)
-            # One pixel more than the projection: lookups are bilinear.
-            reach = math.ceil(0.87 * cell * float(camera.intrinsics[0, 0]) / depth * 1.15) + 1
-            widened.append(widen(mask, 2 * min(reach, min(mask.shape) // 2) + 1))
-        return widened
+    def _widened(self, points: Float[Tensor, "point 3"], cell: float, widen: Callable[[ndarray, int], ndarray]) -> MaskStack:
+        return self.masks.widened(widen, [reach + BETWEEN for reach in self.masks.reach(points.mean(0), cell)])
 
-    def _outvote(
-        self, points: Float[Tensor, "point 3"], masks: list[UInt8[ndarray, "_height _width"]]
-    ) -> tuple[Float[Tensor, "point"], Int32[Tensor, "point"]]:
+    def _smallest(self, points: Float[Tensor, "point 3"], masks: MaskStack) -> Float[Tensor, "point"]:
         points = points.float().contiguous()
-        heights, widths = ([mask.shape[axis] for mask in masks] for axis in (0, 1))
-        stacked = np.zeros((len(masks), max(heights), max(widths)), np.uint8)
-        for place, mask in zip(stacked, masks, strict=True):
-            place[: mask.shape[0], : mask.shape[1]] = mask
-        field, seen = torch.zeros(len(points)), torch.zeros(len(points), dtype=torch.int32)
-        launch(
-            outvote,
-            len(points),
-            inputs=[
-                warp_array(points, wp.vec3),
-                warp_array(self.pixel_from_world.reshape(-1, 4), wp.vec4),
-                warp_array(torch.from_numpy(stacked)),
-                warp_array(torch.tensor([widths, heights], dtype=torch.int32).T.contiguous(), wp.vec2i),
-                self.outvoted,
-                self.fewest_seen,
-            ],
-            outputs=[warp_array(field), warp_array(seen)],
-            device=warp_device(points),
-        )
-        return field, seen
+        field = torch.zeros(len(points))
+        inputs = [*masks.inputs(points), self.fewest_seen]
+        launch(smallest_coverage, len(points), inputs=inputs, outputs=[warp_array(field)], device=warp_device(points))
+        return field
 
 
 def _grid_shape(lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], cell: float) -> tuple[int, int, int]:

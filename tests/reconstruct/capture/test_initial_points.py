@@ -92,7 +92,7 @@ def test_large_masks_give_the_hull_of_their_averages(sphere: Views) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fill", [0, 255])
-def test_one_wrong_mask_is_outvoted(fill: int, sphere: Views) -> None:
+def test_one_wrong_mask_is_left_out(fill: int, sphere: Views) -> None:
     coverage = tuple(torch.full_like(mask, fill) if view == 5 else mask for view, mask in enumerate(sphere.coverage))
     radii = _radii(initial_points(replace(sphere, coverage=coverage), COUNT, seed=0).points_world)
     assert radii.min() > 0.96
