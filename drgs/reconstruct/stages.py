@@ -21,6 +21,7 @@ from drgs.reconstruct.capture.find_masks import find_masks
 from drgs.reconstruct.capture.initial_points import InitialPoints, initial_points
 from drgs.reconstruct.capture.on_ground.stands_on_ground import look_again, stands_on_ground
 from drgs.reconstruct.capture.open_vessels import open_vessels
+from drgs.reconstruct.capture.outside_masks import OutsideMasks
 from drgs.reconstruct.capture.visual_hull import VisualHull, VisualHullSettings
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState
@@ -261,7 +262,8 @@ def mesh_stage(
     def made() -> dict[str, Tensor]:
         gaussians = drop_unseen(gaussians_from_state(fit), views.cameras, points.bounds_radius)
         # Those outside still hide what is behind them.
-        mesh = mesh_from_gaussians(gaussians, views.cameras, points, settings, box)
+        outside = OutsideMasks(views) if views.has_masks else None
+        mesh = mesh_from_gaussians(gaussians, views.cameras, points, settings, box, outside)
         gaussians = gaussians if box is None else chosen_surfels(gaussians, box.holds(gaussians.centers))
         records = {"Gaussians": vars(gaussians), "TriangleMesh": mesh.columns}
         return {f"{record}.{name}": value for record, columns in records.items() for name, value in columns.items()}

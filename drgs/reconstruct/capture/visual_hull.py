@@ -119,21 +119,32 @@ def visual_hull(views: Views, settings: VisualHullSettings = HULL, box: BuildBox
     Args:
         box: cuts it flat, and cells are the smaller; None where it holds nothing of the hull.
     """
-    masks = MaskStack.of(_with_small_masks(views, settings.mask_side))
-    coarse = MaskStack.of(_with_small_masks(views, settings.wrong_mask_side))
-    first = _first_box(views)
-    found = None if first is None else _box_of_object(coarse, *first, settings)
+    masks = MaskStack.of(with_small_masks(views, settings.mask_side))
+    found = _object_box(views, settings)
     if found is None:
         return None
-    lower, upper, fewest_seen = found
-    wrong = _wrong_masks(coarse, lower, upper, fewest_seen, settings)
-    carver = _Carver(masks.chosen([view for view in range(len(masks.masks)) if view not in wrong]), fewest_seen)
+    coarse, lower, upper, fewest_seen = found
+    carver = _Carver(masks.chosen(_believed(coarse, lower, upper, fewest_seen, settings)), fewest_seen)
     if box is None:
         return _fine_surface(carver, lower, upper, settings)
     lower, upper = np.maximum(lower, box.low), np.minimum(upper, box.high)
     hull = _fine_surface(carver, lower, upper, settings) if (lower < upper).all() else None
     # Cells are whole, so the grid ends up to one of them behind the box.
     return hull and replace(hull, vertices_world=hull.vertices_world.clip(box.low, box.high).astype(np.float32))
+
+
+def believed_views(views: Views, settings: VisualHullSettings = HULL) -> list[int]:
+    """Numbers of the views whose masks carve the hull: those that carve away what the others need are left out."""
+    found = _object_box(views, settings)
+    return list(range(len(views.cameras))) if found is None else _believed(*found, settings)
+
+
+def _object_box(views: Views, settings: VisualHullSettings) -> tuple[MaskStack, Float[ndarray, "3"], Float[ndarray, "3"], int] | None:
+    """Coarse masks, the box in which the object is, and how many views must see a place of it."""
+    coarse = MaskStack.of(with_small_masks(views, settings.wrong_mask_side))
+    first = _first_box(views)
+    found = None if first is None else _box_of_object(coarse, *first, settings)
+    return None if found is None else (coarse, *found)
 
 
 def _box_of_object(
@@ -166,12 +177,13 @@ def _most_wrong(masks: MaskStack, settings: VisualHullSettings) -> int:
     return min(MOST_CARVERS, math.ceil(settings.wrong_mask_share * count)) if count >= FEWEST_FOR_DOUBT else 0
 
 
-def _wrong_masks(
+def _believed(
     masks: MaskStack, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], fewest_seen: int, settings: VisualHullSettings
 ) -> list[int]:
     cell = float((upper - lower).max()) / settings.wrong_mask_cells
     points = _grid_points(lower, cell, _grid_shape(lower, upper, cell))
-    return wrong_masks(masks, points, cell, settings.level, fewest_seen, _most_wrong(masks, settings))
+    wrong = wrong_masks(masks, points, cell, settings.level, fewest_seen, _most_wrong(masks, settings))
+    return [view for view in range(len(masks.masks)) if view not in wrong]
 
 
 def axes_meeting_point(centers: Float[ndarray, "view 3"], directions: Float[ndarray, "view 3"]) -> Float[ndarray, "3"]:
@@ -193,7 +205,7 @@ def camera_geometry(views: Views) -> tuple[Float[ndarray, "view 4 4"], Float[nda
     return camera_from_world, intrinsics, centers
 
 
-def _with_small_masks(views: Views, side: int) -> Views:
+def with_small_masks(views: Views, side: int) -> Views:
     """Masks averaged over squares of whole pixels, cameras to match; the pictures are left alone, nothing here reads them."""
     cameras, masks = [], []
     for camera, mask in zip(views.cameras, views.coverage, strict=True):

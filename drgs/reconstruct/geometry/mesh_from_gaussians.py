@@ -1,5 +1,6 @@
 """The surfels that cameras see, and the mesh around them: grey, since bake_materials gives it its materials."""
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import TypeVar
 
@@ -62,14 +63,19 @@ def reduced_mesh(mesh: TriangleMesh, face_limit: int, radius: float) -> Triangle
 
 
 def mesh_from_gaussians(
-    gaussians: Gaussians, cameras: tuple[Camera, ...], points: InitialPoints, settings: MeshSettings, box: BuildBox | None = None
+    gaussians: Gaussians,
+    cameras: tuple[Camera, ...],
+    points: InitialPoints,
+    settings: MeshSettings,
+    box: BuildBox | None = None,
+    outside: Callable[[Float[Tensor, "point 3"]], Float[Tensor, "point"]] | None = None,
 ) -> TriangleMesh:
     """Fuse the median depth of every training view (mean depth draws a second sheet between two surfaces).
 
     Things that stand apart are kept, where a hull says that they are the object; without one the largest alone is.
 
     Args:
-        box: of the build, which cuts the surface flat.
+        box: of the build, which cuts the surface flat. outside: as extract_mesh takes it.
 
     Raises:
         ValueError: as extract_mesh.
@@ -80,10 +86,10 @@ def mesh_from_gaussians(
     tangents, opacities = surfel_tangents(gaussians), torch.sigmoid(gaussians.opacity_logits)
     maps = median_depths(gaussians.centers, tangents, opacities, cameras, points.bounds_radius)
     if points.hull_vertices is None or points.hull_faces is None:
-        vertices, faces = extract_mesh(maps, center, radius, settings, box)
+        vertices, faces = extract_mesh(maps, center, radius, settings, box, outside)
         return _grey_mesh(whole_or_within(box, vertices), faces)
     settings = replace(settings, keep_component_fraction=SMALLEST_PART)
-    vertices, faces = extract_mesh(maps, center, radius, settings, box)
+    vertices, faces = extract_mesh(maps, center, radius, settings, box, outside)
     vertices, faces = parts_in_hull(vertices, faces, points.hull_vertices, points.hull_faces, BEYOND_HULL * points.bounds_radius)
     return _grey_mesh(whole_or_within(box, vertices), faces)
 

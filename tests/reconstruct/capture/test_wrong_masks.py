@@ -8,42 +8,21 @@ import pytest
 import torch
 import trimesh
 
-from drgs.reconstruct.capture.hull_rays import surface_of
 from drgs.reconstruct.capture.mask_stack import MaskStack
 from drgs.reconstruct.capture.visual_hull import HULL, VisualHull, visual_hull
 from drgs.reconstruct.capture.wrong_masks import wrong_masks
-from drgs.render.intersect.trace_rays import trace_rays
-from drgs.scene.camera import Camera, pixel_rays_world, scaled_camera
 from drgs.scene.views import Views
 from tests.reconstruct import tiny_capture as tiny
+from tests.reconstruct.capture.photographed import SIDE, VIEWS, photographed
 
-SIDE, VIEWS = 128, 36
 SMALL = replace(HULL, fine_cells=96, wrong_mask_cells=96)
-
-
-def _photographed(*parts: trimesh.Trimesh) -> Views:
-    """Masks of the parts, coverage of a pixel by four places in it."""
-    solid = trimesh.util.concatenate(parts)
-    tracer = surface_of(torch.from_numpy(np.asarray(solid.vertices)).float(), torch.from_numpy(np.asarray(solid.faces)).int())
-    intrinsics = torch.tensor([[1.3 * SIDE, 0, SIDE / 2], [0, 1.3 * SIDE, SIDE / 2], [0, 0, 1]])
-    cameras, masks = [], []
-    for number, position in enumerate(tiny.camera_positions(VIEWS)):
-        camera = Camera(torch.from_numpy(tiny.look_at(position)).float(), intrinsics, SIDE, SIDE, f"r_{number}")
-        fine = scaled_camera(camera, 2.0)
-        origin, directions = pixel_rays_world(fine)
-        direction = torch.nn.functional.normalize(directions.reshape(-1, 3), dim=-1).contiguous()
-        hit = trace_rays(origin.expand_as(direction).contiguous(), direction, tracer).hit.reshape(fine.height, fine.width)
-        cameras.append(camera)
-        masks.append((255 * torch.nn.functional.avg_pool2d(hit.float()[None], 2)[0]).round().to(torch.uint8))
-    pictures = tuple(torch.zeros(SIDE, SIDE, 3, dtype=torch.uint8) for _ in cameras)
-    return Views(tuple(cameras), pictures, tuple(masks), None, None, True, "nerfstudio")
 
 
 @pytest.fixture(scope="module")
 def dumbbell() -> Views:
     rod = trimesh.creation.cylinder(0.1, 1.0, transform=trimesh.transformations.rotation_matrix(math.pi / 2, [0, 1, 0]))
     balls = [trimesh.creation.icosphere(3, 0.3).apply_translation([x, 0, 0]) for x in (-0.5, 0.5)]
-    return _photographed(rod, *balls)
+    return photographed(rod, *balls)
 
 
 def _wrong(views: Views, most: int = 3) -> list[int]:
@@ -99,7 +78,7 @@ def test_a_slit_that_one_view_sees_through_is_open() -> None:
     # Plates stand apart by a little more than a pixel, and only the view along the slit sees light between them.
     plates = [trimesh.creation.box((0.9, 0.1, 0.9)).apply_translation([0, y, 0]) for y in (-0.09, 0.09)]
     towards = np.array([3.0, 0.0, 0.0])
-    views = _photographed(*plates)
+    views = photographed(*plates)
     along = replace(views.cameras[0], camera_from_world=torch.from_numpy(tiny.look_at(towards)).float())
     rows, columns = torch.meshgrid(torch.arange(SIDE), torch.arange(SIDE), indexing="ij")
     x = (columns + 0.5 - SIDE / 2).abs() / (1.3 * SIDE)

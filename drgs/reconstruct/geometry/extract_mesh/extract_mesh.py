@@ -1,6 +1,6 @@
 """Depth maps to mesh: fuse_depth, marching cubes, clean_mesh."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -20,6 +20,7 @@ def extract_mesh(
     bounds_radius: float,
     settings: MeshSettings = FAST_MESH,
     box: BuildBox | None = None,
+    outside: Callable[[Float[Tensor, "point 3"]], Float[Tensor, "point"]] | None = None,
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """Vertices (V, 3) float32 and faces (F, 3) int32 of the object's surface, counter-clockwise seen from outside.
 
@@ -27,6 +28,7 @@ def extract_mesh(
         bounds_center: (3,) world position of the middle of the object's box.
         bounds_radius: half the box's longest side [world units]; a little too large costs little, too small cuts the object.
         box: of the build: the surface is closed flat where the object goes on outside.
+        outside: how far points lie outside of what the object may fill at most [world units].
 
     Raises:
         ValueError: no depth map, none of them reaches into the bounds, or nothing of the object is left after fusion.
@@ -34,6 +36,8 @@ def extract_mesh(
     field = fuse_depth(depth_maps, bounds_center, bounds_radius, settings)
     if box is not None:
         field = field_within(field, box, settings)
+    if outside is not None:
+        field = field_inside(field, outside, settings)
     vertices, faces = march(field)
     return clean_mesh(vertices, faces, settings, shortest_edge=1e-3 * field.voxel_size)
 
@@ -47,6 +51,18 @@ def field_within(field: DistanceField, box: BuildBox, settings: MeshSettings) ->
         outside = torch.maximum(box.low[axis] - place, place - box.high[axis]) / truncation
         values = torch.maximum(values, outside.clamp(-1, 1).reshape([-1 if k == axis else 1 for k in range(3)]))
     return replace(field, values=values)
+
+
+def field_inside(
+    field: DistanceField, outside: Callable[[Float[Tensor, "point 3"]], Float[Tensor, "point"]], settings: MeshSettings
+) -> DistanceField:
+    """The same of what the object may fill at most."""
+    values, truncation = field.values, settings.truncation_voxels * field.voxel_size
+    asked = (values < 1).nonzero()
+    distance = outside(field.origin + field.voxel_size * asked.to(field.origin)).to(values.device) / truncation
+    cut = values.clone()
+    cut[asked[:, 0], asked[:, 1], asked[:, 2]] = torch.maximum(values[asked[:, 0], asked[:, 1], asked[:, 2]], distance.clamp(-1, 1))
+    return replace(field, values=cut)
 
 
 def march(field: DistanceField) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
