@@ -30,7 +30,6 @@ from drgs.reconstruct.capture.hull_rays import (
     surface_of_hull,
     unlikenesses,
 )
-from drgs.reconstruct.capture.outside_masks import OutsideMasks
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
 from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.reconstruct.fit.view_targets import ViewTarget
@@ -134,7 +133,7 @@ def _look_behind(
         return hull
     maps = [view.chosen(inner, empty) for view in seen]
     try:
-        vertices, faces = extract_mesh(maps, center, 1.03 * radius, settings.chosen_mesh, outside=OutsideMasks(views))
+        vertices, faces = extract_mesh(maps, center, 1.03 * radius, settings.chosen_mesh)
     except ValueError:  # so much was believed to be empty that nothing is left
         return hull
     cell = 2 * radius / settings.chosen_mesh.resolution
