@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from drgs.maths.constants import UNBOUNDED
 from drgs.reconstruct.capture.mask_stack import MaskStack
 from drgs.reconstruct.capture.visual_hull import HULL, VisualHullSettings, believed_views, with_small_masks
 from drgs.scene.views import Views
@@ -35,10 +36,10 @@ def farthest_outside(
     # outputs
     outside: wp.array[float],
 ):
-    """One thread a point: the largest distance [world units] of all views that see it; never by less than REACH pixels inside."""
+    """One thread a point: the largest distance [world units] of all views that see it, and what is there already."""
     i = first + wp.tid()
     point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
-    farthest = float(-1.0e30)  # Warp: a variable that a loop changes must not be a constant
+    farthest = outside[i]
     for view in range(distances.shape[0]):
         depth = wp.dot(pixel_from_world[3 * view + 2], point)
         if depth > 0.0:
@@ -71,7 +72,7 @@ class OutsideMasks:
     def __call__(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
         """Distances [world units], positive where a mask leaves the point out by more than SLACK; views that do not see it say nothing."""
         points = points.float().cpu().contiguous()
-        outside = torch.zeros(len(points))
+        outside = torch.full((len(points),), -UNBOUNDED)
         inputs = [*self._masks.inputs(points)[:3], warp_array(self._distances), warp_array(self._masks.focal)]
         launch(farthest_outside, len(points), inputs=inputs, outputs=[warp_array(outside)], device=warp_device(points))
         return outside
