@@ -25,7 +25,7 @@ from drgs.render.film.resolve_frame import resolve_frame
 from drgs.render.progressive.refine import refine_frame
 from drgs.render.progressive.start_frame import start_frame
 from drgs.render.records import Frame, RenderSettings
-from drgs.scene.asset import load_asset
+from drgs.scene.asset import load_asset, save_asset
 from drgs.scene.edits import parse_edits
 from drgs_server.live.messages import CameraMessage, Channel, Settings
 from drgs_server.render.drgs_renderer import DrgsRenderer
@@ -98,11 +98,13 @@ def main(folder: Path) -> None:
     wp.launch = count_launches
     PRESETS["tiny"] = replace(TINY, surface=replace(TINY.surface, cameras_after=(1,)))
     capture = write_nerf_synthetic(folder / "capture", sphere_views(FEW_VIEWS, square=True))
-    build_asset(capture, folder / "asset", BuildSettings(preset="tiny", device="cuda"))
+    build_asset(capture, folder / "asset", BuildSettings(preset="tiny", device="cuda", light="object"))
     asset = load_asset(folder / "asset", pretended_cuda.CUDA)
     moving(asset, SIDE, 8, 3, None)
     moving(asset, SIDE, 8, 1, "gaussians")
     show_as_a_server(folder / "asset")
+    save_asset(replace(asset, light_frame="camera"), folder / "turned")
+    DrgsRenderer("cuda").load(folder / "turned", folder / "turned")
     simulate(["--particles", "64", "--frames", "1", "--device", "cuda", "--json"])
     carry(["--surfels", "200", "--particles", "64", "--repeats", "1", "--device", "cuda", "--json"])
     there, here = picture(folder / "asset", pretended_cuda.CUDA), picture(folder / "asset", pretended_cuda.CPU)

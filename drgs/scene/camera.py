@@ -40,7 +40,7 @@ def camera_from_opengl(world_from_opengl: Tensor, intrinsics: Tensor, width: int
 def opengl_from_camera(camera: Camera) -> Tensor:
     """(4, 4) OpenGL camera-to-world, the inverse of `camera_from_opengl`."""
     opencv_from_opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-    return torch.linalg.inv(camera.camera_from_world.double()) @ opencv_from_opengl
+    return torch.linalg.inv(camera.camera_from_world.double()) @ opencv_from_opengl.to(camera.camera_from_world.device)
 
 
 def scaled_camera(camera: Camera, factor: float) -> Camera:

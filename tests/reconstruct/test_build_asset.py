@@ -74,7 +74,8 @@ WITHOUT_HOLLOWS = replace(
 )
 """For tests of other files that ask nothing about hollows; pictures as they are, for some of them compare those."""
 ON_SURFELS = replace(TINY, hollows=WITHOUT_HOLLOWS.hollows, vessels=WITHOUT_HOLLOWS.vessels, materials_on="surfels")
-SETTINGS = BuildSettings(preset="tiny", device="cpu")
+SETTINGS = BuildSettings(preset="tiny", device="cpu", light="object")
+"""Of ten pictures of a few pixels nothing tells whose light it is: tests of that are elsewhere (try_light_frames, turning_light)."""
 
 
 @pytest.fixture(autouse=True)
