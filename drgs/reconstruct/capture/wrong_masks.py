@@ -175,7 +175,7 @@ def wrong_masks(masks: MaskStack, points: Float[Tensor, "cell 3"], cell: float, 
 
 
 def _uncovered(masks: MaskStack, points: Float[Tensor, "cell 3"], reach: int) -> MaskStack:
-    """255 where a mask is object for more than a pixel around and no cell lies near: not 0."""
+    """1 where a mask is object for more than a pixel around and no cell lies near."""
     points, drawn = points.float().contiguous(), replace(masks, masks=torch.zeros_like(masks.masks))
     launch(draw_cells, len(points), inputs=drawn.inputs(points)[:3], outputs=[drawn.inputs(points)[3]], device=warp_device(points))
     uncovered = (masks.masks > 127) & ~_grown(drawn.masks > 0, reach + SLACK)
