@@ -23,6 +23,32 @@ HALF_SIDE = 0.6
 """Of a cell, and a little more."""
 
 
+@wp.func
+def seen_at(pixel_from_world: wp.array[wp.vec4], sizes: wp.array[wp.vec2i], view: int, world: wp.vec3) -> wp.vec3:
+    """Where a view sees a point: column and row [pixels], depth along its axis; depth 0 where it does not."""
+    point = wp.vec4(world[0], world[1], world[2], 1.0)
+    depth = wp.dot(pixel_from_world[3 * view + 2], point)
+    place = wp.vec3(0.0, 0.0, 0.0)
+    if depth > 0.0:
+        x = wp.dot(pixel_from_world[3 * view], point) / depth
+        y = wp.dot(pixel_from_world[3 * view + 1], point) / depth
+        if x >= 0.0 and y >= 0.0 and x < float(sizes[view][0]) and y < float(sizes[view][1]):
+            place = wp.vec3(x, y, depth)
+    return place
+
+
+@wp.func
+def corner_of(x: float, count: int) -> int:
+    """The first of the two pixels of a row, or a column, between whose middles x lies."""
+    return wp.min(int(wp.clamp(x - 0.5, 0.0, float(count - 1))), count - 2)
+
+
+@wp.func
+def between(x: float, corner: int) -> float:
+    """How far x lies from the middle of that pixel to the next one's, 0..1."""
+    return wp.clamp(x - 0.5 - float(corner), 0.0, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class MaskStack:
     """Masks and projections of all views."""

@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from drgs.maths.constants import UNBOUNDED
-from drgs.reconstruct.capture.mask_stack import MaskStack
+from drgs.reconstruct.capture.mask_stack import MaskStack, between, corner_of, seen_at
 from drgs.reconstruct.capture.visual_hull import HULL, VisualHullSettings, believed_views, with_small_masks
 from drgs.scene.views import Views
 from drgs.warp_torch import launch, thread_pool, warp_array, warp_device
@@ -38,23 +38,17 @@ def farthest_outside(
 ):
     """One thread a point: the largest distance [world units] of all views that see it, and what is there already."""
     i = first + wp.tid()
-    point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
     farthest = outside[i]
     for view in range(distances.shape[0]):
-        depth = wp.dot(pixel_from_world[3 * view + 2], point)
-        if depth > 0.0:
-            x = wp.dot(pixel_from_world[3 * view], point) / depth
-            y = wp.dot(pixel_from_world[3 * view + 1], point) / depth
-            if x >= 0.0 and y >= 0.0 and x < float(sizes[view][0]) and y < float(sizes[view][1]):
-                u = wp.clamp(x - 0.5, 0.0, float(sizes[view][0] - 1))
-                v = wp.clamp(y - 0.5, 0.0, float(sizes[view][1] - 1))
-                column = wp.min(int(u), sizes[view][0] - 2)
-                row = wp.min(int(v), sizes[view][1] - 2)
-                fu = u - float(column)
-                fv = v - float(row)
-                top = distances[view, row, column] * (1.0 - fu) + distances[view, row, column + 1] * fu
-                bottom = distances[view, row + 1, column] * (1.0 - fu) + distances[view, row + 1, column + 1] * fu
-                farthest = wp.max(farthest, (top * (1.0 - fv) + bottom * fv) * depth / focal[view])
+        place = seen_at(pixel_from_world, sizes, view, points[i])
+        if place[2] > 0.0:
+            column = corner_of(place[0], sizes[view][0])
+            row = corner_of(place[1], sizes[view][1])
+            u = between(place[0], column)
+            v = between(place[1], row)
+            top = distances[view, row, column] * (1.0 - u) + distances[view, row, column + 1] * u
+            bottom = distances[view, row + 1, column] * (1.0 - u) + distances[view, row + 1, column + 1] * u
+            farthest = wp.max(farthest, (top * (1.0 - v) + bottom * v) * place[2] / focal[view])
     outside[i] = farthest
 
 

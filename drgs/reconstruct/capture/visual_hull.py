@@ -21,7 +21,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox
-from drgs.reconstruct.capture.mask_stack import MaskStack
+from drgs.reconstruct.capture.mask_stack import MaskStack, between, corner_of, seen_at
 from drgs.reconstruct.capture.wrong_masks import MOST_CARVERS, find_carved, wrong_masks
 from drgs.scene.views import Views
 from drgs.warp_torch import launch, warp_array, warp_device
@@ -86,30 +86,22 @@ def smallest_coverage(
 ):
     """One thread a point: the smallest coverage, looked up bilinearly, over the views that see the point; 0 where too few do."""
     i = first + wp.tid()
-    point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
     smallest = float(1.0)  # Warp: a variable that a loop changes must not be a constant
     seen = int(0)
     for view in range(masks.shape[0]):
-        depth = wp.dot(pixel_from_world[3 * view + 2], point)
-        if depth > 0.0:
-            width = sizes[view][0]
-            height = sizes[view][1]
-            x = wp.dot(pixel_from_world[3 * view], point) / depth
-            y = wp.dot(pixel_from_world[3 * view + 1], point) / depth
-            # A view that does not see the point says nothing about it.
-            if x >= 0.0 and y >= 0.0 and x < float(width) and y < float(height):
-                seen += 1
-                u = wp.clamp(x - 0.5, 0.0, float(width - 1))
-                v = wp.clamp(y - 0.5, 0.0, float(height - 1))
-                column = wp.min(int(u), width - 2)
-                row = wp.min(int(v), height - 2)
-                fu = u - float(column)
-                fv = v - float(row)
-                top = float(masks[view, row, column]) * (1.0 - fu) + float(masks[view, row, column + 1]) * fu
-                bottom = float(masks[view, row + 1, column]) * (1.0 - fu) + float(masks[view, row + 1, column + 1]) * fu
-                smallest = wp.min(smallest, (top * (1.0 - fv) + bottom * fv) / 255.0)
-                if smallest <= 0.0:
-                    break
+        place = seen_at(pixel_from_world, sizes, view, points[i])
+        # A view that does not see the point says nothing about it.
+        if place[2] > 0.0:
+            seen += 1
+            column = corner_of(place[0], sizes[view][0])
+            row = corner_of(place[1], sizes[view][1])
+            u = between(place[0], column)
+            v = between(place[1], row)
+            top = float(masks[view, row, column]) * (1.0 - u) + float(masks[view, row, column + 1]) * u
+            bottom = float(masks[view, row + 1, column]) * (1.0 - u) + float(masks[view, row + 1, column + 1]) * u
+            smallest = wp.min(smallest, (top * (1.0 - v) + bottom * v) / 255.0)
+            if smallest <= 0.0:
+                break
     field[i] = wp.where(seen >= fewest_seen, smallest, 0.0)
 
 
@@ -123,8 +115,8 @@ def visual_hull(views: Views, settings: VisualHullSettings = HULL, box: BuildBox
     found = _object_box(views, settings)
     if found is None:
         return None
-    coarse, lower, upper, fewest_seen = found
-    carver = _Carver(masks.chosen(_believed(coarse, lower, upper, fewest_seen, settings)), fewest_seen)
+    carver = _Carver(masks.chosen(_believed(found, settings)), found.fewest_seen)
+    lower, upper = found.lower, found.upper
     if box is None:
         return _fine_surface(carver, lower, upper, settings)
     lower, upper = np.maximum(lower, box.low), np.minimum(upper, box.high)
@@ -136,21 +128,26 @@ def visual_hull(views: Views, settings: VisualHullSettings = HULL, box: BuildBox
 def believed_views(views: Views, settings: VisualHullSettings = HULL) -> list[int]:
     """Numbers of the views whose masks carve the hull: those that carve away what the others need are left out."""
     found = _object_box(views, settings)
-    return list(range(len(views.cameras))) if found is None else _believed(*found, settings)
+    return list(range(len(views.cameras))) if found is None else _believed(found, settings)
 
 
-def _object_box(views: Views, settings: VisualHullSettings) -> tuple[MaskStack, Float[ndarray, "3"], Float[ndarray, "3"], int] | None:
-    """Coarse masks, the box in which the object is, and how many views must see a place of it."""
-    coarse = MaskStack.of(with_small_masks(views, settings.wrong_mask_side))
-    first = _first_box(views)
-    found = None if first is None else _box_of_object(coarse, *first, settings)
-    return None if found is None else (coarse, *found)
+@dataclass(frozen=True, eq=False)
+class _ObjectBox:
+    """Where the object may be, by coarse masks."""
+
+    masks: MaskStack
+    lower: Float[ndarray, "3"]
+    upper: Float[ndarray, "3"]
+    fewest_seen: int
+    """Views that must see a place of it."""
 
 
-def _box_of_object(
-    masks: MaskStack, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], settings: VisualHullSettings
-) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"], int] | None:
-    """Where the object may be, and how many views must see a place of it; as many masks may be wrong as ever."""
+def _object_box(views: Views, settings: VisualHullSettings) -> _ObjectBox | None:
+    """As many masks may be wrong as ever; None where the masks have no common shape."""
+    masks, first = MaskStack.of(with_small_masks(views, settings.wrong_mask_side)), _first_box(views)
+    if first is None:
+        return None
+    lower, upper = first
     for _ in range(4):  # possibly the first guess cuts the object: grow it until nothing touches its sides
         cell = float((upper - lower).max()) / settings.coarse_cells
         shape = _grid_shape(lower, upper, cell)
@@ -168,7 +165,7 @@ def _box_of_object(
     indices = torch.nonzero(occupied)
     lower = lower + (indices.min(0).values.double().numpy() - 1.0) * cell
     upper = lower + (indices.max(0).values - indices.min(0).values + 3).double().numpy() * cell
-    return lower, upper, fewest_seen
+    return _ObjectBox(masks, lower, upper, fewest_seen)
 
 
 def _most_wrong(masks: MaskStack, settings: VisualHullSettings) -> int:
@@ -177,13 +174,11 @@ def _most_wrong(masks: MaskStack, settings: VisualHullSettings) -> int:
     return min(MOST_CARVERS, math.ceil(settings.wrong_mask_share * count)) if count >= FEWEST_FOR_DOUBT else 0
 
 
-def _believed(
-    masks: MaskStack, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], fewest_seen: int, settings: VisualHullSettings
-) -> list[int]:
-    cell = float((upper - lower).max()) / settings.wrong_mask_cells
-    points = _grid_points(lower, cell, _grid_shape(lower, upper, cell))
-    wrong = wrong_masks(masks, points, cell, settings.level, fewest_seen, _most_wrong(masks, settings))
-    return [view for view in range(len(masks.masks)) if view not in wrong]
+def _believed(found: _ObjectBox, settings: VisualHullSettings) -> list[int]:
+    cell = float((found.upper - found.lower).max()) / settings.wrong_mask_cells
+    points = _grid_points(found.lower, cell, _grid_shape(found.lower, found.upper, cell))
+    wrong = wrong_masks(found.masks, points, cell, settings.level, found.fewest_seen, _most_wrong(found.masks, settings))
+    return [view for view in range(len(found.masks.masks)) if view not in wrong]
 
 
 def axes_meeting_point(centers: Float[ndarray, "view 3"], directions: Float[ndarray, "view 3"]) -> Float[ndarray, "3"]:

@@ -15,8 +15,10 @@ from jaxtyping import Bool, Float, Int32
 from scipy import ndimage
 from torch import Tensor
 
-from drgs.reconstruct.capture.mask_stack import HALF_SIDE, MaskStack
+from drgs.reconstruct.capture.mask_stack import HALF_SIDE, MaskStack, seen_at
 from drgs.warp_torch import launch, warp_array, warp_device
+
+wp.set_module_options({"enable_backward": False})
 
 MOST_CARVERS = 3
 """A place that more views carve away is empty, whoever needs it. The kernel keeps their numbers in a wp.vec3i."""
@@ -40,19 +42,6 @@ class Carved:
     """How many views see the cell, as long as carvers were counted."""
 
 
-@wp.func
-def pixel_of(projections: wp.array[wp.vec4], sizes: wp.array[wp.vec2i], view: int, point: wp.vec4) -> wp.vec2i:
-    """Column and row; (-1, -1) where the view does not see the point."""
-    depth = wp.dot(projections[3 * view + 2], point)
-    pixel = wp.vec2i(-1, -1)
-    if depth > 0.0:
-        x = wp.dot(projections[3 * view], point) / depth
-        y = wp.dot(projections[3 * view + 1], point) / depth
-        if x >= 0.0 and y >= 0.0 and x < float(sizes[view][0]) and y < float(sizes[view][1]):
-            pixel = wp.vec2i(int(x), int(y))
-    return pixel
-
-
 @wp.kernel
 def find_carvers(
     first: int,
@@ -69,16 +58,15 @@ def find_carvers(
 ):
     """One thread a cell: how many trusted views see it, and how many and which of them see past the object there; counted up to MOST_CARVERS + 1."""
     i = first + wp.tid()
-    point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
     found = wp.vec3i(-1, -1, -1)
     many = int(0)  # Warp: a variable that a loop changes must not be a constant
     seen = int(0)
     for view in range(widened.shape[0]):
         if trusted[view] != 0 and many <= 3:
-            pixel = pixel_of(projections, sizes, view, point)
-            if pixel[0] >= 0:
+            place = seen_at(projections, sizes, view, points[i])
+            if place[2] > 0.0:
                 seen += 1
-                if float(widened[view, pixel[1], pixel[0]]) <= level * 255.0:
+                if float(widened[view, int(place[1]), int(place[0])]) <= level * 255.0:
                     if many < 3:
                         found[many] = view
                     many += 1
@@ -98,11 +86,10 @@ def draw_cells(
 ):
     """One thread a cell that is left: the pixel of its middle in every picture. Threads that meet write the same."""
     i = first + wp.tid()
-    point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
     for view in range(drawn.shape[0]):
-        pixel = pixel_of(projections, sizes, view, point)
-        if pixel[0] >= 0:
-            drawn[view, pixel[1], pixel[0]] = wp.uint8(255)
+        place = seen_at(projections, sizes, view, points[i])
+        if place[2] > 0.0:
+            drawn[view, int(place[1]), int(place[0])] = wp.uint8(255)
 
 
 @wp.kernel
@@ -115,16 +102,13 @@ def count_marked(
     # outputs
     count: wp.array[wp.int32],
 ):
-    """One thread a cell: in how many pictures its middle lies on a marked pixel."""
+    """One thread a cell: in how many pictures its middle lies on a pixel that is marked by 1, and not by 0."""
     i = first + wp.tid()
-    point = wp.vec4(points[i][0], points[i][1], points[i][2], 1.0)
     many = int(0)
     for view in range(marked.shape[0]):
-        pixel = pixel_of(projections, sizes, view, point)
-        if pixel[0] < 0:
-            continue
-        if marked[view, pixel[1], pixel[0]] != wp.uint8(0):
-            many += 1
+        place = seen_at(projections, sizes, view, points[i])
+        if place[2] > 0.0:
+            many += int(marked[view, int(place[1]), int(place[0])])
     count[i] = many
 
 
