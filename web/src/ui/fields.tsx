@@ -1,6 +1,6 @@
 /** Form pieces that every panel uses. While a value is dragged they show it, not the server's echo. */
 
-import { useState } from 'preact/hooks';
+import { useRef, useState } from 'preact/hooks';
 import type { ComponentChildren, InputHTMLAttributes } from 'preact';
 import type { Vec3 } from '../session/view';
 import { hexFromLinear, linearFromHex, type Rgb } from '../edit/material/color';
@@ -20,19 +20,33 @@ type EntryProps = { type: 'text' | 'number'; value: string | number; onEnter(tex
   'class' | 'min' | 'max' | 'step' | 'title' | 'spellcheck' | 'maxLength' | 'aria-label' | 'aria-invalid'
 >;
 
-/** A text or a number that counts once it is entered. What is being typed stays, whatever news of the value arrives meanwhile. */
+/** A text or a number that counts once it is entered. What is being typed stays, whatever news of the value arrives meanwhile.
+ *
+ * What is typed counts even where it reads as the value does: a time of 0.247 is shown as 0.25, and who types that means 0.25. Browsers call that
+ * no change, so Enter is heard by itself. */
 export function Entry({ value, onEnter, ...attributes }: EntryProps) {
   const [typed, setTyped] = useState<string | null>(null);
+  const typing = useRef(false); // at once, where `typed` waits for the page: Enter may be followed by the browser's own change
+  const leave = () => {
+    typing.current = false;
+    setTyped(null);
+  };
+  const enter = (text: string) => {
+    if (!typing.current) return;
+    leave();
+    onEnter(text);
+  };
   return (
     <input
       {...(attributes as object)}
       value={typed ?? value}
-      onInput={(event) => setTyped(event.currentTarget.value)}
-      onChange={(event) => {
-        setTyped(null);
-        onEnter(event.currentTarget.value);
+      onInput={(event) => {
+        typing.current = true;
+        setTyped(event.currentTarget.value);
       }}
-      onBlur={() => setTyped(null)}
+      onKeyDown={(event) => event.key === 'Enter' && !event.isComposing && enter(event.currentTarget.value)}
+      onChange={(event) => enter(event.currentTarget.value)}
+      onBlur={leave}
     />
   );
 }
