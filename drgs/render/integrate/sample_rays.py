@@ -314,5 +314,11 @@ def sample_rays(
     weight = torch.empty(point_count, counts.total, device=device)
     inputs = [point_arrays(points), light, sample_set(counts, seed, by_material=by_material)]
     outputs = [warp_array(direction.view(-1, 3), wp.vec3), warp_array(weight.view(-1))]
-    launch(sample_directions, point_count * counts.total, inputs, outputs, warp_device(direction))
+    rays = point_count * counts.total
+    if device.type == "cpu":
+        from drgs.render.integrate.sample_sixteen import SIXTEEN, sample_directions_by_sixteen  # made of this file's structs
+
+        launch(sample_directions_by_sixteen, -(-rays // SIXTEEN), [rays, *inputs], outputs, warp_device(direction))
+    else:
+        launch(sample_directions, rays, inputs, outputs, warp_device(direction))
     return Rays((points.position_world + lift * points.normal_world).detach(), direction, weight)

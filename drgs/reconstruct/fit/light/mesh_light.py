@@ -13,7 +13,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drgs.reconstruct.fit.light.mesh_light_kernels import hit_kernel, mirrored_kernel, rotation_of
+from drgs.reconstruct.fit.light.mesh_light_kernels import arriving_kernel, hit_kernel, mirrored_kernel, rotation_of
 from drgs.reconstruct.fit.light.split_sum import factor_table
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.integrate.environment_table import build_environment_table
@@ -121,6 +121,33 @@ def radiance_along(
     return (~hits.hit).float(), radiance
 
 
+def light_of_rays(
+    tracer: AbstractTracer,
+    origins: Float[Tensor, "point 3"],
+    up: Float[Tensor, "point 3"],
+    directions: Float[Tensor, "point sample 3"],
+    weight: Float[Tensor, "point sample"],
+    light: MeshLight,
+) -> tuple[Float[Tensor, "point sample"], Float[Tensor, "point sample 3"]]:
+    """Of several rays a point what radiance_along finds; rays without weight, or not above `up`, count as blocked by something black.
+
+    All at once: as separate operations on some of the rays, this took stage 2 a quarter longer.
+    """
+    mesh, device = tracer.mesh, origins.device
+    origins, up, directions, weight = (x.contiguous() for x in (origins, up, directions, weight))
+    transmittance, met = torch.empty_like(weight), torch.empty_like(directions)
+    inputs = [
+        tracer.handle, weight.shape[1], warp_argument(origins, wp.vec3), warp_argument(up, wp.vec3),
+        warp_argument(directions.view(-1, 3), wp.vec3), warp_argument(weight.view(-1)), warp_argument(mesh.faces),
+        warp_argument(mesh.normals, wp.vec3), warp_argument(mesh.albedo, wp.vec3), warp_argument(mesh.roughness), warp_argument(mesh.metallic),
+        warp_argument(light.open_share, wp.vec3), rotation_of(light.light_from_world), warp_argument(light.tables, wp.vec3),
+        warp_argument(factor_table(device), wp.vec2),
+    ]  # fmt: skip
+    outputs = [warp_argument(transmittance.view(-1)), warp_argument(met.view(-1, 3), wp.vec3)]
+    launch(arriving_kernel(tracer.kernel_query), weight.numel(), inputs, outputs, warp_device(origins))
+    return transmittance, met
+
+
 def mirrored_light(
     tracer: AbstractTracer,
     face: Int[Tensor, "place"],
@@ -171,13 +198,11 @@ def irradiance_share(tracer: AbstractTracer, environment: Environment, light: Me
         index = torch.arange(first, last, dtype=torch.int32, device=normal.device)
         points = ShadingPoints(mesh.vertices[some], normal, normal, torch.ones_like(normal), one, 0 * one, index)
         sampled = sample_rays(points, table, counts, seed, SHARE_LIFT * tracer.lift)
-        direction = sampled.direction_world.reshape(-1, 3)
-        origins = sampled.origin_world[:, None].expand_as(sampled.direction_world).reshape(-1, 3)
         cosine = (sampled.direction_world * normal[:, None]).sum(-1)
-        weight = (sampled.weight * cosine).clamp(min=0)[..., None]
-        transmittance, met = radiance_along(tracer, origins, direction, light)
-        sky = environment_radiance(environment, direction).view(count, rays, 3) * weight
-        arriving = sky * transmittance.view(count, rays, 1) + met.view(count, rays, 3) * weight
+        weight = (sampled.weight * cosine).clamp(min=0)
+        transmittance, met = light_of_rays(tracer, sampled.origin_world, normal, sampled.direction_world, weight, light)
+        sky = environment_radiance(environment, sampled.direction_world) * weight[..., None]
+        arriving = sky * transmittance[..., None] + met * weight[..., None]
         return arriving.sum(1) / sky.sum(1).clamp(min=1e-6)
 
     parts = by_pool(shares, [*range(0, len(mesh.vertices), SHARED_AT_ONCE), len(mesh.vertices)], mesh.vertices.device)

@@ -1,5 +1,6 @@
 """Kernels of mesh_light.py: where mirrored rays go, and what a ray sees where it meets the mesh; without gradient."""
 
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -7,6 +8,7 @@ from torch import Tensor
 
 from drgs.maths.constants import F0
 from drgs.reconstruct.fit.light.split_sum_kernels import radiance_of_point
+from drgs.render.intersect.tracer import KernelQuery
 
 wp.set_module_options({"enable_backward": False})
 
@@ -97,6 +99,36 @@ def mirrored_kernel(
     above[i] = leaves
 
 
+@wp.func
+def _sent(
+    corner: wp.vec3i,
+    weight: wp.vec3,
+    towards: wp.vec3,
+    normals: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    metallic: wp.array[float],
+    open_share: wp.array[wp.vec3],
+    open_sky: float,
+    seen: wp.vec3,
+    light_from_world: wp.mat33,
+    tables: wp.array[wp.vec3],
+    factors: wp.array[wp.vec2],
+) -> wp.vec3:
+    """Radiance that a place on the mesh sends `towards`, at least 0; `open_sky` and `seen`: whether its mirrored ray escapes, and what that meets.
+
+    Many arguments because kernels take arrays one by one.
+    """
+    base = vector_at(albedo, corner, weight)
+    metal = number_at(metallic, corner, weight)
+    normal = light_from_world * normal_at(vector_at(normals, corner, weight))
+    sent = radiance_of_point(
+        base * (1.0 - metal), base_f0(base, metal), number_at(roughness, corner, weight), normal, light_from_world * towards, open_sky,
+        seen, vector_at(open_share, corner, weight), tables, factors,
+    )  # fmt: skip
+    return wp.max(sent, wp.vec3(0.0, 0.0, 0.0))
+
+
 @wp.kernel
 def hit_kernel(
     first: int,
@@ -123,18 +155,65 @@ def hit_kernel(
     Many arguments because a struct of them would be filled anew, array by array, for each launch.
     """
     i = first + wp.tid()
-    corner = _corner(face[i], faces)
-    weight = weights[i]
-    base = vector_at(albedo, corner, weight)
-    metal = number_at(metallic, corner, weight)
     open_sky = float(1.0)
     seen = wp.vec3(0.0, 0.0, 0.0)
     if mirrors != 0:
         open_sky = transmittance[i]
         seen = met[i]
-    normal = light_from_world * normal_at(vector_at(normals, corner, weight))
-    sent = radiance_of_point(
-        base * (1.0 - metal), base_f0(base, metal), number_at(roughness, corner, weight), normal, light_from_world * towards[i], open_sky,
-        seen, vector_at(open_share, corner, weight), tables, factors,
+    radiance[i] = _sent(
+        _corner(face[i], faces), weights[i], towards[i], normals, albedo, roughness, metallic, open_share, open_sky, seen, light_from_world,
+        tables, factors,
     )  # fmt: skip
-    radiance[i] = wp.max(sent, wp.vec3(0.0, 0.0, 0.0))
+
+
+@cache
+def arriving_kernel(query: KernelQuery) -> Any:
+    """The kernel that finds what light some rays of each point bring, for a kind of tracer."""
+    closest_fn, handle_type = query.closest_fn, query.handle_type
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def arriving_light(
+        first: int,
+        tracer: handle_type,  # type: ignore[valid-type]  # known when the kernel is made
+        samples: int,
+        origin: wp.array[wp.vec3],
+        up: wp.array[wp.vec3],
+        direction: wp.array[wp.vec3],
+        weight: wp.array[float],
+        faces: wp.array2d[int],
+        normals: wp.array[wp.vec3],
+        albedo: wp.array[wp.vec3],
+        roughness: wp.array[float],
+        metallic: wp.array[float],
+        open_share: wp.array[wp.vec3],
+        light_from_world: wp.mat33,
+        tables: wp.array[wp.vec3],
+        factors: wp.array[wp.vec2],
+        # outputs
+        transmittance: wp.array[float],
+        radiance: wp.array[wp.vec3],
+    ):
+        """One thread a ray. What it meets mirrors the sky alone.
+
+        Many arguments because a struct of them would be filled anew, array by array, for each launch.
+        """
+        i = first + wp.tid()
+        point = i // samples
+        along = direction[i]
+        free = float(0.0)
+        met = wp.vec3(0.0, 0.0, 0.0)
+        if weight[i] > 0.0 and wp.dot(along, up[point]) > 0.0:
+            hit = closest_fn(tracer, origin[point], along, wp.inf)
+            if hit.face < 0:
+                free = 1.0
+            else:
+                corner = wp.vec3i(faces[hit.face, 0], faces[hit.face, 1], faces[hit.face, 2])
+                weights = wp.vec3(1.0 - (hit.barycentric[0] + hit.barycentric[1]), hit.barycentric[0], hit.barycentric[1])
+                met = _sent(
+                    corner, weights, -along, normals, albedo, roughness, metallic, open_share, 1.0, wp.vec3(0.0, 0.0, 0.0), light_from_world,
+                    tables, factors,
+                )  # fmt: skip
+        transmittance[i] = free
+        radiance[i] = met
+
+    return arriving_light

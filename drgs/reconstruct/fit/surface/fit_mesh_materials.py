@@ -27,7 +27,7 @@ from torch import Tensor
 from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, radiance_along
+from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, light_of_rays
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, display_image
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates
@@ -107,15 +107,6 @@ def fit_mesh_materials(
     )
 
 
-def traced_light(tracer: AbstractTracer, light: MeshLight, points: ShadingPoints, face_normal: Tensor, rays: Rays) -> tuple[Tensor, Tensor]:
-    """(point, sample) transmittance and (point, sample, 3) hit radiance, without gradient; rays below the face count as blocked."""
-    usable = (rays.weight > 0) & ((rays.direction_world * face_normal[:, None]).sum(-1) > 0)
-    transmittance, met = torch.zeros_like(rays.weight), torch.zeros_like(rays.direction_world)
-    origins = (points.position_world + tracer.lift * face_normal)[:, None].expand_as(rays.direction_world)[usable]
-    transmittance[usable], met[usable] = radiance_along(tracer, origins, rays.direction_world[usable], light)
-    return transmittance, met
-
-
 @dataclass(frozen=True, eq=False)
 class Surroundings:
     """What rays of a step meet."""
@@ -173,9 +164,9 @@ class _Steps:
         return StepLoss(terms, target.camera, squared_error)
 
     def _drawn(self, solid: Tensor) -> Tensor:
-        """Some of the view's pixels, flat."""
+        """Some of the view's pixels, flat, in their order: rays that leave from near each other find what they need in the cache."""
         most = min(self.settings.points_a_step, len(solid))
-        return solid[torch.randint(max(1, len(solid)), (most,), generator=self.state.generator).to(solid.device)]
+        return solid[torch.randint(max(1, len(solid)), (most,), generator=self.state.generator).sort().values.to(solid.device)]
 
     def _traced(
         self, target: ViewTarget, pixels: Tensor, environment: Tensor, surface: Tensor, iteration: int
@@ -186,6 +177,7 @@ class _Steps:
             surface: of packed_surface.
         """
         with torch.no_grad():
+            _ = self.surface.tracer.swift  # made once, shared by the copies with other materials
             tracer = self.surface.tracer.with_materials(mesh_from_surface_fit(self.state, self.faces))
             around = Surroundings(
                 tracer,
@@ -250,7 +242,12 @@ def _radiance(
     turned = in_light(points, turn)
     with torch.no_grad():
         rays = sample_rays(turned, around.table, settings.samples, settings.seed * 1_000_003 + draw, by_material=True)
-        transmittance, met = traced_light(tracer, around.light, points, tracer.face_normals[seen.face], in_world(rays, turn))
+        face_normal = tracer.face_normals.index_select(0, seen.face)
+        starts = points.position_world + tracer.lift * face_normal
+        # One ray in a million may slip through an edge.
+        transmittance, met = light_of_rays(
+            tracer.swift, starts, face_normal, in_world(rays, turn).direction_world, rays.weight, around.light
+        )
     return integrate_samples(turned, rays, transmittance, met, environment)
 
 

@@ -5,12 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from drgs.reconstruct.fit.light.mesh_light import SHARE_LIFT, MeshLight, irradiance_share, mirrored_light
+from drgs.reconstruct.fit.light.mesh_light import SHARE_LIFT, MeshLight, irradiance_share, light_of_rays, mirrored_light, radiance_along
 from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, filter_environment, texel_directions, texel_solid_angles
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.environment import Environment
 from drgs.scene.mesh import TriangleMesh
+from tests.reconstruct.fit.convex_rays import assert_only_the_sky_is_seen, rays_of_convex
 from tests.render.closed_form_scenes import sphere_mesh
 
 LAMP = 3000.0
@@ -66,6 +67,41 @@ def test_where_nothing_is_met_all_arrives() -> None:
     one = sphere_mesh(subdivisions=2)
     found = shares(build_tracer(dataclasses.replace(one, albedo=torch.ones_like(one.albedo))), lamp_sky(), 8)
     torch.testing.assert_close(found, torch.ones_like(found))
+
+
+def test_on_a_convex_surface_rays_above_it_see_the_sky_and_others_bring_nothing():
+    mesh = sphere_mesh(subdivisions=3)
+    points, rays = rays_of_convex(mesh)
+    light = MeshLight(filter_environment(torch.ones(*ENVIRONMENT_SIZE, 3)), torch.ones_like(mesh.vertices))
+    tracer = build_tracer(mesh)
+    starts = points.position_world + tracer.lift * points.normal_world
+    found = light_of_rays(tracer, starts, points.normal_world, rays.direction_world, rays.weight, light)
+    assert_only_the_sky_is_seen(points, rays, *found)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_several_rays_a_point_find_what_rays_one_by_one_do(turned: bool) -> None:
+    """Of two coloured spheres under a lamp, from points of the first."""
+    random = torch.Generator().manual_seed(2)
+    mesh = black_spheres(2.2)
+    mesh = dataclasses.replace(
+        mesh, albedo=torch.rand(mesh.albedo.shape, generator=random), metallic=torch.rand(len(mesh.vertices), generator=random)
+    )
+    tracer, count, samples = build_tracer(mesh), 40, 30
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) if turned else None
+    light = MeshLight(filter_environment(lamp_sky().radiance), torch.rand(mesh.vertices.shape, generator=random), turn)
+    up = mesh.normals[:count].contiguous()
+    origins = 1.001 * up
+    directions = torch.nn.functional.normalize(torch.randn(count, samples, 3, generator=random), dim=-1)
+    weight = (torch.rand(count, samples, generator=random) - 0.2).clamp(min=0)
+    transmittance, met = light_of_rays(tracer, origins, up, directions, weight, light)
+
+    counts = (weight > 0) & ((directions * up[:, None]).sum(-1) > 0)
+    alone = radiance_along(tracer, origins[:, None].expand_as(directions)[counts].contiguous(), directions[counts].contiguous(), light)
+    assert 0.2 < float(counts.float().mean()) < 0.6 and 0.03 < float((alone[0] == 0).float().mean()) < 0.9
+    assert float(transmittance[~counts].abs().max()) == 0 and float(met[~counts].abs().max()) == 0
+    torch.testing.assert_close(transmittance[counts], alone[0])
+    torch.testing.assert_close(met[counts], alone[1])
 
 
 def facing_mirrors(albedo: float) -> TriangleMesh:

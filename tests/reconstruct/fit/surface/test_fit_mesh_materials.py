@@ -1,4 +1,4 @@
-"""Stage 2 on the mesh: rays on a convex object, a fit that finds colours, repeats itself and resumes."""
+"""Stage 2 on the mesh: a fit that finds colours, repeats itself and resumes."""
 
 import math
 from pathlib import Path
@@ -9,32 +9,19 @@ import torch
 from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState, StepLoss
-from drgs.reconstruct.fit.light.mesh_light import MeshLight
-from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface import fit_mesh_materials as fit_mesh_materials_file
 from drgs.reconstruct.fit.surface.fit_mesh_materials import (
     MeshMaterialSettings,
     fit_mesh_materials,
     start_mesh_materials,
-    traced_light,
 )
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings, start_surface
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
-from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.records import SampleCounts
 from drgs.scene.views import Views
-from tests.reconstruct.fit.convex_rays import assert_only_the_sky_is_seen, rays_of_convex
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
 from tests.reconstruct.surfel_spheres import surfel_sphere
 from tests.reconstruct.tiny_capture import SPHERE_RADIUS
-from tests.render.closed_form_scenes import sphere_mesh
-
-
-def test_on_a_convex_surface_rays_above_it_see_the_sky_and_others_bring_nothing():
-    mesh = sphere_mesh(subdivisions=3)
-    points, rays = rays_of_convex(mesh)
-    light = MeshLight(filter_environment(torch.ones(128, 256, 3)), torch.ones_like(mesh.vertices))
-    assert_only_the_sky_is_seen(points, rays, *traced_light(build_tracer(mesh), light, points, points.normal_world, rays))
 
 
 @pytest.fixture(scope="module")
