@@ -18,7 +18,8 @@ from drgs.render.integrate.environment_pool import BLOCK_STREAM, BLOCKS
 from drgs.render.integrate.integrator import AbstractIntegrator, Estimate
 from drgs.render.integrate.path_arrays import PathArrays, path_arrays
 from drgs.render.integrate.ray_scene import RayScene
-from drgs.render.integrate.sample_rays import PointArrays, SampleSet, StartArrays, point_at
+from drgs.render.integrate.sample_arrays import PointArrays, SampleSet, StartArrays
+from drgs.render.integrate.sample_rays import point_at
 from drgs.render.integrate.sum_samples import LightSums, RaySamples, ray_samples, sum_point
 from drgs.render.integrate.surface_light import SurfaceLightArrays, light_of_hit
 from drgs.render.intersect.ray_memory import TracedArrays, traced_arrays

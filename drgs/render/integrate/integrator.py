@@ -19,7 +19,7 @@ from torch import Tensor
 
 from drgs.render.integrate.environment_pool import candidate_pools
 from drgs.render.integrate.ray_scene import ray_scene
-from drgs.render.integrate.sample_rays import point_arrays, sample_set, start_arrays
+from drgs.render.integrate.sample_arrays import point_arrays, sample_set, start_arrays
 from drgs.render.integrate.sum_samples import LightSums
 from drgs.render.integrate.surface_light import SurfaceLight
 from drgs.render.intersect.ray_memory import RayMemory, empty_rays, usable_rays

@@ -7,8 +7,6 @@ a sample below the horizon has weight 0. Random numbers are Owen-scrambled Sobol
 Does not know the tracer, nor radiance.
 """
 
-from typing import Any
-
 import torch
 import warp as wp
 
@@ -23,7 +21,9 @@ from drgs.render.integrate.environment_table import (
     uv_from_world_direction,
 )
 from drgs.render.integrate.random_warp import hash_combine, sobol_2d
-from drgs.render.records import GBuffer, Rays, RayStarts, SampleCounts, ShadingPoints
+from drgs.render.integrate.sample_arrays import PointArrays, SampleSet, point_arrays, sample_set
+from drgs.render.integrate.sample_sixteen import SIXTEEN, sample_directions_by_sixteen
+from drgs.render.records import GBuffer, Rays, SampleCounts, ShadingPoints
 from drgs.warp_torch import launch, warp_array, warp_device
 
 wp.set_module_options({"enable_backward": False})
@@ -33,51 +33,6 @@ def sample_counts(total: int) -> SampleCounts:
     """2:1:1 of `total` samples (at least one each)."""
     quarter = max(1, total // 4)
     return SampleCounts(max(1, total - 2 * quarter), quarter, quarter)
-
-
-@wp.struct
-class PointArrays:
-    """ShadingPoints as kernels see them."""
-
-    position: wp.array[wp.vec3]
-    normal: wp.array[wp.vec3]
-    wo: wp.array[wp.vec3]
-    albedo: wp.array[wp.vec3]
-    roughness: wp.array[float]
-    metallic: wp.array[float]
-    pixel: wp.array[int]
-    round: wp.array[int]
-    """Each point's own rounds, added to SampleSet.round; empty where all are the same."""
-    pool: wp.array[int]
-    """The round whose pools each point's samples choose from; empty where that is the point's own (environment_pool.py)."""
-    order: wp.array[int]
-    """The points that are meant, one after the other; empty where all are (point_at)."""
-
-
-@wp.struct
-class StartArrays:
-    """RayStarts as kernels see them."""
-
-    origin: wp.array[wp.vec3]
-    surface_normal: wp.array[wp.vec3]
-    face: wp.array[int]
-    """Empty where none is known."""
-
-
-@wp.struct
-class SampleSet:
-    """How a point's samples are laid out, and which of each strategy's sequence they are."""
-
-    cosine: int
-    ggx: int
-    environment: int
-    by_material: int
-    """1: each point shares the same total out by its material (split_at)."""
-    round: int
-    """Samples already taken: rounds of the same counts."""
-    seed: wp.uint32
-    candidates: int
-    """Directions that each environment sample chooses among (environment_pool.py)."""
 
 
 @wp.kernel
@@ -228,37 +183,6 @@ def sample_directions(
     weight[i] = w
 
 
-def point_arrays(
-    points: ShadingPoints, rounds: torch.Tensor | None = None, order: torch.Tensor | None = None, pools: torch.Tensor | None = None
-) -> Any:
-    """The struct that kernels read; shares memory with the tensors.
-
-    Args:
-        rounds: (point,) int32, where points of several passes come together. order: (chosen,) int32, of some of them.
-        pools: (point,) int32, the round whose pools each takes, where that is not its own.
-    """
-    arrays = PointArrays()
-    arrays.position = warp_array(points.position_world.float(), wp.vec3)
-    arrays.normal = warp_array(points.normal_world.float(), wp.vec3)
-    arrays.wo = warp_array(points.wo_world.float(), wp.vec3)
-    arrays.albedo = warp_array(points.albedo.float(), wp.vec3)
-    arrays.roughness = warp_array(points.roughness.float())
-    arrays.metallic = warp_array(points.metallic.float())
-    arrays.pixel = warp_array(points.pixel.int())
-    none = points.pixel[:0].int()
-    arrays.round, arrays.order, arrays.pool = (warp_array(none if values is None else values) for values in (rounds, order, pools))
-    return arrays
-
-
-def start_arrays(starts: RayStarts) -> Any:
-    """The struct that kernels read; shares memory with the tensors."""
-    arrays = StartArrays()
-    arrays.origin = warp_array(starts.origin_world, wp.vec3)
-    arrays.surface_normal = warp_array(starts.surface_normal_world, wp.vec3)
-    arrays.face = warp_array(starts.origin_world.new_empty(0, dtype=torch.int32) if starts.face is None else starts.face.int())
-    return arrays
-
-
 def shading_points(gbuffer: GBuffer, first_pixel: int = 0) -> ShadingPoints:
     """The covered pixels of a G-buffer, packed in row-major order; differentiable.
 
@@ -278,17 +202,6 @@ def shading_points(gbuffer: GBuffer, first_pixel: int = 0) -> ShadingPoints:
         arrays = [*(warp_array(values, wp.vec3) for values in vectors), *(warp_array(values) for values in numbers)]
         launch(gather_points, len(pixel), [warp_array(pixel), *arrays, first_pixel], [point_arrays(points)], warp_device(pixel))
     return points
-
-
-def sample_set(counts: SampleCounts, seed: int, samples_round: int = 0, by_material: bool = False, candidates: int = 1) -> Any:
-    """The struct that kernels read."""
-    samples = SampleSet()
-    samples.by_material = int(by_material)
-    samples.cosine, samples.ggx, samples.environment = counts.cosine, counts.ggx, counts.environment
-    samples.round = samples_round
-    samples.seed = seed & 0xFFFFFFFF
-    samples.candidates = candidates
-    return samples
 
 
 def sample_rays(
@@ -316,8 +229,6 @@ def sample_rays(
     outputs = [warp_array(direction.view(-1, 3), wp.vec3), warp_array(weight.view(-1))]
     rays = point_count * counts.total
     if device.type == "cpu":
-        from drgs.render.integrate.sample_sixteen import SIXTEEN, sample_directions_by_sixteen  # made of this file's structs
-
         launch(sample_directions_by_sixteen, -(-rays // SIXTEEN), [rays, *inputs], outputs, warp_device(direction))
     else:
         launch(sample_directions, rays, inputs, outputs, warp_device(direction))

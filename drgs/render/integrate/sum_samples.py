@@ -7,7 +7,8 @@ import warp as wp
 
 from drgs.render.color_warp import luminance_of
 from drgs.render.integrate.brdf_warp import PI
-from drgs.render.integrate.sample_rays import PointArrays, SampleSet, point_at, split_at
+from drgs.render.integrate.sample_arrays import PointArrays, SampleSet
+from drgs.render.integrate.sample_rays import point_at, split_at
 from drgs.warp_torch import warp_array
 
 wp.set_module_options({"enable_backward": False})

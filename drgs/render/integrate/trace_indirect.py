@@ -24,16 +24,8 @@ from drgs.render.integrate.integrator import Estimate
 from drgs.render.integrate.path_arrays import PathArrays
 from drgs.render.integrate.random_warp import hash_combine, shuffle_index, sobol_2d
 from drgs.render.integrate.ray_scene import RayScene
-from drgs.render.integrate.sample_rays import (
-    PointArrays,
-    SampleSet,
-    point_at,
-    pool_round_at,
-    round_at,
-    split_at,
-    strategy_of,
-    strategy_seed,
-)
+from drgs.render.integrate.sample_arrays import PointArrays, SampleSet
+from drgs.render.integrate.sample_rays import point_at, pool_round_at, round_at, split_at, strategy_of, strategy_seed
 from drgs.render.integrate.surface_light import light_of_hit
 from drgs.render.intersect.mesh_surface import Surface, face_limit, far_along, surface_at
 from drgs.render.intersect.tracer import AbstractTracer

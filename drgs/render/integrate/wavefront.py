@@ -16,10 +16,8 @@ from drgs.render.integrate.environment_table import lookup_radiance, uv_from_wor
 from drgs.render.integrate.integrator import AbstractIntegrator, Estimate
 from drgs.render.integrate.random_warp import sobol_2d
 from drgs.render.integrate.ray_scene import RayScene
+from drgs.render.integrate.sample_arrays import PointArrays, SampleSet, StartArrays
 from drgs.render.integrate.sample_rays import (
-    PointArrays,
-    SampleSet,
-    StartArrays,
     balance_weight,
     point_at,
     pool_round_at,

@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from drgs.render.integrate.integrator import light_sums
-from drgs.render.integrate.sample_rays import PointArrays, point_arrays
+from drgs.render.integrate.sample_arrays import PointArrays, point_arrays
 from drgs.render.integrate.sum_samples import LightSums
 from drgs.render.progressive.demodulate_albedo import diffuse_reflectance, mean_square, specular_reflectance
 from drgs.render.progressive.neighbours import Neighbourhood, column_of, neighbour_alike, neighbourhood, point_beside, row_of

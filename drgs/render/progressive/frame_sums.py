@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drgs.render.color_warp import luminance_of
-from drgs.render.integrate.sample_rays import PointArrays, point_arrays
+from drgs.render.integrate.sample_arrays import PointArrays, point_arrays
 from drgs.render.records import PrimaryPoints, ShadedPoints
 from drgs.warp_torch import launch, warp_array, warp_device
 

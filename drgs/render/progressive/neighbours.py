@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 from torch import Tensor
 
-from drgs.render.integrate.sample_rays import PointArrays
+from drgs.render.integrate.sample_arrays import PointArrays
 from drgs.render.visible.image_tiles import Window
 from drgs.warp_torch import warp_array
 

@@ -16,7 +16,7 @@ import warp as wp
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from drgs.render.integrate.sample_rays import PointArrays, StartArrays, point_arrays, start_arrays
+from drgs.render.integrate.sample_arrays import PointArrays, StartArrays, point_arrays, start_arrays
 from drgs.render.intersect.mesh_surface import MeshArrays, mesh_arrays, surface_at
 from drgs.render.intersect.tracer import AbstractTracer, KernelQuery, MiddleView, middle_direction
 from drgs.render.records import GBuffer, PrimaryPoints, RayStarts, ShadingPoints

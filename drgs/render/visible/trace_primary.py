@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from drgs.render.integrate.random_warp import hash_combine, sobol_2d
-from drgs.render.integrate.sample_rays import PointArrays, StartArrays, point_arrays, start_arrays
+from drgs.render.integrate.sample_arrays import PointArrays, StartArrays, point_arrays, start_arrays
 from drgs.render.intersect.mesh_surface import MeshArrays, Surface, mesh_arrays, surface_at
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer

@@ -12,7 +12,7 @@ from drgs.reference.scatter_hits import scatter_hits as twin
 from drgs.render.integrate.environment_table import build_environment_table, environment_light
 from drgs.render.integrate.path_arrays import PathArrays
 from drgs.render.integrate.ray_scene import ray_scene
-from drgs.render.integrate.sample_rays import point_arrays, sample_set
+from drgs.render.integrate.sample_arrays import point_arrays, sample_set
 from drgs.render.integrate.trace_indirect import ScatteredRays, scatter_hits
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.records import SampleCounts, ShadingPoints

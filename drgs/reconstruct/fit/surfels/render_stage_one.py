@@ -10,11 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.maths.brdf import f0_from_base
-from drgs.maths.frames import rotation_from_quat_wxyz
-from drgs.maths.spherical_harmonics import evaluate_sh
 from drgs.reconstruct.fit.light.split_sum import shade_split_sum
-from drgs.render.visible.rasterize import RasterSettings, face_camera, facing_normals, rasterize
+from drgs.reconstruct.fit.surfels.surfel_features import surfel_features
+from drgs.render.visible.rasterize import RasterSettings, face_camera, rasterize
 from drgs.scene.camera import Camera, pixel_rays_world
 
 
@@ -46,17 +44,8 @@ def render_stage_one(
     Args:
         open_share: of the open sky's irradiance that arrives at each surfel; None: all of it.
     """
-    rotation = rotation_from_quat_wxyz(parameters["quats"])
-    tangents = rotation[:, :, :2] * parameters["log_scales"].exp()[:, None, :]
     centers = parameters["centers"]
-    with torch.no_grad():
-        to_surfel = torch.nn.functional.normalize(centers - camera.center_world, dim=-1)
-    metallic = torch.sigmoid(parameters["metallic_logits"])
-    sh = parameters["sh_dc"] if sh_degree == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"]], 1)
-    albedo = torch.sigmoid(parameters["albedo_logits"])
-    lit = albedo if open_share is None else albedo * open_share
-    surface = [lit * (1 - metallic)[:, None], f0_from_base(albedo, metallic), torch.sigmoid(parameters["roughness_logits"])[:, None]]
-    features = torch.cat([facing_normals(rotation[:, :, 2], centers, camera), *surface, evaluate_sh(sh, to_surfel, sh_degree)], 1)
+    tangents, features = surfel_features(parameters, camera.center_world, sh_degree, open_share)
     maps = rasterize(centers, tangents, torch.sigmoid(parameters["opacity_logits"]), features, camera, RasterSettings(near=near))
     # Maps are divided by coverage; a pixel hardly covered keeps a bounded gradient.
     inverse = 1 / maps.coverage.clamp(min=0.02)

@@ -13,7 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from drgs.render.integrate.integrator import light_sums
-from drgs.render.integrate.sample_rays import PointArrays, point_arrays
+from drgs.render.integrate.sample_arrays import PointArrays, point_arrays
 from drgs.render.integrate.sum_samples import LightSums
 from drgs.render.progressive.demodulate_albedo import mean_square, specular_reflectance
 from drgs.render.progressive.kept_light.read_light import READ

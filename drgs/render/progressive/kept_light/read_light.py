@@ -23,7 +23,7 @@ from torch import Tensor
 from drgs.maths.constants import F0
 from drgs.render.color_warp import luminance_of
 from drgs.render.integrate import plan
-from drgs.render.integrate.sample_rays import PointArrays, point_arrays
+from drgs.render.integrate.sample_arrays import PointArrays, point_arrays
 from drgs.render.intersect.mesh_surface import MeshArrays, mesh_arrays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.progressive.kept_light.kept_light import A_ROUND, KeptArrays, KeptLight, kept_arrays

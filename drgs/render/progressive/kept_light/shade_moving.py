@@ -14,7 +14,7 @@ from torch import Tensor
 
 from drgs.maths.constants import F0
 from drgs.render.integrate.integrator import AbstractIntegrator, IntegratorSettings, light_sums
-from drgs.render.integrate.sample_rays import PointArrays, point_arrays
+from drgs.render.integrate.sample_arrays import PointArrays, point_arrays
 from drgs.render.integrate.sum_samples import LightSums
 from drgs.render.progressive.demodulate_albedo import mean_square
 from drgs.render.progressive.kept_light.gather_light import gather_light, vertices_to_light
