@@ -7,13 +7,14 @@ passes a gradient on: what was reflected twice is taken as known. One ray a poin
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drgs.reconstruct.fit.light.mesh_light_kernels import arriving_kernel, hit_kernel, mirrored_kernel, rotation_of
+from drgs.reconstruct.fit.light.mesh_light_kernels import MOST_MIRRORS, arriving_kernel, hit_kernel, mirrored_kernel, rotation_of
 from drgs.reconstruct.fit.light.split_sum import factor_table
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.integrate.environment_table import build_environment_table
@@ -31,8 +32,6 @@ BRIGHTEST_SHARE = 3.0
 """More than this times the open sky's irradiance is noise."""
 SHARED_AT_ONCE = 4096
 """Vertices whose rays are traced together."""
-MIRRORS = 2
-"""Times that what a mirrored ray meets mirrors the object again. Few rays meet anything, so it costs little."""
 CLEAR_OF_FACE = 1e-3
 """Least cosine of a mirrored ray to its face; rays below it count as free."""
 
@@ -67,57 +66,49 @@ def corner_weights(barycentric: Tensor) -> Tensor:
 
 
 def hit_radiance(
-    mesh: TriangleMesh,
-    face: Int[Tensor, "place"],
-    weights: Float[Tensor, "place 3"],
-    towards: Float[Tensor, "place 3"],
-    light: MeshLight,
-    mirrored: tuple[Tensor, Tensor] | None = None,
+    mesh: TriangleMesh, face: Int[Tensor, "place"], weights: Float[Tensor, "place 3"], towards: Float[Tensor, "place 3"], light: MeshLight
 ) -> Float[Tensor, "place 3"]:
-    """Radiance that places on the mesh send in the directions `towards`, by split sum.
+    """Radiance that places on the mesh send in the directions `towards`, by split sum; they mirror the sky alone.
 
     Args:
-        face, weights: where, int64 and by corner_weights. mirrored: of mirrored_light; None: all that is mirrored there is the sky.
+        face, weights: where, int64 and by corner_weights.
     """
     weights, towards = weights.contiguous(), towards.contiguous()
     radiance = torch.empty_like(towards)
-    # Never read where nothing is mirrored again.
-    transmittance, met = (mesh.roughness, light.open_share) if mirrored is None else mirrored
-    vectors = (warp_argument(x, wp.vec3) for x in (mesh.normals, mesh.albedo))
     inputs = [
-        warp_argument(face), warp_argument(weights, wp.vec3), warp_argument(towards, wp.vec3), warp_argument(mesh.faces), *vectors,
-        warp_argument(mesh.roughness), warp_argument(mesh.metallic), warp_argument(light.open_share, wp.vec3), warp_argument(transmittance),
-        warp_argument(met, wp.vec3), int(mirrored is not None), rotation_of(light.light_from_world), warp_argument(light.tables, wp.vec3),
-        warp_argument(factor_table(towards.device), wp.vec2),
-    ]  # fmt: skip
+        warp_argument(face),
+        warp_argument(weights, wp.vec3),
+        warp_argument(towards, wp.vec3),
+        warp_argument(mesh.faces),
+        *_sent_arguments(mesh, light),
+    ]
     launch(hit_kernel, len(face), inputs, [warp_argument(radiance, wp.vec3)], warp_device(radiance))
     return radiance
 
 
-def radiance_along(
-    tracer: AbstractTracer,
-    origins: Tensor,
-    directions: Tensor,
-    light: MeshLight,
-    mirrors: int = 0,
-    generator: torch.Generator | None = None,
-) -> tuple[Tensor, Tensor]:
-    """(ray,) 1 where nothing is met, and (ray, 3) radiance of what is, 0 elsewhere.
+def _sent_arguments(mesh: TriangleMesh, light: MeshLight) -> list[Any]:
+    """By which kernels know what a place sends, from `normals` to `factors`."""
+    vectors = (warp_argument(x, wp.vec3) for x in (mesh.normals, mesh.albedo))
+    numbers = (warp_argument(x) for x in (mesh.roughness, mesh.metallic))
+    turn, factors = rotation_of(light.light_from_world), factor_table(mesh.vertices.device)
+    return [
+        *vectors,
+        *numbers,
+        warp_argument(light.open_share, wp.vec3),
+        turn,
+        warp_argument(light.tables, wp.vec3),
+        warp_argument(factors, wp.vec2),
+    ]
 
-    Args:
-        mirrors: how often what is met mirrors the object again; after that it mirrors the sky. generator: of their directions.
-    """
+
+def radiance_along(tracer: AbstractTracer, origins: Tensor, directions: Tensor, light: MeshLight) -> tuple[Tensor, Tensor]:
+    """(ray,) 1 where nothing is met, and (ray, 3) radiance of what is, 0 elsewhere."""
     hits = trace_rays(origins, directions, tracer)
     radiance = torch.zeros_like(directions)
     met = hits.hit.nonzero().squeeze(1)
     if len(met):
-        towards = -directions.index_select(0, met)
         face, weights = hits.face.index_select(0, met).long(), corner_weights(hits.barycentric.index_select(0, met))
-        again = None
-        if mirrors:
-            assert generator is not None
-            again = mirrored_light(tracer, face, weights, towards, light, generator, mirrors - 1)
-        radiance.index_copy_(0, met, hit_radiance(tracer.mesh, face, weights, towards, light, again))
+        radiance.index_copy_(0, met, hit_radiance(tracer.mesh, face, weights, -directions.index_select(0, met), light))
     return (~hits.hit).float(), radiance
 
 
@@ -133,15 +124,13 @@ def light_of_rays(
 
     All at once: as separate operations on some of the rays, this took stage 2 a quarter longer.
     """
-    mesh, device = tracer.mesh, origins.device
+    mesh = tracer.mesh
     origins, up, directions, weight = (x.contiguous() for x in (origins, up, directions, weight))
     transmittance, met = torch.empty_like(weight), torch.empty_like(directions)
     inputs = [
         tracer.handle, weight.shape[1], warp_argument(origins, wp.vec3), warp_argument(up, wp.vec3),
         warp_argument(directions.view(-1, 3), wp.vec3), warp_argument(weight.view(-1)), warp_argument(mesh.faces),
-        warp_argument(mesh.normals, wp.vec3), warp_argument(mesh.albedo, wp.vec3), warp_argument(mesh.roughness), warp_argument(mesh.metallic),
-        warp_argument(light.open_share, wp.vec3), rotation_of(light.light_from_world), warp_argument(light.tables, wp.vec3),
-        warp_argument(factor_table(device), wp.vec2),
+        *_sent_arguments(mesh, light),
     ]  # fmt: skip
     outputs = [warp_argument(transmittance.view(-1)), warp_argument(met.view(-1, 3), wp.vec3)]
     launch(arriving_kernel(tracer.kernel_query), weight.numel(), inputs, outputs, warp_device(origins))
@@ -155,25 +144,26 @@ def mirrored_light(
     wo: Float[Tensor, "place 3"],
     light: MeshLight,
     generator: torch.Generator,
-    mirrors: int = MIRRORS,
+    mirrors: int = MOST_MIRRORS,
 ) -> tuple[Float[Tensor, "place"], Float[Tensor, "place 3"]]:
     """Of each place on the mesh: whether a ray mirrored at a half vector drawn from its lobe escapes, and what it meets.
 
     Args:
-        face, weights: where, int64 and by corner_weights. mirrors: of radiance_along.
+        face, weights: where, int64 and by corner_weights. generator: one number is drawn from it.
+        mirrors: how often what is met mirrors the object again (MOST_MIRRORS at most); after that it mirrors the sky. Few rays meet anything, so it
+            costs little.
     """
-    weights, wo = weights.contiguous(), wo.contiguous()
-    mesh, drawn = tracer.mesh, torch.rand(2, len(face), generator=generator).to(wo.device)
-    origin, direction, above = torch.empty_like(wo), torch.empty_like(wo), torch.empty(len(face), dtype=torch.bool, device=wo.device)
+    mesh, weights, wo = tracer.mesh, weights.contiguous(), wo.contiguous()
+    seed = int(torch.randint(1 << 31, (1,), generator=generator))
+    transmittance, met = wo.new_empty(len(face)), torch.empty_like(wo)
     inputs = [
-        warp_argument(face), warp_argument(weights, wp.vec3), warp_argument(wo, wp.vec3), warp_argument(drawn), warp_argument(mesh.faces),
-        warp_argument(mesh.vertices, wp.vec3), warp_argument(mesh.normals, wp.vec3), warp_argument(mesh.roughness),
-        warp_argument(tracer.face_normals, wp.vec3), tracer.lift, CLEAR_OF_FACE,
+        tracer.handle, seed, mirrors, warp_argument(face), warp_argument(weights, wp.vec3), warp_argument(wo, wp.vec3), warp_argument(mesh.faces),
+        warp_argument(mesh.vertices, wp.vec3), warp_argument(tracer.face_normals, wp.vec3), tracer.lift, CLEAR_OF_FACE,
+        *_sent_arguments(mesh, light),
     ]  # fmt: skip
-    outputs = [warp_argument(origin, wp.vec3), warp_argument(direction, wp.vec3), warp_argument(above, wp.bool)]
-    launch(mirrored_kernel, len(face), inputs, outputs, warp_device(wo))
-    transmittance, met = radiance_along(tracer, origin, direction, light, mirrors, generator)
-    return torch.where(above, transmittance, 1.0), torch.where(above[:, None], met, 0.0)
+    outputs = [warp_argument(transmittance), warp_argument(met, wp.vec3)]
+    launch(mirrored_kernel(tracer.kernel_query), len(face), inputs, outputs, warp_device(wo))
+    return transmittance, met
 
 
 def irradiance_share(tracer: AbstractTracer, environment: Environment, light: MeshLight, rays: int, generator: torch.Generator) -> Tensor:

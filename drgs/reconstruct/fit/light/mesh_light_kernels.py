@@ -8,11 +8,14 @@ from torch import Tensor
 
 from drgs.maths.constants import F0
 from drgs.reconstruct.fit.light.split_sum_kernels import radiance_of_point
+from drgs.render.integrate.random_warp import hash32, hash_combine, unit_float
 from drgs.render.intersect.tracer import KernelQuery
 
 wp.set_module_options({"enable_backward": False})
 
 _F0 = wp.constant(float(F0))
+MOST_MIRRORS = 2
+"""How often mirrored_kernel lets mirror what rays meet: it has place for one hit more."""
 
 
 @wp.func
@@ -45,58 +48,8 @@ def rotation_of(light_from_world: Tensor | None) -> Any:
 
 
 @wp.func
-def _corner(face: wp.int64, faces: wp.array2d[int]) -> wp.vec3i:
-    k = int(face)
-    return wp.vec3i(faces[k, 0], faces[k, 1], faces[k, 2])
-
-
-@wp.kernel
-def mirrored_kernel(
-    first: int,
-    face: wp.array[wp.int64],
-    weights: wp.array[wp.vec3],
-    wo: wp.array[wp.vec3],
-    drawn: wp.array2d[float],
-    faces: wp.array2d[int],
-    vertices: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    roughness: wp.array[float],
-    face_normals: wp.array[wp.vec3],
-    lift: float,
-    clear: float,
-    # outputs
-    origin: wp.array[wp.vec3],
-    direction: wp.array[wp.vec3],
-    above: wp.array[wp.bool],
-):
-    """wo mirrored at a half vector that two uniform numbers draw from the GGX lobe (Walter et al. 2007; docs/sources.md: walter2007), and whether
-    that leaves the face; the normal where it does not.
-
-    Many arguments because a struct of them would be filled anew, array by array, for each launch.
-    """
-    i = first + wp.tid()
-    corner = _corner(face[i], faces)
-    weight = weights[i]
-    n = normal_at(vector_at(normals, corner, weight))
-    r = number_at(roughness, corner, weight)
-    alpha = r * r
-    u = drawn[0, i]
-    cosine2 = (1.0 - u) / (1.0 + (alpha * alpha - 1.0) * u)
-    sine = wp.sqrt(wp.max(1.0 - cosine2, 0.0))
-    azimuth = 2.0 * wp.pi * drawn[1, i]
-    # tangents_from_normal
-    sign = wp.where(n[2] >= 0.0, 1.0, -1.0)
-    a = -1.0 / (sign + n[2])
-    b = n[0] * n[1] * a
-    t_u = wp.vec3(1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0])
-    t_v = wp.vec3(b, sign + n[1] * n[1] * a, -n[1])
-    half = t_u * (sine * wp.cos(azimuth)) + t_v * (sine * wp.sin(azimuth)) + n * wp.sqrt(cosine2)
-    mirrored = 2.0 * wp.dot(half, wo[i]) * half - wo[i]
-    up = face_normals[int(face[i])]
-    leaves = wp.dot(mirrored, up) > clear
-    origin[i] = vector_at(vertices, corner, weight) + lift * up
-    direction[i] = wp.where(leaves, mirrored, up)
-    above[i] = leaves
+def _corner(face: int, faces: wp.array2d[int]) -> wp.vec3i:
+    return wp.vec3i(faces[face, 0], faces[face, 1], faces[face, 2])
 
 
 @wp.func
@@ -141,29 +94,119 @@ def hit_kernel(
     roughness: wp.array[float],
     metallic: wp.array[float],
     open_share: wp.array[wp.vec3],
-    transmittance: wp.array[float],
-    met: wp.array[wp.vec3],
-    mirrors: int,
     light_from_world: wp.mat33,
     tables: wp.array[wp.vec3],
     factors: wp.array[wp.vec2],
     # outputs
     radiance: wp.array[wp.vec3],
 ):
-    """What places send `towards` where a ray came from, at least 0; without `mirrors` they mirror the sky alone.
+    """What places send `towards` where a ray came from; they mirror the sky alone.
 
     Many arguments because a struct of them would be filled anew, array by array, for each launch.
     """
     i = first + wp.tid()
-    open_sky = float(1.0)
-    seen = wp.vec3(0.0, 0.0, 0.0)
-    if mirrors != 0:
-        open_sky = transmittance[i]
-        seen = met[i]
     radiance[i] = _sent(
-        _corner(face[i], faces), weights[i], towards[i], normals, albedo, roughness, metallic, open_share, open_sky, seen, light_from_world,
-        tables, factors,
+        _corner(int(face[i]), faces), weights[i], towards[i], normals, albedo, roughness, metallic, open_share, 1.0, wp.vec3(0.0, 0.0, 0.0),
+        light_from_world, tables, factors,
     )  # fmt: skip
+
+
+@wp.func
+def _drawn_half_vector(n: wp.vec3, roughness: float, seed: wp.uint32) -> wp.vec3:
+    """From the GGX lobe, by two uniform numbers (Walter et al. 2007; docs/sources.md: walter2007)."""
+    alpha = roughness * roughness
+    u = unit_float(seed)
+    cosine2 = (1.0 - u) / (1.0 + (alpha * alpha - 1.0) * u)
+    sine = wp.sqrt(wp.max(1.0 - cosine2, 0.0))
+    angle = 2.0 * wp.pi * unit_float(hash32(seed))
+    # tangents_from_normal
+    sign = wp.where(n[2] >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + n[2])
+    b = n[0] * n[1] * a
+    t_u = wp.vec3(1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0])
+    t_v = wp.vec3(b, sign + n[1] * n[1] * a, -n[1])
+    return t_u * (sine * wp.cos(angle)) + t_v * (sine * wp.sin(angle)) + n * wp.sqrt(cosine2)
+
+
+@cache
+def mirrored_kernel(query: KernelQuery) -> Any:
+    """The kernel that follows mirrored rays, for a kind of tracer."""
+    closest_fn, handle_type = query.closest_fn, query.handle_type
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def mirrored_light(
+        first: int,
+        tracer: handle_type,  # type: ignore[valid-type]  # known when the kernel is made
+        seed: wp.uint32,
+        mirrors: int,
+        face: wp.array[wp.int64],
+        weights: wp.array[wp.vec3],
+        wo: wp.array[wp.vec3],
+        faces: wp.array2d[int],
+        vertices: wp.array[wp.vec3],
+        face_normals: wp.array[wp.vec3],
+        lift: float,
+        clear: float,
+        normals: wp.array[wp.vec3],
+        albedo: wp.array[wp.vec3],
+        roughness: wp.array[float],
+        metallic: wp.array[float],
+        open_share: wp.array[wp.vec3],
+        light_from_world: wp.mat33,
+        tables: wp.array[wp.vec3],
+        factors: wp.array[wp.vec2],
+        # outputs
+        transmittance: wp.array[float],
+        met: wp.array[wp.vec3],
+    ):
+        """One thread a place. Rays that do not clear their face count as free.
+
+        Many arguments because a struct of them would be filled anew, array by array, for each launch.
+        """
+        i = first + wp.tid()
+        here = int(face[i])
+        weight = weights[i]
+        towards = wo[i]
+        stream = hash_combine(seed, wp.uint32(i))
+        # What rays have met, one after the other: faces, weights and the directions that they came from, row by row.
+        met_face = wp.vec3i(0, 0, 0)
+        met_weight = wp.mat33()
+        met_towards = wp.mat33()
+        count = int(0)
+        goes_on = bool(True)
+        while goes_on:
+            goes_on = False
+            corner = _corner(here, faces)
+            n = normal_at(vector_at(normals, corner, weight))
+            half = _drawn_half_vector(n, number_at(roughness, corner, weight), hash_combine(stream, wp.uint32(count)))
+            along = 2.0 * wp.dot(half, towards) * half - towards
+            up = face_normals[here]
+            if wp.dot(along, up) > clear:
+                hit = closest_fn(tracer, vector_at(vertices, corner, weight) + lift * up, along, wp.inf)
+                if hit.face >= 0:
+                    here = hit.face
+                    weight = wp.vec3(1.0 - (hit.barycentric[0] + hit.barycentric[1]), hit.barycentric[0], hit.barycentric[1])
+                    towards = -along
+                    met_face[count] = here
+                    for c in range(3):
+                        met_weight[count, c] = weight[c]
+                        met_towards[count, c] = towards[c]
+                    count += 1
+                    goes_on = count <= mirrors
+        free = float(1.0)
+        seen = wp.vec3(0.0, 0.0, 0.0)
+        while count > 0:
+            count -= 1
+            seen = _sent(
+                _corner(met_face[count], faces), wp.vec3(met_weight[count, 0], met_weight[count, 1], met_weight[count, 2]),
+                wp.vec3(met_towards[count, 0], met_towards[count, 1], met_towards[count, 2]), normals, albedo, roughness, metallic, open_share,
+                free, seen, light_from_world, tables, factors,
+            )  # fmt: skip
+            free = 0.0
+        transmittance[i] = free
+        met[i] = seen
+
+    return mirrored_light
 
 
 @cache
@@ -207,10 +250,9 @@ def arriving_kernel(query: KernelQuery) -> Any:
             if hit.face < 0:
                 free = 1.0
             else:
-                corner = wp.vec3i(faces[hit.face, 0], faces[hit.face, 1], faces[hit.face, 2])
                 weights = wp.vec3(1.0 - (hit.barycentric[0] + hit.barycentric[1]), hit.barycentric[0], hit.barycentric[1])
                 met = _sent(
-                    corner, weights, -along, normals, albedo, roughness, metallic, open_share, 1.0, wp.vec3(0.0, 0.0, 0.0), light_from_world,
+                    _corner(hit.face, faces), weights, -along, normals, albedo, roughness, metallic, open_share, 1.0, wp.vec3(0.0, 0.0, 0.0), light_from_world,
                     tables, factors,
                 )  # fmt: skip
         transmittance[i] = free

@@ -29,7 +29,7 @@ from drgs.reconstruct.fit.losses import crossed_halves
 from drgs.reconstruct.fit.surface.displaced_surface import DisplacedSurface, weights_where_seen
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.prior_terms import prior_terms
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places, steep_enough
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
@@ -279,9 +279,7 @@ def _cost_of_pixels(
     """
     surface, *positions = leaves
     normals = surface.detach()[:, :3].contiguous()
-    twice = seen_twice(target, pixels, tracer, generator)
-    steep = steep_enough(twice[0], normals) & steep_enough(twice[1], normals)
-    compared = [seen[steep] for seen in twice]
+    compared = list(seen_twice(target, pixels, tracer, generator, normals))
     if positions:
         compared = [replace(seen, weights=weights_where_seen(seen, tracer.mesh.vertices, positions[0])) for seen in compared]
     halves = [shade_places(seen, target, tracer, surface, light, generator) for seen in compared]

@@ -5,18 +5,24 @@ display space, differentiable in all but the places.
 """
 
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import torch
+import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, mirrored_light
+from drgs.reconstruct.fit.light.mesh_light_kernels import normal_at, vector_at
 from drgs.reconstruct.fit.surface.surface_color import surface_color
 from drgs.reconstruct.fit.view_targets import ViewTarget
+from drgs.render.integrate.random_warp import hash32, hash_combine, unit_float
 from drgs.render.intersect.trace_rays import trace_rays
-from drgs.render.intersect.tracer import AbstractTracer
+from drgs.render.intersect.tracer import AbstractTracer, KernelQuery
 from drgs.render.records import Hits
 from drgs.scene.camera import world_from_pixel
+from drgs.warp_torch import launch, warp_argument, warp_device
 
 SOLID = 0.995
 """Least coverage of a pixel that is compared: others mix in the background."""
@@ -56,20 +62,93 @@ def seen_places(target: ViewTarget, pixels: Int[Tensor, "pixel"], tracer: Abstra
 
 @torch.no_grad()
 def seen_twice(
-    target: ViewTarget, pixels: Int[Tensor, "pixel"], tracer: AbstractTracer, generator: torch.Generator
+    target: ViewTarget,
+    pixels: Int[Tensor, "pixel"],
+    tracer: AbstractTracer,
+    generator: torch.Generator,
+    normals: Float[Tensor, "vertex 3"] | None = None,
 ) -> tuple[SeenPlaces, SeenPlaces]:
     """Of those of `pixels` (flat) that see the mesh two times, each time by a place of the pixel drawn anew.
 
     Why: a pixel shows its mean. With one place for both estimates, what differs within a pixel is noise that both share, and crossed_halves
     takes it for error: what is finer than a pixel would be flattened.
+
+    Args:
+        generator: one number is drawn from it. normals: only what is steep_enough by them, both times; None: all.
     """
-    rays = []
-    for _ in range(2):
-        direction = _directions(target, pixels, torch.rand(len(pixels), 2, generator=generator).to(target.mask))
-        rays.append((direction, trace_rays(target.camera.center_world.expand_as(direction), direction, tracer)))
-    both = rays[0][1].hit & rays[1][1].hit
-    first, second = (_places_of(both, pixels, direction, hits, tracer) for direction, hits in rays)
-    return first, second
+    count, camera, device = len(pixels), target.camera, pixels.device
+    seed = int(torch.randint(1 << 31, (1,), generator=generator))
+    pixels = pixels.contiguous()
+    wo, weights = torch.empty(2, count, 3, device=device), torch.empty(2, count, 3, device=device)
+    face = torch.empty(2, count, dtype=torch.int64, device=device)
+    seen = torch.empty(count, dtype=torch.bool, device=device)
+    normals = wo.new_empty(0, 3) if normals is None else normals.contiguous()
+    mesh = tracer.mesh
+    inputs = [
+        tracer.handle, seed, warp_argument(pixels), camera.width, wp.mat33(*world_from_pixel(camera).flatten().tolist()),
+        wp.vec3(*camera.center_world.tolist()), warp_argument(mesh.faces), warp_argument(normals, wp.vec3), GRAZING,
+    ]  # fmt: skip
+    outputs = [warp_argument(seen), warp_argument(wo, wp.vec3), warp_argument(weights, wp.vec3), warp_argument(face)]
+    launch(seen_twice_kernel(tracer.kernel_query), count, inputs, outputs, warp_device(pixels))
+    at = seen.nonzero().squeeze(1)
+    chosen = pixels.index_select(0, at)
+    halves = []
+    for k in range(2):
+        faces = face[k].index_select(0, at)
+        corners = mesh.faces.index_select(0, faces).long()
+        halves.append(SeenPlaces(chosen, wo[k].index_select(0, at), faces, corners, weights[k].index_select(0, at)))
+    return halves[0], halves[1]
+
+
+@cache
+def seen_twice_kernel(query: KernelQuery) -> Any:
+    """The kernel of seen_twice, for a kind of tracer."""
+    closest_fn, handle_type = query.closest_fn, query.handle_type
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def see_twice(
+        first: int,
+        tracer: handle_type,  # type: ignore[valid-type]  # known when the kernel is made
+        seed: wp.uint32,
+        pixels: wp.array[wp.int64],
+        width: int,
+        world_from_pixel: wp.mat33,
+        center: wp.vec3,
+        faces: wp.array2d[int],
+        normals: wp.array[wp.vec3],
+        least_cosine: float,
+        # outputs
+        seen: wp.array[wp.bool],
+        wo: wp.array2d[wp.vec3],
+        weights: wp.array2d[wp.vec3],
+        face: wp.array2d[wp.int64],
+    ):
+        """One thread a pixel.
+
+        Many arguments because a struct of them would be filled anew, array by array, for each launch.
+        """
+        i = first + wp.tid()
+        pixel = int(pixels[i])
+        is_seen = bool(True)
+        for k in range(2):
+            if is_seen:
+                drawn = hash_combine(hash_combine(seed, wp.uint32(i)), wp.uint32(k))
+                x = float(pixel % width) + unit_float(drawn)
+                y = float(pixel // width) + unit_float(hash32(drawn))
+                along = wp.normalize(world_from_pixel * wp.vec3(x, y, 1.0))
+                hit = closest_fn(tracer, center, along, wp.inf)
+                is_seen = hit.face >= 0
+                if is_seen:
+                    weight = wp.vec3(1.0 - (hit.barycentric[0] + hit.barycentric[1]), hit.barycentric[0], hit.barycentric[1])
+                    if normals.shape[0] > 0:
+                        corner = wp.vec3i(faces[hit.face, 0], faces[hit.face, 1], faces[hit.face, 2])
+                        is_seen = -wp.dot(normal_at(vector_at(normals, corner, weight)), along) > least_cosine
+                    wo[k, i] = -along
+                    weights[k, i] = weight
+                    face[k, i] = wp.int64(hit.face)
+        seen[i] = is_seen
+
+    return see_twice
 
 
 def _directions(target: ViewTarget, pixels: Int[Tensor, "pixel"], inside: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 3"]:
