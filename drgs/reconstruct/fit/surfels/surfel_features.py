@@ -23,11 +23,11 @@ _F0 = wp.constant(float(F0))
 _BEHIND = wp.constant(float(SEEN_FROM_BEHIND))
 _K = wp.constant(wp.types.vector(length=9, dtype=float)(K00, K1, K20, K21, K22, K30, K31, K32, K33))
 
-vec16 = wp.types.vector(length=16, dtype=float)
+_Coefficients = wp.types.vector(length=16, dtype=float)
 
 
 @wp.func
-def _harmonics(d: wp.vec3) -> vec16:
+def _harmonics(d: wp.vec3):
     """sh_basis."""
     x = d[0]
     y = d[1]
@@ -35,7 +35,7 @@ def _harmonics(d: wp.vec3) -> vec16:
     xx = x * x
     yy = y * y
     zz = z * z
-    b = vec16()
+    b = _Coefficients()
     b[0] = _K[0]
     b[1] = -_K[1] * y
     b[2] = _K[1] * z
