@@ -22,6 +22,7 @@ from drgs.reconstruct.capture.exposures import with_gains_of_fit, with_gains_of_
 from drgs.reconstruct.capture.find_masks import masked_by_surfels
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
+from drgs.reconstruct.capture.look_nearer import look_nearer, object_windows
 from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
 from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
@@ -209,7 +210,8 @@ def build_stages(
         if not views.has_masks:
             views = masked_by_surfels(views, gaussians_from_state(fit), points.bounds_radius, settings.box)
             views = sharpen_masks(views) if settings.masks == "auto" else views
-            photographs = views_of(photographs, views)
+            views = _nearer(found, views, preset, settings)
+            photographs = replace(views_of(photographs, views), cameras=views.cameras, images_srgb=views.images_srgb)
         views = with_gains_of_fit(views, drawn_object(fit, points.bounds_radius, preset.fit.sh_degree))
     yield "fit", None
 
@@ -256,7 +258,13 @@ def _opened(
     """open_capture, as the settings say."""
     masked_by = _by_strokes(settings.strokes, reporter, should_stop) if settings.strokes else None
     given = (settings.seed, settings.up, settings.box, masked_by, preset.hull)
-    return open_capture(capture, preset.image_side, preset.points, *given, sharpen=settings.masks == "auto")
+    return open_capture(capture, preset.image_side, preset.points, *given, sharpen=settings.masks == "auto", nearer=True)
+
+
+def _nearer(capture: Capture, views: Views, preset: Preset, settings: BuildSettings) -> Views:
+    """look_nearer by masks that were found."""
+    windows = object_windows(capture, views, preset.image_side)
+    return views if windows is None else look_nearer(capture, views, windows, False, settings.masks == "auto")
 
 
 def _by_strokes(strokes: tuple[Stroke, ...], reporter: BuildReporter, should_stop: Callable[[], bool]) -> Callable[[Views], Views]:

@@ -18,6 +18,7 @@ from drgs.reconstruct.capture.load_views import read_capture
 from drgs.reconstruct.capture.load_views.capture import Capture, without_masks
 from drgs.reconstruct.capture.load_views.checks import CaptureFault
 from drgs.reconstruct.capture.load_views.read_pictures import read_pictures
+from drgs.reconstruct.capture.look_nearer import look_nearer, object_windows
 from drgs.reconstruct.capture.mask_agreement import mask_agreement
 from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
 from drgs.reconstruct.capture.turn_up import UP, Direction, turn_up
@@ -49,6 +50,7 @@ def open_capture(
     masked: Callable[[Views], Views] | None = None,
     hull_settings: VisualHullSettings = HULL,
     sharpen: bool = True,
+    nearer: bool = False,
 ) -> tuple[Capture, Views, InitialPoints]:
     """The capture, its pictures of at most `max_side` pixels a side, and points to begin with.
 
@@ -57,6 +59,7 @@ def open_capture(
         box: of that turned world. Masks of the capture's own are cut to what it holds (cut_to_box); without masks it bounds the points alone.
         masked: gives the views other masks than the capture's own, which are not read then, as strokes do.
         sharpen: masks are moved to where the photographs show the object to end.
+        nearer: where masks tell the object, max_side is that of what is around it (look_nearer).
 
     Raises:
         ValueError: one sentence why there is nothing to build from; a CaptureFault where what to do about it is known, too.
@@ -72,6 +75,10 @@ def open_capture(
         views = sharpen_masks(views) if sharpen else views
     if box is not None and views.has_masks:
         views = _cut(views, box, folder)
+    windows = object_windows(capture, views, max_side) if nearer and max_side is not None and views.has_masks else None
+    if windows is not None:
+        views = look_nearer(capture, views, windows, masked is None, sharpen)
+        views = views if box is None else _cut(views, box, folder)
     points = initial_points(views, point_count, seed, box=box, hull_settings=hull_settings)
     _check_points(views, points, folder)
     return capture, views, points

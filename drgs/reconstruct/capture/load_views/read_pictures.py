@@ -3,9 +3,10 @@
 Shrinking averages areas of linear, premultiplied light: colour of the background must not bleed into the object's edge.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from drgs.exchange.pictures import as_eight_bits, exif_number, read_exif
 from drgs.reconstruct.capture.exposure_gains import gains_of_files
-from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, camera_of, resize_pinhole
+from drgs.reconstruct.capture.load_views.capture import Capture, Photograph, Pinhole, camera_of, resize_pinhole
 from drgs.reconstruct.capture.load_views.checks import damaged
 from drgs.reconstruct.capture.load_views.linear_light import premultiplied, straight
 from drgs.reconstruct.capture.load_views.undistort import undistort
@@ -32,21 +33,38 @@ NERO_DEPTH_OF_ONE = 15.0
 NERO_BACKGROUND_DEPTH = 14.5
 
 
-def read_pictures(capture: Capture, max_side: int | None, sharpen: bool = False) -> Views:
+@dataclass(frozen=True)
+class Window:
+    """A part of an undistorted photograph, and how large it becomes."""
+
+    rows: slice
+    columns: slice
+    """[pixels of the photograph]"""
+    width: int
+    height: int
+    """[pixels]"""
+
+    def of_pinhole(self, pinhole: Pinhole) -> Pinhole:
+        """What the photograph's camera is to who looks through the window."""
+        height, width = self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+        cut = Pinhole(pinhole.fx, pinhole.fy, pinhole.cx - self.columns.start, pinhole.cy - self.rows.start, width, height)
+        return resize_pinhole(cut, self.width, self.height)
+
+
+def read_pictures(capture: Capture, max_side: int | None, sharpen: bool = False, windows: Sequence[Window] | None = None) -> Views:
     """Views of a checked capture, the longer side of each at most `max_side` pixels.
 
     Args:
         sharpen: masks are moved as sharpen_masks does it, before the photographs are undistorted or shrunk.
+        windows: of each photograph, what becomes its view, whatever max_side; None: all of it.
     """
 
     if sharpen:  # imported here: reading cameras alone asks for nothing that looks at pictures
         from drgs.reconstruct.capture.sharpen_masks import LEAST_OFF, MaskLook, outlines_off
 
-    def read(photograph: Photograph, look: Any) -> tuple[Camera, Tensor, Tensor, bool, float | None, Any]:
+    def read(photograph: Photograph, window: Window, look: Any) -> tuple[Camera, Tensor, Tensor, bool, float | None, Any]:
         """Camera, colour, coverage, whether there is a mask, the exposure where the file tells, and how far its outlines are off (MaskLook): those of `look` are moved."""
         pinhole = photograph.pinhole
-        scale = min(1.0, max_side / max(pinhole.width, pinhole.height)) if max_side else 1.0
-        width, height = max(1, round(pinhole.width * scale)), max(1, round(pinhole.height * scale))
         color, alpha, has_mask, exposure = _decode(photograph)
         if look is not None:
             color, alpha = look.moved(color, alpha)
@@ -54,17 +72,19 @@ def read_pictures(capture: Capture, max_side: int | None, sharpen: bool = False)
             look = MaskLook.at(color, alpha)
         if photograph.lens is not None:
             color, alpha = undistort(color, alpha, photograph.lens, pinhole)
-        if (height, width) != alpha.shape:
-            color, alpha = shrink(color, alpha, width, height)
-        camera = camera_of(photograph.camera_from_world, resize_pinhole(pinhole, width, height), photograph.name)
+        color, alpha = color[window.rows, window.columns], alpha[window.rows, window.columns]
+        if (window.height, window.width) != alpha.shape:
+            color, alpha = shrink(color, alpha, window.width, window.height)
+        camera = camera_of(photograph.camera_from_world, window.of_pinhole(pinhole), photograph.name)
         return camera, torch.from_numpy(color.copy()), torch.from_numpy(alpha.copy()), has_mask, exposure, look
 
+    windows = windows or [_whole(photograph.pinhole, max_side) for photograph in capture.photographs]
     with ThreadPoolExecutor(DECODE_THREADS) as pool:
-        found = list(pool.map(read, capture.photographs, repeat(None)))
+        found = list(pool.map(read, capture.photographs, windows, repeat(None)))
         off = outlines_off([look for *_, look in found]) if sharpen else 0.0
         moved = sharpen and off >= LEAST_OFF
         if moved:
-            found = list(pool.map(read, capture.photographs, [look for *_, look in found]))
+            found = list(pool.map(read, capture.photographs, windows, [look for *_, look in found]))
     cameras, images, coverage, has_masks, exposures, _ = zip(*found, strict=True)
     if any(has_masks) and not all(has_masks):
         lacking = [photograph.image for photograph, has_mask in zip(capture.photographs, has_masks, strict=True) if not has_mask]
@@ -82,6 +102,12 @@ def read_pictures(capture: Capture, max_side: int | None, sharpen: bool = False)
         gains=gains_of_files(exposures),
         masks_moved=off if moved else 0.0,
     )
+
+
+def _whole(pinhole: Pinhole, max_side: int | None) -> Window:
+    scale = min(1.0, max_side / max(pinhole.width, pinhole.height)) if max_side else 1.0
+    width, height = max(1, round(pinhole.width * scale)), max(1, round(pinhole.height * scale))
+    return Window(slice(0, pinhole.height), slice(0, pinhole.width), width, height)
 
 
 @contextmanager
