@@ -240,4 +240,6 @@ def draw_outlines(views: list[ScoredView], path: Path) -> None:
         errors[true & ~view.silhouette] = (0, 1, 1)
         errors[view.silhouette & ~true] = (1, 0, 1)
         columns.append(np.concatenate([view.frame, errors, view.render]))
-    Image.fromarray((255 * np.concatenate(columns, 1) + 0.5).astype(np.uint8)).save(path)
+    rows = max(len(column) for column in columns)  # windows around the object differ
+    filled = [np.pad(column, ((0, rows - len(column)), (0, 0), (0, 0)), constant_values=1.0) for column in columns]
+    Image.fromarray((255 * np.concatenate(filled, 1) + 0.5).astype(np.uint8)).save(path)
