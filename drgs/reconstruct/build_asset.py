@@ -35,6 +35,7 @@ from drgs.reconstruct.fit.evidence.solve_albedo import RINGS, parts_for, solve_a
 from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.ground_light import environment_with_ground, fitted_ground, ground_light
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
 from drgs.reconstruct.fit.surface.surface_passes import SurfaceFit
@@ -207,11 +208,14 @@ def build_stages(
 
     with timed("fit"):
         fit = fit_stage(place, views, points, replace(preset.fit, seed=settings.seed), device)
+        ground = views.ground
         if not views.has_masks:
             views = masked_by_surfels(views, gaussians_from_state(fit), points.bounds_radius, settings.box)
             views = sharpen_masks(views) if settings.masks == "auto" else views
             views = _nearer(found, views, preset, settings)
             photographs = replace(views_of(photographs, views), cameras=views.cameras, images_srgb=views.images_srgb)
+            # The surface and its materials see it as light.
+            views = views if ground is None else replace(views, ground=fitted_ground(fit.parameters["ground"], ground))
         views = with_gains_of_fit(views, drawn_object(fit, points.bounds_radius, preset.fit.sh_degree))
     yield "fit", None
 
@@ -380,7 +384,7 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         vertices = decoupled.state.parameters["vertices"]
         vertices.data = whole_or_within(built.settings.box, vertices.data)
         mesh, certainty = _detailed(built, decoupled)
-        under, environment = decoupled.undivided_mesh, Environment(environment_table(decoupled.state.parameters).detach())
+        under, environment = decoupled.undivided_mesh, _environment(built, decoupled)
         # Faces moved once more with the materials; surfels stay where they are on them: one on each face of before the division.
         surfels, binding = surfels_on_faces_of(under) if bound is None else gaussians_from_mesh_fit(replace(bound, mesh=under))
         for times in range(decoupled.divided):
@@ -392,6 +396,15 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
         surfels = radiating_surfels(surfels, binding, mesh, environment)
         asset = Asset(surfels, mesh, binding, environment, horizons=_horizons(mesh), primary="mesh", certainty=certainty)
     return asset, surface_preview(decoupled, views.cameras), views
+
+
+def _environment(built: _Built, fit: SurfaceFit) -> Environment:
+    """The light that was fitted, with the ground as the object's middle sees it."""
+    radiance, ground = environment_table(fit.state.parameters).detach(), built.views.ground
+    if ground is not None:
+        middle = built.points.bounds_center.to(radiance.device)
+        radiance = environment_with_ground(radiance, ground_light(ground, radiance.device), middle)
+    return Environment(radiance)
 
 
 def _seen_from(built: _Built, surface: SurfaceFit) -> _Built:
@@ -449,7 +462,8 @@ def _detailed(built: _Built, fit: SurfaceFit) -> tuple[TriangleMesh, Certainty]:
     views, mesh, parameters = built.views, fit.mesh, fit.state.parameters
     tracer, targets = build_tracer(mesh), view_targets(views, 1.0, mesh.vertices.device)
     sky = None if views.light_from_world is None else seen_sky(tracer)
-    light_of = light_of_views(filter_environment(environment_table(parameters)), parameters["open_share"], mesh.albedo, sky)
+    ground = None if views.ground is None else ground_light(views.ground, mesh.vertices.device)
+    light_of = light_of_views(filter_environment(environment_table(parameters)), parameters["open_share"], mesh.albedo, sky, ground=ground)
     certainty = vertex_certainty(tracer, targets, light_of, parameters["metal"])
     edges, rings = mesh_edges(mesh.faces), RINGS * 4**fit.divided
     settings = built.preset.detail

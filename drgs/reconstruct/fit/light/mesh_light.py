@@ -14,6 +14,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from drgs.reconstruct.fit.light.ground_light import GroundLight, no_ground
 from drgs.reconstruct.fit.light.mesh_light_kernels import MOST_MIRRORS, arriving_kernel, hit_kernel, mirrored_kernel, rotation_of
 from drgs.reconstruct.fit.light.split_sum import factor_table
 from drgs.reconstruct.fit.view_targets import ViewTarget
@@ -46,6 +47,8 @@ class MeshLight:
     """Of the open sky's irradiance that arrives: irradiance_share, or arriving_share where the light turns with the camera."""
     light_from_world: Float[Tensor, "3 3"] | None = None
     """Rotation of directions in the world to those of the tables; None: the same."""
+    ground: GroundLight | None = None
+    """What the object stands on, which rays that pass it by may meet; None: they see the sky."""
 
 
 LightOf = Callable[[ViewTarget], MeshLight]
@@ -109,7 +112,12 @@ def radiance_along(tracer: AbstractTracer, origins: Tensor, directions: Tensor, 
     if len(met):
         face, weights = hits.face.index_select(0, met).long(), corner_weights(hits.barycentric.index_select(0, met))
         radiance.index_copy_(0, met, hit_radiance(tracer.mesh, face, weights, -directions.index_select(0, met), light))
-    return (~hits.hit).float(), radiance
+    free = ~hits.hit
+    if light.ground is not None:
+        below, seen = light.ground.along(origins, directions)
+        radiance = torch.where((free & below)[:, None], seen, radiance)
+        free = free & ~below
+    return free.float(), radiance
 
 
 def light_of_rays(
@@ -124,13 +132,13 @@ def light_of_rays(
 
     All at once: as separate operations on some of the rays, this took stage 2 a quarter longer.
     """
-    mesh = tracer.mesh
+    mesh, ground = tracer.mesh, light.ground or no_ground(origins.device)
     origins, up, directions, weight = (x.contiguous() for x in (origins, up, directions, weight))
     transmittance, met = torch.empty_like(weight), torch.empty_like(directions)
     inputs = [
         tracer.handle, weight.shape[1], warp_argument(origins, wp.vec3), warp_argument(up, wp.vec3),
         warp_argument(directions.view(-1, 3), wp.vec3), warp_argument(weight.view(-1)), warp_argument(mesh.faces),
-        *_sent_arguments(mesh, light),
+        *_sent_arguments(mesh, light), *ground.arguments(),
     ]  # fmt: skip
     outputs = [warp_argument(transmittance.view(-1)), warp_argument(met.view(-1, 3), wp.vec3)]
     launch(arriving_kernel(tracer.kernel_query), weight.numel(), inputs, outputs, warp_device(origins))
@@ -154,12 +162,13 @@ def mirrored_light(
             costs little.
     """
     mesh, weights, wo = tracer.mesh, weights.contiguous(), wo.contiguous()
+    ground = light.ground or no_ground(wo.device)
     seed = int(torch.randint(1 << 31, (1,), generator=generator))
     transmittance, met = wo.new_empty(len(face)), torch.empty_like(wo)
     inputs = [
         tracer.handle, seed, mirrors, warp_argument(face), warp_argument(weights, wp.vec3), warp_argument(wo, wp.vec3), warp_argument(mesh.faces),
         warp_argument(mesh.vertices, wp.vec3), warp_argument(tracer.face_normals, wp.vec3), tracer.lift, CLEAR_OF_FACE,
-        *_sent_arguments(mesh, light),
+        *_sent_arguments(mesh, light), *ground.arguments(),
     ]  # fmt: skip
     outputs = [warp_argument(transmittance), warp_argument(met, wp.vec3)]
     launch(mirrored_kernel(tracer.kernel_query), len(face), inputs, outputs, warp_device(wo))

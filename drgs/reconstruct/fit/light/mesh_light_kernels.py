@@ -7,6 +7,7 @@ import warp as wp
 from torch import Tensor
 
 from drgs.maths.constants import F0
+from drgs.reconstruct.fit.light.ground_light import ground_along
 from drgs.reconstruct.fit.light.split_sum_kernels import radiance_of_point
 from drgs.render.integrate.random_warp import hash32, hash_combine, unit_float
 from drgs.render.intersect.tracer import KernelQuery
@@ -155,6 +156,9 @@ def mirrored_kernel(query: KernelQuery) -> Any:
         light_from_world: wp.mat33,
         tables: wp.array[wp.vec3],
         factors: wp.array[wp.vec2],
+        ground: wp.array2d[wp.vec4],
+        ground_frame: wp.mat33,
+        ground_middle: wp.vec3,
         # outputs
         transmittance: wp.array[float],
         met: wp.array[wp.vec3],
@@ -173,6 +177,8 @@ def mirrored_kernel(query: KernelQuery) -> Any:
         met_weight = wp.mat33()
         met_towards = wp.mat33()
         count = int(0)
+        free = float(1.0)
+        seen = wp.vec3(0.0, 0.0, 0.0)
         goes_on = bool(True)
         while goes_on:
             goes_on = False
@@ -182,8 +188,13 @@ def mirrored_kernel(query: KernelQuery) -> Any:
             along = 2.0 * wp.dot(half, towards) * half - towards
             up = face_normals[here]
             if wp.dot(along, up) > clear:
-                hit = closest_fn(tracer, vector_at(vertices, corner, weight) + lift * up, along, wp.inf)
-                if hit.face >= 0:
+                start = vector_at(vertices, corner, weight) + lift * up
+                hit = closest_fn(tracer, start, along, wp.inf)
+                if hit.face < 0:
+                    below = ground_along(ground, ground_frame, ground_middle, start, along)
+                    free = 1.0 - below[3]
+                    seen = wp.vec3(below[0], below[1], below[2])
+                else:
                     here = hit.face
                     weight = wp.vec3(1.0 - (hit.barycentric[0] + hit.barycentric[1]), hit.barycentric[0], hit.barycentric[1])
                     towards = -along
@@ -193,8 +204,6 @@ def mirrored_kernel(query: KernelQuery) -> Any:
                         met_towards[count, c] = towards[c]
                     count += 1
                     goes_on = count <= mirrors
-        free = float(1.0)
-        seen = wp.vec3(0.0, 0.0, 0.0)
         while count > 0:
             count -= 1
             seen = _sent(
@@ -232,6 +241,9 @@ def arriving_kernel(query: KernelQuery) -> Any:
         light_from_world: wp.mat33,
         tables: wp.array[wp.vec3],
         factors: wp.array[wp.vec2],
+        ground: wp.array2d[wp.vec4],
+        ground_frame: wp.mat33,
+        ground_middle: wp.vec3,
         # outputs
         transmittance: wp.array[float],
         radiance: wp.array[wp.vec3],
@@ -248,7 +260,9 @@ def arriving_kernel(query: KernelQuery) -> Any:
         if weight[i] > 0.0 and wp.dot(along, up[point]) > 0.0:
             hit = closest_fn(tracer, origin[point], along, wp.inf)
             if hit.face < 0:
-                free = 1.0
+                below = ground_along(ground, ground_frame, ground_middle, origin[point], along)
+                free = 1.0 - below[3]
+                met = wp.vec3(below[0], below[1], below[2])
             else:
                 weights = wp.vec3(1.0 - (hit.barycentric[0] + hit.barycentric[1]), hit.barycentric[0], hit.barycentric[1])
                 met = _sent(

@@ -18,6 +18,7 @@ import warp as wp
 from jaxtyping import Float, Int, Int16
 from torch import Tensor
 
+from drgs.reconstruct.fit.light.ground_light import GroundLight
 from drgs.reconstruct.fit.light.mesh_light import BRIGHTEST_SHARE, SHARE_LIFT, LightOf, MeshLight, corner_weights
 from drgs.reconstruct.fit.light.split_sum import level_table, texel_directions
 from drgs.reconstruct.fit.light.turned_light_kernels import SUM_ROWS, bounce_kernel, direct_kernel, share_adjoint, share_kernel
@@ -204,20 +205,21 @@ def light_of_views(
     albedo: Float[Tensor, "vertex 3"],
     sky: SeenSky | None,
     normals: Float[Tensor, "vertex 3"] | None = None,
+    ground: GroundLight | None = None,
 ) -> LightOf:
     """The light around the mesh in each photograph.
 
     Args:
         open_share: of irradiance_share, where the light stands still. albedo: of the mesh. sky: where it turns with the camera.
-        normals: of arriving_share, where it turns; None: the share has no slope.
+        normals: of arriving_share, where it turns; None: the share has no slope. ground: of MeshLight; where the light turns, what arrives by it is not known.
     """
     if sky is None:
-        still = MeshLight(tables, open_share)
+        still = MeshLight(tables, open_share, ground=ground)
         return lambda target: still
 
     def turned(target: ViewTarget) -> MeshLight:
         assert target.light_from_world is not None  # of views whose light turns
         share = arriving_share(sky, albedo, tables.detach() if normals is None else tables, target.light_from_world, normals)
-        return MeshLight(tables, share, target.light_from_world)
+        return MeshLight(tables, share, target.light_from_world, ground)
 
     return turned

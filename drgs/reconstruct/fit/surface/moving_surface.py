@@ -19,6 +19,7 @@ from drgs.reconstruct.fit.evidence.matched_texture import matched_texture
 from drgs.reconstruct.fit.evidence.metal_evidence import ViewSums, light_scale, metal_evidence, view_sums
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import ENVIRONMENT_PYRAMID, environment_table, upsampled
+from drgs.reconstruct.fit.light.ground_light import ground_light
 from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, irradiance_share
 from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.fit.light.turned_light import COARSE, Fineness, SeenSky, light_of_views, seen_sky
@@ -78,6 +79,7 @@ class MovingSurface:
         self._views = views
         self.light_turns = views.light_from_world is not None
         self._fineness = fineness
+        self.ground = None if views.ground is None else ground_light(views.ground, faces.device)
         self._seen_sky: SeenSky | None = None
         self._around: csr_matrix | None = None
         if same_place is None:
@@ -162,7 +164,7 @@ class MovingSurface:
         if self.light_turns:
             return
         radiance = environment_table(parameters)
-        light = MeshLight(filter_environment(radiance), parameters["open_share"])
+        light = MeshLight(filter_environment(radiance), parameters["open_share"], ground=self.ground)
         share = irradiance_share(self.tracer, Environment(radiance), light, share_rays, self._state.generator)
         parameters["open_share"].copy_(self._agreed_share(share))
 
@@ -238,7 +240,8 @@ class MovingSurface:
             tables: of filter_environment. normals: of light_of_views.
         """
         parameters = self._state.parameters
-        return light_of_views(tables, parameters["open_share"], torch.sigmoid(parameters["albedo_logits"].detach()), self.sky, normals)
+        albedo = torch.sigmoid(parameters["albedo_logits"].detach())
+        return light_of_views(tables, parameters["open_share"], albedo, self.sky, normals, self.ground)
 
     @torch.no_grad()
     def look_for_metal(self, targets: list[ViewTarget], settings: MoveSettings) -> ViewSums:

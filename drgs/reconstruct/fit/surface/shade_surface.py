@@ -4,7 +4,7 @@ In: the tracer of a mesh, normals and materials of its vertices, the filtered li
 display space, differentiable in all but the places.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -194,7 +194,7 @@ def shade_places(
     Args:
         tracer: its mesh has the materials that mirrors see. surface: of packed_surface. light: its tables may want a gradient.
     """
-    known = MeshLight(light.tables.detach(), light.open_share, light.light_from_world)
+    known = replace(light, tables=light.tables.detach())
     with torch.no_grad():
         transmittance, met = mirrored_light(tracer, seen.face, seen.weights.detach(), seen.wo, known, generator)
     photo = target.saturation.reshape(-1, 3)[seen.pixels]
@@ -202,7 +202,7 @@ def shade_places(
     if weights.requires_grad:
         # The kernel has no slope by weights: it gets what lies at each place, as that place's own vertex.
         surface, open_share = at_corners(surface, corners, weights), at_corners(light.open_share, corners, weights)
-        light = MeshLight(light.tables, open_share, light.light_from_world)
+        light = replace(light, open_share=open_share)
         corners = torch.arange(len(weights), device=weights.device)[:, None].expand(-1, 3).contiguous()
         weights = torch.eye(3, device=weights.device)[0].expand(len(corners), 3).contiguous()
     return surface_color(corners, weights, seen.wo, transmittance, met, photo, target.ceiling, surface, light)
