@@ -208,14 +208,9 @@ def build_stages(
 
     with timed("fit"):
         fit = fit_stage(place, views, points, replace(preset.fit, seed=settings.seed), device)
-        ground = views.ground
         if not views.has_masks:
-            views = masked_by_surfels(views, gaussians_from_state(fit), points.bounds_radius, settings.box)
-            views = sharpen_masks(views) if settings.masks == "auto" else views
-            views = _nearer(found, views, preset, settings)
+            views = _masked_by_fit(fit, found, views, points, preset, settings)
             photographs = replace(views_of(photographs, views), cameras=views.cameras, images_srgb=views.images_srgb)
-            # The surface and its materials see it as light.
-            views = views if ground is None else replace(views, ground=fitted_ground(fit.parameters["ground"], ground))
         views = with_gains_of_fit(views, drawn_object(fit, points.bounds_radius, preset.fit.sh_degree))
     yield "fit", None
 
@@ -265,10 +260,15 @@ def _opened(
     return open_capture(capture, preset.image_side, preset.points, *given, sharpen=settings.masks == "auto", nearer=True)
 
 
-def _nearer(capture: Capture, views: Views, preset: Preset, settings: BuildSettings) -> Views:
-    """look_nearer by masks that were found."""
+def _masked_by_fit(fit: FitState, capture: Capture, views: Views, points: InitialPoints, preset: Preset, settings: BuildSettings) -> Views:
+    """Views without masks, masked by what stage 1 has fitted, and nearer (look_nearer); with the ground, where there is one, as it was fitted: the surface and its
+    materials see it as light."""
+    ground, sharpen = views.ground, settings.masks == "auto"
+    views = masked_by_surfels(views, gaussians_from_state(fit), points.bounds_radius, settings.box)
+    views = sharpen_masks(views) if sharpen else views
     windows = object_windows(capture, views, preset.image_side)
-    return views if windows is None else look_nearer(capture, views, windows, False, settings.masks == "auto")
+    views = views if windows is None else look_nearer(capture, views, windows, False, sharpen)
+    return views if ground is None else replace(views, ground=fitted_ground(fit.parameters["ground"], ground))
 
 
 def _by_strokes(strokes: tuple[Stroke, ...], reporter: BuildReporter, should_stop: Callable[[], bool]) -> Callable[[Views], Views]:

@@ -1,9 +1,9 @@
 """What an object stands on, as light: rays that meet it see its picture, from wherever they come.
 
-The learned environment is infinitely far. Metal on a table mirrors the table, each place another part of it, and the environment can say none of that:
-with true masks and cameras a teapot on a printed table came out as paint (metallic RMSE .68, relit 18.5 dB). So where a build has found what the object stands on
-(Ground), rays that pass the object by and would meet it see it, and not the environment. It is a picture alone: as bright from all sides, and not
-lit by the object.
+The learned environment is infinitely far. What faces down on a table is lit by the table beside it, and mirrors it, each place another part: the environment can
+say none of that, and metal, which mirrors, was the next best word for it. So where a build has found what the object stands on (Ground), rays that pass
+the object by and would meet it see it, and not the environment. With true masks and cameras, and the true table, of a bunny on a printed one
+(`draft`): metallic RMSE .431 to .052, relit 25.1 and 25.0 to 25.9 and 27.3 dB. It is a picture alone: as bright from all sides, and not lit by the object.
 
 In: the ground. Out: what kernels look it up by; and an environment that shows it, for those who have no ground.
 """

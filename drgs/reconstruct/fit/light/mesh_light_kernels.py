@@ -165,7 +165,7 @@ def mirrored_kernel(query: KernelQuery) -> Any:
     ):
         """One thread a place. Rays that do not clear their face count as free.
 
-        Many arguments because a struct of them would be filled anew, array by array, for each launch.
+        Long because its loops share what functions would have to hand on, array by array. Many arguments because a struct of them would be filled anew, array by array, for each launch.
         """
         i = first + wp.tid()
         here = int(face[i])
