@@ -35,9 +35,10 @@ from drgs.reconstruct.fit.evidence.solve_albedo import RINGS, parts_for, solve_a
 from drgs.reconstruct.fit.evidence.vertex_certainty import vertex_certainty
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.ground_light import environment_with_ground, fitted_ground, ground_light
+from drgs.reconstruct.fit.light.ground_light import fitted_ground, ground_light
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import light_of_views, seen_sky
+from drgs.reconstruct.fit.surface.fit_mesh_materials import light_without_ground
 from drgs.reconstruct.fit.surface.surface_passes import SurfaceFit
 from drgs.reconstruct.fit.surfels.fit_gaussians import drawn_object, gaussians_from_state
 from drgs.reconstruct.fit.surfels.fit_materials import gaussians_from_materials
@@ -399,12 +400,11 @@ def _on_mesh(built: _Built) -> Generator[tuple[str, None], None, tuple[Asset, by
 
 
 def _environment(built: _Built, fit: SurfaceFit) -> Environment:
-    """The light that was fitted, with the ground as the object's middle sees it."""
-    radiance, ground = environment_table(fit.state.parameters).detach(), built.views.ground
-    if ground is not None:
-        middle = built.points.bounds_center.to(radiance.device)
-        radiance = environment_with_ground(radiance, ground_light(ground, radiance.device), middle)
-    return Environment(radiance)
+    """The light that was fitted; where there is a ground, one for pictures without it."""
+    if built.views.ground is None:
+        return Environment(environment_table(fit.state.parameters).detach())
+    settings = replace(built.materials_preset.materials, seed=built.settings.seed)
+    return Environment(light_without_ground(built.views, fit.faces, fit.state, built.points.bounds_center, settings, built.radius))
 
 
 def _seen_from(built: _Built, surface: SurfaceFit) -> _Built:

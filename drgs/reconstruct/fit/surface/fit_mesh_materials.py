@@ -26,7 +26,8 @@ from torch import Tensor
 
 from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, cosine_rates, run_fit
-from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.environment_pyramid import ENVIRONMENT_PYRAMID, environment_table
+from drgs.reconstruct.fit.light.ground_light import environment_with_ground, ground_light
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, light_of_rays
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves, display_image
@@ -45,6 +46,9 @@ from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Rays, SampleCounts, ShadingPoints
 from drgs.scene.environment import Environment
 from drgs.scene.views import Views
+
+LIGHT_STEPS = 60
+"""Of light_without_ground."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,29 @@ def fit_mesh_materials(
         report,
         should_stop,
     )
+
+
+def light_without_ground(
+    views: Views, faces: Tensor, state: FitState, middle: Tensor, settings: MeshMaterialSettings, radius: float
+) -> Tensor:
+    """(128, 256, 3) radiance of the environment that explains the photographs best where nothing but it is around the object as it was fitted: for
+    pictures of the object alone. It begins as what was fitted, with the ground as the object's middle sees it.
+
+    Args:
+        views: with the ground that `state` was fitted above. middle: of the object [world units]. settings: those of the fit. radius: of start_mesh_materials.
+    """
+    assert views.ground is not None
+    only_light = SurfaceRates(
+        normals=0.0, albedo_logits=0.0, roughness_logits=0.0, metallic_logits=0.0, environment=settings.rates.environment
+    )
+    own = replace(settings, iterations=LIGHT_STEPS, rounds=1, times_light=0, rates=only_light, normals_end=0.0)
+    values = {name: value.detach().clone() for name, value in state.parameters.items()}  # the fit's stay what they are
+    start = start_mesh_materials(replace(state, parameters=values), own, radius)
+    known = environment_table(start.parameters).detach()
+    shown = environment_with_ground(known, ground_light(views.ground, known.device), middle.to(known.device))
+    with torch.no_grad():
+        start.parameters[f"environment_{ENVIRONMENT_PYRAMID[-1]}"] += (shown.clamp(min=1e-3) / known).log().permute(2, 0, 1)[None]
+    return environment_table(fit_mesh_materials(replace(views, ground=None), faces, start, own).parameters).detach()
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,17 @@
 """Stage 2 on the mesh: a fit that finds colours, repeats itself and resumes."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from drgs.maths.color import linear_from_srgb
 from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState, StepLoss
+from drgs.reconstruct.fit.light.environment_pyramid import environment_table
 from drgs.reconstruct.fit.surface import fit_mesh_materials as fit_mesh_materials_file
 from drgs.reconstruct.fit.surface.fit_mesh_materials import (
     MeshMaterialSettings,
@@ -18,6 +21,7 @@ from drgs.reconstruct.fit.surface.fit_mesh_materials import (
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings, start_surface
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.render.records import SampleCounts
+from drgs.scene.ground import Ground
 from drgs.scene.views import Views
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
 from tests.reconstruct.surfel_spheres import surfel_sphere
@@ -146,3 +150,22 @@ def test_light_that_turns_is_looked_for_before_the_first_step(views: Views, turn
     monkeypatch.setattr(MovingSurface, "look_for_light", lambda surface, targets, moves: asked.append(state.iteration))
     fitted(with_light_of_camera(views) if turns else views, settings, state=state)
     assert asked == ([0, 0, 0] if turns else [])
+
+
+def test_light_for_pictures_without_the_ground_begins_as_the_ground_and_changes_nothing_else(views: Views, monkeypatch: pytest.MonkeyPatch):
+    """A red ground below the ball; no photograph is asked, so that the light stays where it begins, and then some are."""
+    low = float(CENTER[2]) - SPHERE_RADIUS - 0.05
+    red = torch.tensor([0.9, 0.1, 0.1])[:, None, None].expand(3, 16, 16)
+    ground = Ground(torch.tensor([0.0, 0.0, low]), torch.eye(3)[:2], 3.0, red, torch.ones(1, 16, 16))
+    above, settings = replace(views, ground=ground), short(4)
+    state = started(settings)
+    before = {name: value.detach().clone() for name, value in state.parameters.items()}
+    found = {}
+    for steps in (0, 30):
+        monkeypatch.setattr(fit_mesh_materials_file, "LIGHT_STEPS", steps)
+        found[steps] = fit_mesh_materials_file.light_without_ground(above, placed_sphere().faces, state, CENTER, settings, SPHERE_RADIUS)
+    assert all(torch.equal(value, before[name]) for name, value in state.parameters.items())
+    down, up = found[0][-1, 0], found[0][0, 0]
+    torch.testing.assert_close(down, linear_from_srgb(red[:, 0, 0]), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(up, environment_table(before)[0, 0], rtol=1e-4, atol=1e-4)
+    assert not torch.allclose(found[30], found[0], rtol=0.01) and bool(torch.isfinite(found[30]).all())
