@@ -44,7 +44,7 @@ from drgs.scene.asset import Asset, load_asset, load_photographs
 from drgs.scene.lens import Lens
 from drgs.scene.views import Views
 from tests.reconstruct.surfel_spheres import joined, surfel_sphere
-from tests.reconstruct.tiny_capture import FEW_VIEWS, SPHERE_CENTER, SPHERE_RADIUS, sphere_views, write_nerf_synthetic
+from tests.reconstruct.tiny_capture import FEW_VIEWS, FX, HEIGHT, SPHERE_CENTER, SPHERE_RADIUS, WIDTH, sphere_views, write_nerf_synthetic
 from tests.render.closed_form_scenes import front_camera
 
 TINY = Preset(
@@ -136,9 +136,14 @@ def test_the_photographs_of_the_capture_are_kept_with_the_asset(build: Build):
     photographs = load_photographs(build.path)
     assert photographs is not None
     check_photographs(photographs, len(build.asset.cameras), "the asset")
-    for number, view in enumerate(sphere_views(FEW_VIEWS, square=True)):
+    for number, (view, camera) in enumerate(zip(sphere_views(FEW_VIEWS, square=True), build.asset.cameras, strict=True)):
         kept = Image.open(io.BytesIO(read_photograph(build.path / PHOTOGRAPHS, number)))
-        reduced = np.asarray(Image.fromarray(view.rgba).resize(kept.size, Image.Resampling.BOX), float)
+        assert kept.size == (camera.width, camera.height)
+        # What of the photograph the asset's camera sees: the window around the object.
+        across, down = FX / float(camera.intrinsics[0, 0]), FX / float(camera.intrinsics[1, 1])
+        left, top = WIDTH / 2 - across * float(camera.intrinsics[0, 2]), HEIGHT / 2 - down * float(camera.intrinsics[1, 2])
+        window = tuple(round(edge) for edge in (left, top, left + across * camera.width, top + down * camera.height))
+        reduced = np.asarray(Image.fromarray(view.rgba).crop(window).resize(kept.size, Image.Resampling.BOX), float)
         difference = np.abs(np.asarray(kept.convert("RGBA"), float) - reduced)
         assert max(kept.size) == TINY.image_side and difference[..., 3].mean() < 4, view.name
         assert difference[..., :3][reduced[..., 3] == 255].mean() < 8, view.name
