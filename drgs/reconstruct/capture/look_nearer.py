@@ -68,7 +68,7 @@ def look_nearer(capture: Capture, views: Views, windows: Sequence[Window | None]
     by_name = {photograph.name: photograph for photograph in capture.photographs}
     shown = replace(capture, photographs=tuple(by_name[camera.name] for camera in views.cameras))
     small = tuple((camera.height, camera.width) for camera in views.cameras)
-    near = read_pictures(shown, None, sharpen and has_own_masks, windows_or_whole(shown, windows, small))
+    near = read_pictures(shown, None, sharpen and has_own_masks, _windows_or_whole(shown, windows, small))
     cameras = tuple(replace(new, camera_from_world=old.camera_from_world) for new, old in zip(near.cameras, views.cameras, strict=True))
     if has_own_masks:
         return replace(views, cameras=cameras, images_srgb=near.images_srgb, coverage=near.coverage, masks_moved=near.masks_moved)
@@ -81,7 +81,7 @@ def look_nearer(capture: Capture, views: Views, windows: Sequence[Window | None]
     return sharpen_masks(found) if sharpen else found
 
 
-def windows_or_whole(capture: Capture, windows: Sequence[Window | None], sizes: Sequence[tuple[int, int]]) -> tuple[Window, ...]:
+def _windows_or_whole(capture: Capture, windows: Sequence[Window | None], sizes: Sequence[tuple[int, int]]) -> tuple[Window, ...]:
     """The windows, where there is none the whole photograph at the size (rows, columns) that its view has."""
     return tuple(
         Window(slice(0, photograph.pinhole.height), slice(0, photograph.pinhole.width), width, height) if window is None else window
