@@ -1,9 +1,10 @@
 """A capture with everything known, drawn by us: the mesh and cameras of a scene of the benchmark, of other matter or shape, under other light.
 
     python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn|mug|plant|chair|bricks] --light FILE.exr --new-light FILE.exr [--spp 64]
-                                    [--turned] [--every 2] [--side 200]
+                                    [--turned] [--above] [--every 2] [--side 200]
 
-With --turned the light of the photographs stands still with the camera, as on a turntable; the file holds it as the first photograph's camera
+With --above photographs and test views are taken from a ring above the object, as people take them of things on tables, and test views from between the photographs:
+what faces down is in neither. With --turned the light of the photographs stands still with the camera, as on a turntable; the file holds it as the first photograph's camera
 sees it, which is how an asset holds it. OUT has the layout of the scenes in shared/bench (photographs, test views with maps, the same under the new light), so that `drgs build` takes it
 and `drgs eval` scores what was built. Our own renderer drew it, so it says nothing of that one; it says what a build makes of matter and light
 that no scene at hand has.
@@ -28,19 +29,22 @@ from benchmarks.measures.swap_parts import swapped_picture
 from benchmarks.render._mitsuba import mitsuba_picture
 from benchmarks.scenes.bench_scene import Array, BenchScene, open_scene, read_true_mesh, training_cameras
 from benchmarks.scenes.embossed_urn import embossed_urn
+from benchmarks.scenes.draw_film import looking_pose
 from benchmarks.scenes.hollow_things import mug, plant
 from benchmarks.scenes.made_things import bricks, chair
 from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.visible.trace_primary import trace_primary
-from drgs.scene.camera import Camera, scaled_camera
+from drgs.scene.camera import Camera, camera_from_opengl, opengl_from_camera, scaled_camera
 from drgs.scene.environment import turned_environment
 from drgs.scene.load_environment import load_environment
 from drgs.scene.mesh import TriangleMesh
 
 Renderer = Literal["ours", "mitsuba"]
 BOUNCES = 4
+ABOVE_TURNS, ABOVE_FROM, ABOVE_TO = 1.15, 20.0, 55.0
+"""Of cameras above: rounds, and the first and the last one's height above the horizontal of the object's middle [degrees]; a film's are alike."""
 TEST_RAYS = 2
 """Rays of a test picture, for one of a photograph."""
 
@@ -136,6 +140,8 @@ class Drawing:
     """Rays a pixel of a photograph."""
     turned: bool = False
     """The light of the photographs stands still with the camera."""
+    above: bool = False
+    """All cameras stand in a ring above the object, as far from it as the scene's."""
     every: int = 1
     """Of the scene's photographs and test views, one in so many."""
     side: int | None = None
@@ -163,8 +169,15 @@ def draw_scene(
     (out / "env").mkdir(parents=True)
     for path in (light, new_light):
         shutil.copy(path, out / "env" / path.name)
-    for name in ("transforms_train.json", "transforms_test.json"):
+    photographs, tests = drawn_cameras(scene, drawing)
+    if drawing.above:
+        middle = 0.5 * (mesh.vertices.amin(0) + mesh.vertices.amax(0)).double().numpy()
+        photographs, tests = from_above(photographs, middle, 0.0), from_above(tests, middle, 0.5)
+    for name, cameras in (("transforms_train.json", photographs), ("transforms_test.json", tests)):
         document = chosen_frames(json.loads((scene_folder / name).read_text()), drawing)
+        placed = {Path(camera.name).name: opengl_from_camera(camera).tolist() for camera in cameras}
+        for frame in document["frames"]:
+            frame["transform_matrix"] = placed[Path(frame["file_path"]).name]
         (out / name).write_text(json.dumps(document))
     if shape is None:
         shutil.copy(scene_folder / "gt_mesh.ply", out)
@@ -173,7 +186,7 @@ def draw_scene(
     np.savez(out / "gt_materials.npz", **{name: getattr(mesh, name).numpy() for name in ("albedo", "roughness", "metallic")})
     facts = {"name": out.name, "train_env": light.stem, "relight": [new_light.stem], "deform": {}}
     (out / "scene.json").write_text(json.dumps(facts))
-    tracer, (photographs, tests) = build_tracer(mesh), drawn_cameras(scene, drawing)
+    tracer = build_tracer(mesh)
     for camera in tests:
         (out / "test").mkdir(exist_ok=True)
         np.savez_compressed(out / "test" / f"{Path(camera.name).name}_aov.npz", aov=true_maps(tracer, camera).astype(np.float16))
@@ -200,6 +213,22 @@ def drawn_cameras(scene: BenchScene, drawing: Drawing) -> tuple[list[Camera], li
     return chosen(training_cameras(scene)[:: drawing.every]), chosen(tests)
 
 
+def from_above(cameras: list[Camera], middle: Array, offset: float) -> list[Camera]:
+    """The cameras, as far from the middle as they were and looking at it, once around and a little further while they rise.
+
+    Args:
+        offset: in cameras, along the way.
+    """
+    moved = []
+    for k, camera in enumerate(cameras):
+        share = (k + offset) / len(cameras)
+        around, up = 2 * np.pi * ABOVE_TURNS * share, np.radians(ABOVE_FROM + (ABOVE_TO - ABOVE_FROM) * share)
+        outward = np.array([np.cos(around) * np.cos(up), np.sin(around) * np.cos(up), np.sin(up)])
+        eye = middle + float(np.linalg.norm(camera.center_world.double().numpy() - middle)) * outward
+        moved.append(camera_from_opengl(looking_pose(eye, middle), camera.intrinsics, camera.width, camera.height, camera.name))
+    return moved
+
+
 def chosen_frames(document: dict[str, Any], drawing: Drawing) -> dict[str, Any]:
     """A transforms.json without the frames that are not drawn, and of pictures as large as those that are.
 
@@ -224,9 +253,10 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--new-light", type=Path, required=True)
     parser.add_argument("--spp", type=int, default=64, help="rays a pixel of a photograph; test pictures have twice as many")
     parser.add_argument("--turned", action="store_true", help="the light of the photographs stands still with the camera")
+    parser.add_argument("--above", action="store_true", help="photographs and test views are taken from a ring above the object")
     parser.add_argument("--every", type=int, default=1, help="draw one in so many of the scene's views")
     parser.add_argument("--side", type=int, help="of a picture [pixels]; as the scene's without")
     given = parser.parse_args(arguments)
-    drawing = Drawing(given.spp, given.turned, given.every, given.side)
+    drawing = Drawing(given.spp, given.turned, given.above, given.every, given.side)
     shape = SHAPES[given.shape]() if given.shape in SHAPES else None
     draw_scene(given.scene, given.out, MATTERS[given.matter], given.light, given.new_light, drawing, shape)

@@ -79,11 +79,11 @@ def film_cameras(mesh: TriangleMesh, drawing: FilmDrawing) -> list[Camera]:
         distance = 3.9 + 0.25 * np.sin(2.3 * around)
         target = np.array([0.08 * np.sin(3 * around), 0.06 * np.cos(2 * around), (low + high) / 2 + 0.05 * np.sin(4 * around)])
         eye = distance * np.array([np.cos(around) * np.cos(up), np.sin(around) * np.cos(up), np.sin(up)]) + [0, 0, target[2]]
-        cameras.append(camera_from_opengl(_looking(eye, target), intrinsics, drawing.width, drawing.height, f"{k:05d}"))
+        cameras.append(camera_from_opengl(looking_pose(eye, target), intrinsics, drawing.width, drawing.height, f"{k:05d}"))
     return cameras
 
 
-def _looking(eye: Array, target: Array) -> torch.Tensor:
+def looking_pose(eye: Array, target: Array) -> torch.Tensor:
     """(4, 4) OpenGL camera-to-world, upright."""
     back = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross([0, 0, 1.0], back)

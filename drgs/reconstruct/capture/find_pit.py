@@ -22,7 +22,7 @@ from torch import Tensor
 from drgs.reconstruct.capture.hull_rays import SolidRays, seen_from_elsewhere
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
-from drgs.warp_torch import as_in_thread_pool, launch, warp_array, warp_device
+from drgs.warp_torch import by_pool, launch, warp_array, warp_device
 
 BEYOND = 1e-3
 """Of the radius: from where a ray enters or leaves the hull to where it is followed on."""
@@ -48,7 +48,7 @@ class PitSettings:
     promising: tuple[float, float] = (0.9, 0.7)
     """Shares of the lid's difference that may be left, at most: by one floor and wall, and after the first blocks. Beds and pots leave 0.53 to 0.71 and 0.53 to 0.6."""
     rays: int = 8_000
-    """Through the lid, at most: so few that one thread is as fast as all, and waits for no other."""
+    """Through the lid, at most: so few that one thread is as fast as all, and tries one depth while others try theirs."""
     shallow: float = 0.04
     """What is less deep is rim."""
     rim: float = 0.25
@@ -107,8 +107,7 @@ def find_pit(
     if int(columns.inside.sum()) < settings.least:
         return None
     search = _Search(columns, _Rays.of(looks, columns, outer, radius, settings), radius, cell, settings)
-    with as_in_thread_pool():
-        depth = search.best()
+    depth = search.best()
     if depth is None:
         return None
     depth = ndimage.median_filter(np.minimum(depth, columns.most), 3) * columns.inside
@@ -248,20 +247,19 @@ class _Search:
         """None where one floor or large blocks leave too much already, and where there is no rim."""
         settings, inside = self.settings, self.columns.inside
         depth = np.zeros(inside.shape)
-        whole = least = self.left(depth)
+        (whole,) = self._left_by([depth])
         within = ndimage.distance_transform_edt(inside) * self.columns.width
-        for wall in settings.walls:
-            for deep in settings.depths:
-                trial = np.where(within > wall * self.radius, deep * self.radius, 0.0)
-                least, depth = min((least, depth), (self.left(trial), trial), key=lambda pair: pair[0])
+        floors = ((within > wall * self.radius) * deep * self.radius for wall in settings.walls for deep in settings.depths)
+        least, depth = self._least(whole, depth, list(floors))
         if least > settings.promising[0] * whole:
             return None
         for number, width in enumerate(settings.blocks):
             for block in self._blocks(max(1, round(width / settings.column))):
+                trials = []
                 for deep in self._depths_to_try(depth, block) if number else (0.0, *settings.depths):
-                    trial = depth.copy()
-                    trial[block] = deep * self.radius
-                    least, depth = min((least, depth), (self.left(trial), trial), key=lambda pair: pair[0])
+                    trials.append(depth.copy())
+                    trials[-1][block] = deep * self.radius
+                least, depth = self._least(least, depth, trials)
             if (number == 0 and least > settings.promising[1] * whole) or not self._has_rim(depth):
                 return None
         return depth
@@ -289,6 +287,15 @@ class _Search:
                     block = slice(max(u, 0), u + side), slice(max(v, 0), v + side)
                     if self.columns.inside[block].any():
                         yield block
+
+    def _least(
+        self, least: float, depth: Float[ndarray, "u v"], trials: list[Float[ndarray, "u v"]]
+    ) -> tuple[float, Float[ndarray, "u v"]]:
+        """What is left by the depth or the trial that leaves least, the first of them, and which that is."""
+        return min([(least, depth), *zip(self._left_by(trials), trials, strict=True)], key=lambda pair: pair[0])
+
+    def _left_by(self, trials: list[Float[ndarray, "u v"]]) -> list[float]:
+        return by_pool(lambda k, _: self.left(trials[k]), range(len(trials) + 1), self.rays.origin.device)
 
     def left(self, depth: Float[ndarray, "u v"]) -> float:
         """Mean difference of rays from what other views see where they end."""

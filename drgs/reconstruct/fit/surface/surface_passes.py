@@ -36,8 +36,8 @@ from drgs.scene.views import Views
 PASS_MESH = MeshSettings(resolution=200, face_limit=60_000, smoothing_passes=0, keep_component_fraction=0.01)
 """How fine the surface is meshed before a pass."""
 KINDS_AFTER = 1
-"""Pass, counted from 1, after which the fit begins once more as metal and as paint where light turns with the camera: normals are known a little, and no
-pass but the first was led by what one light said."""
+"""Pass, counted from 1, after which the fit begins once more as metal and as paint: normals are known a little, and no pass but the first was led by
+what one light said."""
 DISPLACEMENT_RATES = SurfaceRates(
     normals=0.0, albedo_logits=0.01, roughness_logits=0.01, metallic_logits=0.01, environment=0.005, offsets=0.03
 )
@@ -293,8 +293,8 @@ def fit_surface_in_passes(
     """
     steps = settings.surface.iterations
     between = [(after, settings.trials.iterations) for after in settings.try_after]
-    turns = views.light_from_world is not None and settings.passes > KINDS_AFTER
-    between += [(KINDS_AFTER, iterations_of_kinds(settings_of_pass(settings, KINDS_AFTER)))] if turns else []
+    kinds = iterations_of_kinds(settings_of_pass(settings, KINDS_AFTER)) if settings.passes > KINDS_AFTER else 0
+    between += [(KINDS_AFTER, kinds)]
     total = settings.passes * steps + sum(more for _, more in between) + settings.displacement_steps
     total += settings.relief_steps * (settings.division.most_faces > 0)
 
@@ -316,11 +316,12 @@ def fit_surface_in_passes(
             fit.doing = "looking whether cameras are right"
             views, fit.cameras_asked = move_cameras(fit, views, settings), number
             fit.doing = ""
-        if turns and number == KINDS_AFTER and not begin_as_either_kind(fit, views, settings, partial(tell, done + steps), should_stop):
-            return False
-        if number in settings.try_after and not move_to_tried_depths(
-            fit, views, settings, radius, partial(tell, done + steps), should_stop
-        ):
+        done += steps
+        if number == KINDS_AFTER:
+            if not begin_as_either_kind(fit, views, settings, partial(tell, done), should_stop):
+                return False
+            done += kinds
+        if number in settings.try_after and not move_to_tried_depths(fit, views, settings, radius, partial(tell, done), should_stop):
             return False
         start_next_pass(fit, settings, radius)
     relief, displacement = settings_of_relief(settings), settings_of_displacement(settings)

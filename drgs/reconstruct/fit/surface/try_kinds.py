@@ -1,13 +1,14 @@
-"""Metal or paint where light turns with the camera: the fit begins once more as all metal and as all paint, and goes on from what explains more.
+"""Metal or paint: the fit begins once more as all metal and as all paint, and goes on from what explains more.
 
-Under such light what arrives at paint changes from view to view as well as what metal mirrors, and either of them, under a light that was fitted to
-it, explains much of what the other one shows. So evidence under one light (metal_evidence) repeats what was believed when that light was
-fitted: on the teapot it calls all metal under a light that was fitted with metal, and all paint under one that was fitted with paint. Here each
-belief gets a light of its own: materials, normals and light follow the photographs for some steps with everything held to be of one kind; then
-evidence is asked under that light, for objects are made of both, what it is sure of begins anew, and as many steps follow. The beginning that leaves
-less error is kept, with its light; paint unless metal leaves clearly less (CLEARLY).
+Either of them, under a light that was fitted to it, explains much of what the other one shows. So evidence under one light (metal_evidence) repeats
+what was believed when that light was fitted. Where light turns with the camera it calls all of a teapot metal under a light that was fitted with metal,
+and all paint under one that was fitted with paint; where light stands still and cameras stand in a ring above the teapot, its chrome lid mirrors the
+ceiling alone, and is beige paint below a dark ceiling. Here each belief gets a light of its own: materials, normals and light follow the
+photographs for some steps with everything held to be of one kind; then evidence is asked under that light, for objects are made of both, what it is
+sure of begins anew, and as many steps follow. The beginning that leaves less error is kept, with its light; paint unless metal leaves clearly less
+(CLEARLY).
 
-In: the state of a fit on the mesh (fit_surface), photographs whose light turns. Out: that state, its surface where it was.
+In: the state of a fit on the mesh (fit_surface), photographs. Out: that state, its surface where it was.
 """
 
 from collections.abc import Callable
@@ -41,6 +42,8 @@ SURE = 0.5
 """Of evidence, -1..1."""
 PIXELS = 16_384
 """Of each photograph, at most, by which errors are compared: of a million in all their mean is known to a thousandth."""
+PIXELS_A_STEP = 16_384
+"""Of all photographs that a step looks at, at most: whole kinds show by a quarter of what finer steps see."""
 ALBEDO = (0.05, 0.95)
 """That a place may begin with."""
 
@@ -68,7 +71,8 @@ def try_kinds(
     Args:
         parameters: of a surface's fit. settings: of a pass; each beginning has as many steps, half of them as it began. report: is told of the steps of both.
     """
-    own = replace(settings, rounds=1, steps_a_round=_half(settings), still=True, fall_from=1.0)
+    few = min(settings.pixels_a_step, PIXELS_A_STEP)
+    own = replace(settings, rounds=1, steps_a_round=_half(settings), still=True, fall_from=1.0, pixels_a_step=few)
     targets = view_targets(views, 1.0, faces.device)
     given = {name: value.detach() for name, value in parameters.items()}
     here = MovingSurface(views, faces, _state(given, own))  # nothing moves
