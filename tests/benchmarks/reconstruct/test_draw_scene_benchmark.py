@@ -100,6 +100,24 @@ def test_one_view_in_so_many_is_drawn(tmp_path: Path):
     assert [camera.name for camera in load_cameras(tmp_path / "out" / "transforms_train.json")] == ["r_000", "r_002"]
 
 
+def test_cameras_above_stand_in_a_ring_look_at_the_middle_and_show_it_there(tmp_path: Path):
+    scene = small_scene(tmp_path / "scene")
+    chosen = ["--light", str(scene / "lamp.exr"), "--new-light", str(scene / "sky.exr"), "--spp", "2", "--above"]
+    draw_scene.main([str(scene), str(tmp_path / "out"), *chosen])
+    heights = []
+    for name in ("train", "test"):
+        for camera in load_cameras(tmp_path / "out" / f"transforms_{name}.json"):
+            eye = camera.center_world.double().numpy()
+            assert np.linalg.norm(eye) == pytest.approx(4, abs=1e-4)
+            np.testing.assert_allclose(camera.camera_from_world[:3, 3].numpy(), [0, 0, 4], atol=1e-4)  # the middle, before it
+            heights.append(float(np.degrees(np.arcsin(eye[2] / 4))))
+            with Image.open(tmp_path / "out" / name / f"{Path(camera.name).name}.png") as picture:
+                row, column = np.nonzero(np.asarray(picture)[..., 3] > 127)
+            assert (row.mean(), column.mean()) == (pytest.approx(7.5, abs=0.5), pytest.approx(7.5, abs=0.5))
+    steps = np.linspace(draw_scene.ABOVE_FROM, draw_scene.ABOVE_TO, 7)[:6]
+    np.testing.assert_allclose(np.sort(heights), steps, atol=0.01)  # test views from between the photographs
+
+
 def test_the_urn_is_closed_looks_outward_and_carries_its_relief():
     urn = embossed_urn(around=144, up=121)
     assert urn.is_watertight and urn.volume > 0.8
