@@ -28,8 +28,8 @@ from torch import Tensor
 from benchmarks.measures.swap_parts import swapped_picture
 from benchmarks.render._mitsuba import mitsuba_picture
 from benchmarks.scenes.bench_scene import Array, BenchScene, open_scene, read_true_mesh, training_cameras
-from benchmarks.scenes.embossed_urn import embossed_urn
 from benchmarks.scenes.draw_film import looking_pose
+from benchmarks.scenes.embossed_urn import embossed_urn
 from benchmarks.scenes.hollow_things import mug, plant
 from benchmarks.scenes.made_things import bricks, chair
 from drgs.reconstruct.capture.load_views import load_cameras
