@@ -101,8 +101,8 @@ def try_kinds(
                 return None
         ends.append(({name: value.detach() for name, value in state.parameters.items()}, _error(surface_of(state), state, targets, own)))
     (metal, metal_error), (paint, paint_error) = ends
-    kind = better_kind(metal_error, paint_error, here.light_turns)
-    return TriedKinds({1.0: metal, 0.0: paint, None: given}[kind], (metal_error, paint_error))
+    better = better_kind(metal_error, paint_error, here.light_turns)
+    return TriedKinds({1.0: metal, 0.0: paint, None: given}[better], (metal_error, paint_error))
 
 
 def better_kind(metal_error: float, paint_error: float, light_turns: bool) -> float | None:
