@@ -226,8 +226,9 @@ def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
     stages = list(dict.fromkeys(p.stage for p in build.progress))
     assert stages == ["read", "fit", "mesh", "surface", "materials", "pack"]
     passes = {p.iteration: p for p in build.progress if p.stage == "surface"}
-    assert max(passes) == passes[8].iterations == 8
-    assert passes[6].message.startswith("pass 2 of 2") and passes[8].message.startswith("relief")
+    assert max(passes) == passes[12].iterations == 12
+    assert passes[7].message.startswith("pass 1 of 2") and passes[7].message.endswith("trying metal and paint")
+    assert passes[10].message.startswith("pass 2 of 2") and passes[12].message.startswith("relief")
     last_fit = [p for p in build.progress if p.stage == "fit"][-1]
     assert (last_fit.iteration, last_fit.iterations) == (20, 20) and last_fit.psnr > 5
 
@@ -236,17 +237,23 @@ def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
 def test_a_build_stopped_in_every_stage_leaves_checkpoints_and_resumes_to_the_same_bits(
     build: Build, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """One build, stopped five times: what any stop loses, the end lacks."""
+    """One build, stopped six times: what any stop loses, the end lacks."""
     out = tmp_path / "sphere"
     told: list[Progress] = []
-    stops = (("fit", 1, "stage1"), ("mesh", 1, "stage1"), ("surface", 1, "surface"), ("surface", 3, "surface"), ("materials", 1, "stage2"))
+    in_surface = {1: "pass 1 of 2", 3: "trying metal and paint", 5: "pass 2 of 2"}
+    stops = (
+        ("fit", 1, "stage1"),
+        ("mesh", 1, "stage1"),
+        *(("surface", after, "surface") for after in in_surface),
+        ("materials", 1, "stage2"),
+    )
     for stage, after, checkpoint in stops:
         told.clear()
         with pytest.raises(BuildStopped):
             build_asset(capture, out, replace(SETTINGS, resume=True), told.append, stop_when(stage, told, after))
         assert not out.exists() and (Path(f"{out}.build") / f"{checkpoint}.safetensors").is_file()
         assert told[-1].stage == stage and (stage in ("fit", "mesh") or "fit" not in {p.stage for p in told})
-        assert after == 1 or told[-1].message.startswith("pass 2 of 2")
+        assert stage != "surface" or in_surface[after] in told[-1].message
     told.clear()
     resumed = asset_tensors(build_asset(capture, out, replace(SETTINGS, resume=True), told.append))
     assert not {"fit", "surface"} & {p.stage for p in told}
