@@ -3,8 +3,8 @@
     python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn|mug|plant|chair|bricks] --light FILE.exr --new-light FILE.exr [--spp 64]
                                     [--turned] [--above] [--every 2] [--side 200]
 
-With --above photographs and test views are taken from a ring above the object, as people take them of things on tables, and test views from between the photographs:
-what faces down is in neither. With --turned the light of the photographs stands still with the camera, as on a turntable; the file holds it as the first photograph's camera
+With --above photographs are taken from a ring above the object, as people take them of things on tables, and test views from between them: what faces
+down is in neither. With --turned the light of the photographs stands still with the camera, as on a turntable; the file holds it as the first photograph's camera
 sees it, which is how an asset holds it. OUT has the layout of the scenes in shared/bench (photographs, test views with maps, the same under the new light), so that `drgs build` takes it
 and `drgs eval` scores what was built. Our own renderer drew it, so it says nothing of that one; it says what a build makes of matter and light
 that no scene at hand has.
@@ -175,9 +175,9 @@ def draw_scene(
         photographs, tests = from_above(photographs, middle, 0.0), from_above(tests, middle, 0.5)
     for name, cameras in (("transforms_train.json", photographs), ("transforms_test.json", tests)):
         document = chosen_frames(json.loads((scene_folder / name).read_text()), drawing)
-        placed = {Path(camera.name).name: opengl_from_camera(camera).tolist() for camera in cameras}
-        for frame in document["frames"]:
-            frame["transform_matrix"] = placed[Path(frame["file_path"]).name]
+        if drawing.above:
+            poses = {Path(camera.name).name: opengl_from_camera(camera).tolist() for camera in cameras}
+            document["frames"] = [frame | {"transform_matrix": poses[Path(frame["file_path"]).name]} for frame in document["frames"]]
         (out / name).write_text(json.dumps(document))
     if shape is None:
         shutil.copy(scene_folder / "gt_mesh.ply", out)

@@ -1,6 +1,7 @@
 """Metal and paint tried: the fit ends with what the sphere is made of, whatever was believed before."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -75,10 +76,11 @@ def test_the_fit_ends_with_what_it_is_though_the_other_was_believed(metallic: fl
 
 
 def test_the_clearly_better_beginning_is_kept_and_of_neither_only_where_light_stands_still() -> None:
-    assert better_kind(0.8, 1.0, True) == better_kind(0.8, 1.0, False) == 1.0
-    assert better_kind(1.0, 0.8, True) == better_kind(1.0, 0.8, False) == 0.0
-    assert better_kind(0.95, 1.0, True) == better_kind(1.0, 0.95, True) == 0.0, "soft mirrors explain paint nearly as well there"
+    assert better_kind(0.8, 1.0, True) == better_kind(0.8, 1.0, False) == "metal"
+    assert better_kind(1.0, 0.8, True) == better_kind(1.0, 0.8, False) == "paint"
+    assert better_kind(0.95, 1.0, True) == better_kind(1.0, 0.95, True) == "paint", "soft mirrors explain paint nearly as well there"
     assert better_kind(0.95, 1.0, False) is better_kind(1.0, 0.95, False) is None
+    assert better_kind(0.0, 0.0, False) is better_kind(math.nan, 1.0, False) is None, "nothing was compared, or not to be compared"
 
 
 def test_what_evidence_is_sure_of_begins_anew_where_it_was_of_the_other_kind_alone() -> None:
