@@ -98,6 +98,8 @@ def test_one_view_in_so_many_is_drawn(tmp_path: Path):
     draw_scene.main([str(scene), str(tmp_path / "out"), *chosen])
     assert sorted(path.name for path in (tmp_path / "out" / "train").iterdir()) == ["r_000.png", "r_002.png"]
     assert [camera.name for camera in load_cameras(tmp_path / "out" / "transforms_train.json")] == ["r_000", "r_002"]
+    given, drawn = (json.loads((folder / "transforms_train.json").read_text())["frames"] for folder in (scene, tmp_path / "out"))
+    assert drawn == given[::2], "poses are those of the scene, digit by digit"
 
 
 def test_cameras_above_stand_in_a_ring_look_at_the_middle_and_show_it_there(tmp_path: Path):
