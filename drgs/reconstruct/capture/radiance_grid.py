@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from drgs.reconstruct.capture.ray_costs import ray_costs
+from drgs.reconstruct.capture.ray_costs import ray_costs, ray_depths
 from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 
@@ -80,18 +80,6 @@ class RadianceGrid:
     row: Int[Tensor, "node"]
     """Of `colors`."""
 
-    def samples(self, rays: Rays, offsets: Float[Tensor, "ray k"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Distances (ray, k) at shares `offsets` of the way, a cell longer at both ends, places there (ray, k, 3) and weights (ray, k)."""
-        near = rays.near - self.cell
-        length = rays.far + self.cell - near
-        distance = near[:, None] + length[:, None] * offsets
-        places = rays.origin[:, None] + distance[..., None] * rays.direction[:, None]
-        step = length[:, None] / (offsets.shape[1] * self.cell)
-        density = torch.nn.functional.softplus(self.looked_up(self.density, places))
-        opacity = (1 - torch.exp(-density * step)) * (self.looked_up(self.inside, places) > 0.5)
-        passed = torch.cumprod(torch.cat([torch.ones_like(near)[:, None], 1 - opacity + 1e-7], 1), 1)
-        return distance, places, opacity * passed[:, :-1]
-
     def coefficients_at(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 12"]:
         """Trilinearly, as `colors` has them."""
         count = len(self.density)
@@ -104,16 +92,10 @@ class RadianceGrid:
         weights = torch.where(corner.bool(), part[:, None], 1 - part[:, None]).prod(-1)
         return torch.nn.functional.embedding_bag(rows, self.colors, mode="sum", per_sample_weights=weights)
 
-    @torch.no_grad()
     def depths(self, rays: Rays) -> tuple[Float[Tensor, "ray"], Float[Tensor, "ray"]]:
         """Distance at which half of the light is stopped, inf where it never is; and the mean distance of what stops it from its own mean."""
-        offsets = (torch.arange(EVEN_SAMPLES, device=self.low.device) + 0.5) / EVEN_SAMPLES
-        distance, _, weight = self.samples(rays, offsets.expand(len(rays.near), -1))
-        stopped = weight.cumsum(1) > 0.5
-        median = torch.where(stopped.any(1), distance.gather(1, stopped.to(torch.uint8).argmax(1, keepdim=True))[:, 0], torch.inf)
-        total = weight.sum(1, keepdim=True).clamp(min=0.01)
-        mean = (weight * distance).sum(1, keepdim=True) / total
-        return median, (weight * (distance - mean).abs()).sum(1) / total[:, 0]
+        through = (rays.origin, rays.direction, rays.near, rays.far)
+        return ray_depths(through, self.low, self.cell, self.inside, self.density, EVEN_SAMPLES)
 
     def looked_up(self, field: Float[Tensor, "n n n"], places: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
         """Trilinearly."""

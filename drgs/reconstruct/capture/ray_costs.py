@@ -1,4 +1,4 @@
-"""What rays through a radiance grid cost, and the gradient of that: one thread a ray, there and back.
+"""What rays through a radiance grid cost, the gradient of that, and how far they see: one thread a ray, there and back.
 
 As some fifty operations on all samples a step of the fit took five times as long. Formulas: drgs/reference/ray_costs.py.
 """
@@ -101,6 +101,13 @@ def _offset(k: int, shake: float, count: int) -> float:
     return (float(k) + shake) / float(count)
 
 
+@wp.func
+def _stopped(density: float, step: float) -> float:
+    """Share of the light that a sample stops, whose cell's side has that density before softplus."""
+    dense = wp.where(density > 20.0, density, wp.log(1.0 + wp.exp(wp.min(density, 20.0))))
+    return 1.0 - wp.exp(-dense * step)
+
+
 @wp.kernel
 def rays_there(
     first: int,
@@ -147,8 +154,7 @@ def rays_there(
         stopped = float(0.0)
         if _value(inside, here, count) > 0.5:
             value = _value(density, here, count)
-            dense = wp.where(value > 20.0, value, wp.log(1.0 + wp.exp(wp.min(value, 20.0))))
-            stopped = 1.0 - wp.exp(-dense * step)
+            stopped = _stopped(value, step)
         w = stopped * passed
         samples[ray, k] = wp.vec3(value, stopped, w)
         passed *= 1.0 - stopped + PASSED
@@ -230,6 +236,80 @@ def rays_back(
                 if node >= 0:
                     wp.atomic_add(density_gradient, node, g_value * _share(here, corner))
         behind += g_weight * w
+
+
+@wp.kernel
+def rays_stop(
+    first: int,
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    near: wp.array[float],
+    far: wp.array[float],
+    low: wp.vec3,
+    cell: float,
+    count: int,
+    density: wp.array[float],
+    inside: wp.array[float],
+    # outputs
+    weights: wp.array2d[float],
+    median: wp.array[float],
+    spread: wp.array[float],
+):
+    """Distance at which half of each ray's light is stopped, inf where it never is, and the mean distance of what stops it from its own mean; by samples in
+    the middles of even stretches, whose weights (ray, sample) are left behind.
+
+    Many arguments because a struct of them would be filled anew, array by array, for each launch.
+    """
+    ray = first + wp.tid()
+    samples = weights.shape[1]
+    start = near[ray] - cell
+    length = far[ray] + cell - start
+    step = length / (float(samples) * cell)
+    passed = float(1.0)
+    total = float(0.0)
+    moment = float(0.0)
+    half = float(wp.inf)
+    for k in range(samples):
+        distance = start + length * _offset(k, 0.5, samples)
+        here = _cell_at((origin[ray] + distance * direction[ray] - low) / cell)
+        stopped = float(0.0)
+        if _value(inside, here, count) > 0.5:
+            stopped = _stopped(_value(density, here, count), step)
+        w = stopped * passed
+        weights[ray, k] = w
+        passed *= 1.0 - stopped + PASSED
+        total += w
+        moment += w * distance
+        if total > 0.5 and half == wp.inf:
+            half = distance
+    middle = moment / wp.max(total, LEAST_STOPPED)
+    scattered = float(0.0)
+    for k in range(samples):
+        scattered += weights[ray, k] * wp.abs(start + length * _offset(k, 0.5, samples) - middle)
+    median[ray] = half
+    spread[ray] = scattered / wp.max(total, LEAST_STOPPED)
+
+
+def ray_depths(
+    rays: tuple[Tensor, Tensor, Tensor, Tensor],
+    low: Float[Tensor, "3"],
+    cell: float,
+    inside: Float[Tensor, "n n n"],
+    density: Float[Tensor, "n n n"],
+    samples: int,
+) -> tuple[Float[Tensor, "ray"], Float[Tensor, "ray"]]:
+    """As rays_stop has them, by so many samples a ray.
+
+    Args:
+        rays: of ray_costs. low, cell, inside, density: of RadianceGrid.
+    """
+    flat, device = density.detach().contiguous().reshape(-1), warp_device(density)
+    given = [warp_argument(values.contiguous(), dtype) for values, dtype in zip(rays, _TYPES, strict=False)]
+    count = len(rays[0])
+    weights, median, spread = flat.new_empty(count, samples), flat.new_empty(count), flat.new_empty(count)
+    inputs = [*given, wp.vec3(*low.tolist()), cell, len(density), warp_argument(flat), warp_argument(inside.reshape(-1))]
+    launch(rays_stop, count, inputs, [warp_argument(weights), warp_argument(median), warp_argument(spread)], device)
+    return median, spread
 
 
 def ray_costs(

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix, diags
 from torch import Tensor
 
-from drgs.reconstruct.geometry.alike_systems import factored
+from drgs.reconstruct.geometry.symmetric_systems import factored
 
 
 def agree_along_edges(

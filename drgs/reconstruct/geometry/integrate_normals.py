@@ -17,15 +17,15 @@ Source: Nehab et al. 2005 (positions from normals), with outlines in place of me
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
-import numpy as np
 import torch
-from scipy.sparse import csr_matrix, diags, identity
+from jaxtyping import Float64, Int
 from torch import Tensor
 
-from drgs.reconstruct.geometry.alike_systems import AlikeSystems
 from drgs.reconstruct.geometry.mask_outlines import OutlineResiduals
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.reconstruct.geometry.symmetric_systems import SymmetricPlaces, solved
 from drgs.scene.mesh import vertex_normals
 
 TURNED = 0.3
@@ -76,13 +76,12 @@ def integrate_normals(
     settings: IntegrationSettings,
     homes: Places | None = None,
     texture: Places | None = None,
-    systems: AlikeSystems | None = None,
 ) -> Tensor:
     """(vertex, 3) positions after one solve.
 
     Args:
         vertices: (vertex, 3). faces: (face, 3). wanted_normals: (vertex, 3) unit. outlines: of these vertices.
-        homes, texture: None: there are none. systems: of solves before, of these vertices not far from here.
+        homes, texture: None: there are none.
     """
     direction = vertex_normals(vertices, faces)
     start, end = edges.vertices.unbind(1)
@@ -94,44 +93,72 @@ def integrate_normals(
     by_start, by_end = (direction[start] * normal).sum(1) / length, -(direction[end] * normal).sum(1) / length
     by_corners = outlines.weights * (outlines.gradient[:, None] * direction[outlines.corners]).sum(-1)
 
-    edge_count, outline_count, count = len(tilt), len(outlines.distance), len(vertices)
-    row = torch.arange(edge_count, device=vertices.device)
-    outline_row = edge_count + torch.arange(outline_count, device=vertices.device)
-    rows = _numpy(torch.cat([row, row, outline_row.repeat_interleave(3)]))
-    columns = _numpy(torch.cat([start, end, outlines.corners.flatten()]))
-    values = _numpy(torch.cat([by_start, by_end, by_corners.flatten()]).double())
-    jacobian = csr_matrix((values, (rows, columns)), shape=(edge_count + outline_count, count))
-    residual = _numpy(torch.cat([tilt, outlines.distance]).double())
-    outline_length = settings.outline_weight * _numpy(outlines.length.double())
-    edge2 = float(length.mean()) ** 2
-    anchor, pull = settings.anchor / edge2 * identity(count), np.zeros(count)
+    count, edge2 = len(vertices), float(length.mean()) ** 2
+    held, pull = torch.full((count,), settings.anchor / edge2).to(by_start).double(), torch.zeros(count).to(by_start).double()
     reach = settings.longest_move * _mean_of_edges(length, edges, count)
     for places, strength in ((homes, settings.home), (texture, settings.texture)):
         if places is not None:
-            hold = strength / edge2 * _numpy(places.weight.double())
+            hold = strength / edge2 * places.weight.double()
             away = (places.towards * direction).sum(1)
             if places is texture:
                 away = torch.maximum(torch.minimum(away, reach), -reach)
-            anchor, pull = anchor + diags(hold), pull + hold * _numpy(away.double())
-    inverse = _numpy((1 / length).double())
-    differences = csr_matrix(
-        (np.concatenate([inverse, -inverse]), (np.tile(np.arange(edge_count), 2), _numpy(torch.cat([start, end])))),
-        shape=(edge_count, count),
-    )
-    fixed = anchor + settings.even * differences.T @ differences
-    moved, systems = np.zeros(count), systems or AlikeSystems()
+            held, pull = held + hold, pull + hold * away.double()
+    even = settings.even / length.double() ** 2
+    for corner in (start, end):
+        held.index_add_(0, corner, even)
+    tilts = _Residuals(edges.vertices, torch.stack([by_start, by_end], 1).double(), tilt.double())
+    leaps = _Residuals(outlines.corners, by_corners.double(), outlines.distance.double())
+    pattern = SymmetricPlaces.of(torch.cat([tilts.pairs, leaps.pairs]), count)
+    outline_length = settings.outline_weight * outlines.length.double()
+    moved = torch.zeros_like(held)
     for _ in range(settings.reweightings):
-        now = jacobian @ moved + residual
-        weight = np.concatenate(
-            [
-                1 / (1 + (now[:edge_count] / settings.crease_angle) ** 2),
-                outline_length / (1 + (now[edge_count:] / settings.outline_outlier) ** 2),
-            ]
+        diagonal, right_side, beside = held.clone(), pull.clone(), []
+        weights = (
+            1 / (1 + (tilts.after(moved) / settings.crease_angle) ** 2),
+            outline_length / (1 + (leaps.after(moved) / settings.outline_outlier) ** 2),
         )
-        normal_matrix = (jacobian.T @ diags(weight) @ jacobian + fixed).tocsc()
-        moved = systems.solved(normal_matrix, pull - jacobian.T @ (weight * residual), moved)
-    step = torch.maximum(torch.minimum(torch.from_numpy(moved).to(vertices), reach), -reach)
+        for residuals, weight in zip((tilts, leaps), weights, strict=True):
+            residuals.add_to(diagonal, right_side, weight)
+            beside.append(residuals.products(weight))
+        beside[0] -= even
+        moved = solved(pattern.filled(torch.cat(beside)), diagonal, right_side, moved)
+    step = torch.maximum(torch.minimum(moved.to(vertices), reach), -reach)
     return vertices + unfolded(vertices, direction, step, faces, edges)[:, None] * direction
+
+
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """What is to be 0, each a sum over a few vertices' moves."""
+
+    corners: Int[Tensor, "residual corner"]
+    by_corners: Float64[Tensor, "residual corner"]
+    """Derivatives by the corners' moves."""
+    now: Float64[Tensor, "residual"]
+    """Without any move."""
+
+    @property
+    def _two(self) -> list[tuple[int, int]]:
+        return list(combinations(range(self.corners.shape[1]), 2))
+
+    @property
+    def pairs(self) -> Int[Tensor, "pair 2"]:
+        """Of different corners of one residual."""
+        return torch.cat([self.corners[:, [a, b]] for a, b in self._two]).long()
+
+    def products(self, weight: Float64[Tensor, "residual"]) -> Float64[Tensor, "pair"]:
+        """Of both derivatives of each of `pairs`."""
+        return torch.cat([weight * self.by_corners[:, a] * self.by_corners[:, b] for a, b in self._two])
+
+    def after(self, moved: Float64[Tensor, "vertex"]) -> Float64[Tensor, "residual"]:
+        return (self.by_corners * moved[self.corners.long()]).sum(1) + self.now
+
+    def add_to(
+        self, diagonal: Float64[Tensor, "vertex"], right_side: Float64[Tensor, "vertex"], weight: Float64[Tensor, "residual"]
+    ) -> None:
+        """Of the weighted squares' normal equations, what does not lie beside the diagonal."""
+        for corner, derivative in zip(self.corners.long().unbind(1), self.by_corners.unbind(1), strict=True):
+            diagonal.index_add_(0, corner, weight * derivative**2)
+            right_side.index_add_(0, corner, -weight * derivative * self.now)
 
 
 def unfolded(vertices: Tensor, direction: Tensor, step: Tensor, faces: Tensor, edges: MeshEdges) -> Tensor:
@@ -172,7 +199,3 @@ def _mean_of_neighbours(values: Tensor, edges: MeshEdges) -> Tensor:
         total.index_add_(0, here, values[there])
         number.index_add_(0, here, torch.ones_like(values[there]))
     return total / number.clamp(min=1)
-
-
-def _numpy(values: Tensor) -> np.ndarray:
-    return values.detach().cpu().numpy()

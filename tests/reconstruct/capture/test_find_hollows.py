@@ -15,6 +15,7 @@ from drgs.reconstruct.capture.initial_points import initial_points
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays, fit_radiance_grid
 from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.capture.visual_hull import VisualHull, VisualHullSettings, visual_hull
+from drgs.reference.ray_costs import samples_along
 from drgs.render.intersect.trace_rays import build_tracer, trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.camera import Camera, pixel_rays_world
@@ -199,7 +200,7 @@ def test_light_falls_off_by_beer_s_law_and_the_median_depth_follows() -> None:
     grid = constant_grid(float(torch.tensor(density).expm1().log()))  # softplus of it, a cell
     rays = Rays(torch.tensor([[-0.5, 0.0, 0.0]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([0.25]), torch.tensor([0.75]))
     offsets = (torch.arange(400) + 0.5)[None] / 400
-    distance, places, weights = grid.samples(rays, offsets)
+    distance, places, weights = samples_along(grid, rays, offsets)
     length = 0.5 + 2 * 0.25  # a cell longer at both ends
     assert float(weights.sum()) == pytest.approx(1 - np.exp(-density * length / 0.25), rel=1e-3)
     assert torch.allclose(places[0, :, 0], distance[0] - 0.5)

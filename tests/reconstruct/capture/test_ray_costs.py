@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from drgs.reconstruct.capture.radiance_grid import RadianceGrid, RadianceGridSettings, Rays
-from drgs.reconstruct.capture.ray_costs import ray_costs
+from drgs.reconstruct.capture.ray_costs import ray_costs, ray_depths
 from drgs.reference import ray_costs as reference
 
 NODES, RAYS = 14, 300
@@ -70,3 +70,22 @@ def test_no_rays_cost_nothing():
     )  # fmt: skip
     cost.backward()
     assert float(cost.detach()) == 0 and density.grad is not None and float(density.grad.abs().max()) == 0
+
+
+def test_depths_equal_the_twin(device: str):
+    grid, rays, _, _ = hull_of_fog()
+    wanted_median, wanted_spread = reference.ray_depths(grid, rays, 160)
+    low, inside, density = (values.float().to(device) for values in (grid.low, grid.inside, grid.density))
+    median, spread = ray_depths(tuple_of(rays, device), low, grid.cell, inside, density, 160)
+    assert 0.2 < float(torch.isfinite(wanted_median).double().mean()) < 1  # both kinds are asked for
+    one = 2 * (1 + grid.cell) / 160  # a sample's stretch at most: half of the light may be stopped by either of two
+    same = (median.cpu().double() - wanted_median).abs() < 1.01 * one
+    assert float((same | (median.cpu() == wanted_median)).double().mean()) > 0.99
+    torch.testing.assert_close(spread.cpu().double(), wanted_spread, atol=2e-3 * grid.cell, rtol=1e-3)
+
+
+def test_no_rays_see_nowhere():
+    grid, rays, _, _ = hull_of_fog()
+    none = tuple_of(rays[slice(0, 0)], "cpu")
+    median, spread = ray_depths(none, grid.low.float(), grid.cell, grid.inside.float(), grid.density.float(), 160)
+    assert median.shape == spread.shape == (0,)

@@ -25,7 +25,6 @@ from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split
 from drgs.reconstruct.fit.light.turned_light import COARSE, Fineness, SeenSky, light_of_views, seen_sky
 from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
 from drgs.reconstruct.fit.view_targets import ViewTarget
-from drgs.reconstruct.geometry.alike_systems import AlikeSystems
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import OutlineRays, mask_outlines, outline_rays, outline_residuals
@@ -119,14 +118,13 @@ class MovingSurface:
         """
         parameters = self._state.parameters
         normals = torch.nn.functional.normalize(parameters["normals"], dim=-1)
-        systems = AlikeSystems()
         for _ in range(settings.solves):
             residuals = outline_residuals(self.tracer, self._outlines)
             vertices, homeward = parameters["vertices"], parameters["homeward"]
             # Of metal mirrors say where it lies.
             homes = Places(homeward, (-parameters["metal"]).clamp(0, 1))
             texture = Places(parameters["to_texture"], parameters["texture_weight"])
-            moved = integrate_normals(vertices, self.faces, normals, self.edges, residuals, settings.integration, homes, texture, systems)
+            moved = integrate_normals(vertices, self.faces, normals, self.edges, residuals, settings.integration, homes, texture)
             moved = whole_or_within(settings.box, moved)
             for place in (homeward, parameters["to_texture"]):
                 place += vertices - moved

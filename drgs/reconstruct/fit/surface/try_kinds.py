@@ -43,8 +43,8 @@ BEGUN = 0.95
 """What metallic begins with, of its kind: at the very ends there is no gradient."""
 SURE = 0.5
 """Of evidence, -1..1."""
-PIXELS = 16_384
-"""Of each photograph, at most, by which errors are compared: of a million in all their mean is known to a thousandth."""
+PIXELS = 4_096
+"""Of each photograph, at most, by which errors are compared: of a quarter of a million in all their mean is known to a few thousandths, and both beginnings are asked at the same ones."""
 PIXELS_A_STEP = 16_384
 """Of all photographs that a step looks at, at most: as many as a draft has. Finer presets, with four times as many, would take as much longer."""
 ALBEDO = (0.05, 0.95)
