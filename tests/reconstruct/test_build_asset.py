@@ -226,9 +226,9 @@ def test_progress_grows_from_nothing_to_all_through_every_stage(build: Build):
     stages = list(dict.fromkeys(p.stage for p in build.progress))
     assert stages == ["read", "fit", "mesh", "surface", "materials", "pack"]
     passes = {p.iteration: p for p in build.progress if p.stage == "surface"}
-    assert max(passes) == passes[12].iterations == 12
+    assert max(passes) == passes[14].iterations == 14
     assert passes[7].message.startswith("pass 1 of 2") and passes[7].message.endswith("trying metal and paint")
-    assert passes[10].message.startswith("pass 2 of 2") and passes[12].message.startswith("relief")
+    assert passes[12].message.startswith("pass 2 of 2") and passes[14].message.startswith("relief")
     last_fit = [p for p in build.progress if p.stage == "fit"][-1]
     assert (last_fit.iteration, last_fit.iterations) == (20, 20) and last_fit.psnr > 5
 

@@ -10,7 +10,7 @@ from drgs.reconstruct.fit.evidence.metal_evidence import ViewSums
 from drgs.reconstruct.fit.fit_loop import FitReport
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings
-from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, as_evidence_says, better_kind, iterations, try_kinds
+from drgs.reconstruct.fit.surface.try_kinds import TriedKinds, as_evidence_says, better_kind, is_believed, iterations, try_kinds
 from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
 from drgs.scene.mesh import TriangleMesh
 from drgs.scene.views import Views
@@ -83,6 +83,20 @@ def test_the_clearly_better_beginning_is_kept_and_of_neither_only_where_light_st
     assert better_kind(0.0, 0.0, False) is better_kind(math.nan, 1.0, False) is None, "nothing was compared, or not to be compared"
 
 
+def test_what_goes_on_clearly_better_as_it_was_is_left_as_it_was() -> None:
+    """Half of the sphere is metal, half is paint, and the fit has found out."""
+    mesh = sphere_of(1.0)
+    mesh = dataclasses.replace(mesh, metallic=(mesh.vertices[:, 0] > 0).float())
+    parameters = believed(mesh, 0.5) | {"metal": 2 * mesh.metallic - 1}
+    for _ in range(2):  # the second time the fit is what the first one came to
+        found = try_kinds(photographs(mesh, turned=False), parameters, mesh.faces, METAL_SETTINGS)
+        assert found is not None
+        before, parameters = parameters, found.parameters
+    assert found.gone_on is not None and not is_believed(min(found.errors), found.gone_on), (found.errors, found.gone_on)
+    assert all(torch.equal(parameters[name], before[name]) for name in before)
+    assert is_believed(1.05, 1.0) and not is_believed(1.15, 1.0) and not is_believed(math.nan, 1.0)
+
+
 def test_what_evidence_is_sure_of_begins_anew_where_it_was_of_the_other_kind_alone() -> None:
     count = 4
     ones = torch.ones(count, 3)
@@ -103,5 +117,5 @@ def test_told_to_stop_it_finds_nothing_and_steps_are_counted_over_both_beginning
     before = {name: value.clone() for name, value in parameters.items()}
     views = photographs(mesh, turned=True)
     assert try_kinds(views, parameters, mesh.faces, settings, told.append, lambda: len(told) == 5) is None
-    assert [r.iteration for r in told] == [1, 2, 3, 4, 5] and {r.iterations for r in told} == {iterations(settings)} == {8}
+    assert [r.iteration for r in told] == [1, 2, 3, 4, 5] and {r.iterations for r in told} == {iterations(settings)} == {12}
     assert all(torch.equal(parameters[name], value) for name, value in before.items())
