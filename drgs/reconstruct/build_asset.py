@@ -44,7 +44,7 @@ from drgs.reconstruct.fit.surfels.fit_gaussians import drawn_object, gaussians_f
 from drgs.reconstruct.fit.surfels.fit_materials import gaussians_from_materials
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import gaussians_from_mesh_fit
 from drgs.reconstruct.fit.surfels.try_light_frames import light_by_trial
-from drgs.reconstruct.fit.view_targets import view_targets
+from drgs.reconstruct.fit.view_targets import whole_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians, points_from_binding
 from drgs.reconstruct.geometry.divide_faces import divided_binding
@@ -460,7 +460,7 @@ def _horizons(mesh: TriangleMesh) -> UInt8[Tensor, "face 8"]:
 def _detailed(built: _Built, fit: SurfaceFit) -> tuple[TriangleMesh, Certainty]:
     """The fitted mesh with the albedo that photographs show at each of its vertices, and between them; how certain it is."""
     views, mesh, parameters = built.views, fit.mesh, fit.state.parameters
-    tracer, targets = build_tracer(mesh), view_targets(views, 1.0, mesh.vertices.device)
+    tracer, targets = build_tracer(mesh), whole_targets(views, mesh.vertices.device)
     sky = None if views.light_from_world is None else seen_sky(tracer)
     ground = None if views.ground is None else ground_light(views.ground, mesh.vertices.device)
     light_of = light_of_views(filter_environment(environment_table(parameters)), parameters["open_share"], mesh.albedo, sky, ground=ground)

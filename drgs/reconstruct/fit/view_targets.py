@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drgs.maths.color import linear_from_srgb, srgb_from_linear
+from drgs.reconstruct.kept_with_views import kept_with_views
 from drgs.scene.camera import Camera, scaled_camera, windowed_camera
 from drgs.scene.views import Views
 
@@ -80,6 +81,12 @@ def view_targets(views: Views, factor: float, device: torch.device) -> list[View
         turn = None if turn is None else turn.to(device)
         targets.append(ViewTarget(small.to(device), premultiplied, photo, alpha, down, across, ceiling, turn))
     return targets
+
+
+@kept_with_views
+def whole_targets(views: Views, device: torch.device) -> list[ViewTarget]:
+    """view_targets at full size, which all fits of the surface and of its materials share."""
+    return view_targets(views, 1.0, device)
 
 
 def windowed(target: ViewTarget) -> ViewTarget:

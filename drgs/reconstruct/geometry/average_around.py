@@ -1,24 +1,34 @@
 """Means over neighbourhoods of a mesh, as a sparse matrix."""
 
-import numpy as np
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
-from scipy.sparse import csr_matrix, diags, identity
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
+from drgs.reconstruct.geometry.symmetric_systems import SymmetricPlaces
 
 
-def averaging_matrix(edges: MeshEdges, count: int, weight: Float[Tensor, "edge"] | None = None) -> csr_matrix:
-    """(count, count) matrix that takes the mean over each vertex and its neighbours.
+@dataclass(frozen=True, eq=False)
+class Averaging:
+    """Takes the mean over each vertex and its neighbours."""
+
+    neighbours: Tensor
+    """(vertex, vertex) sparse: weights of neighbours, float64."""
+    total: Float64[Tensor, "vertex 1"]
+    """Of their weights and the vertex's own, 1."""
+
+
+def averaging_matrix(edges: MeshEdges, count: int, weight: Float[Tensor, "edge"] | None = None) -> Averaging:
+    """
 
     Args:
         weight: of a neighbour at the other end of each edge, against 1 of the vertex itself; None: 1.
     """
-    start, end = edges.vertices.cpu().numpy().T
-    weights = np.tile(np.ones(len(start)) if weight is None else weight.cpu().double().numpy(), 2)
-    adjacency = csr_matrix((weights, (np.concatenate([start, end]), np.concatenate([end, start]))), shape=(count, count)) + identity(count)
-    return diags(1 / np.asarray(adjacency.sum(1)).ravel()) @ adjacency
+    values = torch.ones(len(edges.vertices), device=edges.vertices.device) if weight is None else weight
+    neighbours = SymmetricPlaces.of(edges.vertices, count).filled(values.double())
+    return Averaging(neighbours, 1 + neighbours @ torch.ones(count, 1, dtype=torch.float64, device=values.device))
 
 
 def rings_as_wide_as(width: float, edges: MeshEdges, vertices: Float[Tensor, "vertex 3"]) -> int:
@@ -28,9 +38,9 @@ def rings_as_wide_as(width: float, edges: MeshEdges, vertices: Float[Tensor, "ve
     return max(1, round((width / (0.65 * float((start - end).norm(dim=1).mean()))) ** 2))
 
 
-def averaged(around: csr_matrix, values: Tensor, rings: int) -> Tensor:
+def averaged(around: Averaging, values: Tensor, rings: int) -> Tensor:
     """Values (vertex, k), averaged `rings` times by an averaging_matrix."""
-    result = values.cpu().double().numpy()
+    result = values.to(around.total)
     for _ in range(rings):
-        result = around @ result
-    return torch.from_numpy(result).to(values)
+        result = (result + around.neighbours @ result) / around.total
+    return result.to(values)

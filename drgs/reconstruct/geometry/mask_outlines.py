@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.reconstruct.geometry.closed_outlines import closed_outlines
+from drgs.reconstruct.kept_with_views import kept_with_views
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.render.records import Hits
@@ -68,6 +69,7 @@ def mask_outline(coverage: Tensor) -> MaskOutline | None:
     return MaskOutline(*(torch.from_numpy(np.concatenate(values)).float() for values in together))
 
 
+@kept_with_views
 def mask_outlines(views: Views) -> list[MaskOutline | None]:
     """Of every view."""
     return [mask_outline(mask.float() / 255) for mask in views.coverage]

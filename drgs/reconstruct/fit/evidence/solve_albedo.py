@@ -122,7 +122,7 @@ def solve_albedo(
 
     def slowly(values: Tensor) -> Tensor:
         """(sample, k) values averaged over `rings` neighbourhoods."""
-        return torch.from_numpy(outwards @ averaged(around, at_vertices(values), rings).numpy()).to(values)
+        return torch.from_numpy(outwards @ averaged(around, at_vertices(values), rings).cpu().numpy()).to(values)
 
     def fine(sides: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """(sample, 3) of albedo over its slow part, less 1, by the photographs of these sides; and (sample,) whether they say something."""

@@ -36,7 +36,7 @@ from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurf
 from drgs.reconstruct.fit.surface.prior_terms import prior_terms
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_twice
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
-from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
+from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, whole_targets
 from drgs.reconstruct.geometry.average_around import averaged
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings
 from drgs.render.integrate.environment_table import EnvironmentTable, build_environment_table
@@ -150,7 +150,7 @@ class _Steps:
 
     def __init__(self, views: Views, faces: Tensor, state: FitState, settings: MeshMaterialSettings) -> None:
         self.state, self.settings, self.faces = state, settings, faces
-        self.targets = view_targets(views, 1.0, faces.device)
+        self.targets = whole_targets(views, faces.device)
         self.solid = [(target.mask.flatten() > SOLID).nonzero().squeeze(1) for target in self.targets]
         self.surface = MovingSurface(views, faces, state)
 

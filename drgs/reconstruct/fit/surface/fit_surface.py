@@ -31,7 +31,7 @@ from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurf
 from drgs.reconstruct.fit.surface.prior_terms import prior_terms
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
-from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, view_targets
+from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, whole_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.gaussians import Gaussians
@@ -173,7 +173,7 @@ class _Steps:
         self, views: Views, faces: Tensor, state: FitState, settings: SurfaceSettings, same_place: MovingSurface | None = None
     ) -> None:
         self.state, self.settings, self.faces = state, settings, faces
-        self.targets = view_targets(views, 1.0, faces.device)
+        self.targets = whole_targets(views, faces.device)
         # A surface that stays has divided faces, whose many vertices would take seconds to trace finely, or is only compared.
         self.surface = MovingSurface(views, faces, state, same_place, COARSE if settings.still else FINE)
         self.displaced = DisplacedSurface(self.surface, state, settings.moves.box) if settings.displaces else None

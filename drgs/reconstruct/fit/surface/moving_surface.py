@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
-from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
@@ -25,7 +24,7 @@ from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split
 from drgs.reconstruct.fit.light.turned_light import COARSE, Fineness, SeenSky, light_of_views, seen_sky
 from drgs.reconstruct.fit.surfel_parameters import logits_of_shares
 from drgs.reconstruct.fit.view_targets import ViewTarget
-from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
+from drgs.reconstruct.geometry.average_around import Averaging, averaged, averaging_matrix
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import OutlineRays, mask_outlines, outline_rays, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -80,7 +79,7 @@ class MovingSurface:
         self._fineness = fineness
         self.ground = None if views.ground is None else ground_light(views.ground, faces.device)
         self._seen_sky: SeenSky | None = None
-        self._around: csr_matrix | None = None
+        self._around: Averaging | None = None
         if same_place is None:
             self.edges, self.tracer = mesh_edges(faces), self._tracer()
         else:
@@ -171,7 +170,7 @@ class MovingSurface:
         than that within two edges, but for places that face elsewhere: they count little."""
         return averaged(self.around(), share, SHARED_RINGS)
 
-    def around(self) -> csr_matrix:
+    def around(self) -> Averaging:
         """averaging_matrix over neighbours that face the same way, of the surface as it lies now; made anew after a move."""
         if self._around is None:
             normals = vertex_normals(self._state.parameters["vertices"], self.faces)

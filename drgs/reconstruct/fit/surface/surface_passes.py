@@ -25,7 +25,7 @@ from drgs.reconstruct.fit.surface.try_depths import TrialSettings, try_depths
 from drgs.reconstruct.fit.surface.try_kinds import iterations as iterations_of_kinds
 from drgs.reconstruct.fit.surface.try_kinds import try_kinds
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
-from drgs.reconstruct.fit.view_targets import view_targets
+from drgs.reconstruct.fit.view_targets import whole_targets
 from drgs.reconstruct.geometry.divide_faces import DivisionSettings, divided_faces, divisions, undivided_faces
 from drgs.reconstruct.geometry.extract_mesh import MeshSettings
 from drgs.reconstruct.geometry.mask_outlines import mask_outlines
@@ -203,7 +203,7 @@ def move_to_tried_depths(
 @torch.no_grad()
 def move_cameras(fit: SurfaceFit, views: Views, settings: PassSettings) -> Views:
     """The views from where the photographs fit the surface as it is; the very views where their cameras are right."""
-    surface, targets = MovingSurface(views, fit.faces, fit.state), view_targets(views, 1.0, fit.faces.device)
+    surface, targets = MovingSurface(views, fit.faces, fit.state), whole_targets(views, fit.faces.device)
     surface.tracer = surface.tracer.with_materials(fit.mesh)
     parameters = fit.state.parameters
     light_of = surface.light_of(filter_environment(environment_table(parameters)))

@@ -34,7 +34,7 @@ from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from
 from drgs.reconstruct.fit.surface.prior_terms import prior_terms
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_places, shade_places, steep_enough
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer, rate_of_group
-from drgs.reconstruct.fit.view_targets import drawn_view, view_targets
+from drgs.reconstruct.fit.view_targets import drawn_view, whole_targets
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
 from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix, rings_as_wide_as
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
@@ -273,7 +273,7 @@ class Trials:
         self.edges, self.stopped = mesh_edges(faces), False
         self._views, self._faces, self._settings, self._seed = views, faces, settings, seed
         self._report, self._should_stop, self._done = report, should_stop, 0
-        self._targets = view_targets(views, 1.0, faces.device)
+        self._targets = whole_targets(views, faces.device)
         generator = torch.Generator().manual_seed(seed)
         self._solid: list[Tensor] = []
         self._bare: list[Tensor] = []

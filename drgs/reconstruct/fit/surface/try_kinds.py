@@ -30,7 +30,7 @@ from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings
 from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places
 from drgs.reconstruct.fit.surfel_parameters import leaves, logits_of_shares, make_optimizer
-from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
+from drgs.reconstruct.fit.view_targets import ViewTarget, whole_targets
 from drgs.scene.views import Views
 
 KINDS = (1.0, 0.0)
@@ -51,6 +51,8 @@ PIXELS = 4_096
 """Of each photograph, at most, by which errors are compared: of a quarter of a million in all their mean is known to a few thousandths, and both beginnings are asked at the same ones."""
 PIXELS_A_STEP = 16_384
 """Of all photographs that a step looks at, at most: as many as a draft has. Finer presets, with four times as many, would take as much longer."""
+MOST_STEPS = 25
+"""Until evidence is asked, and after: what a draft has, too."""
 ALBEDO = (0.05, 0.95)
 """That a place may begin with."""
 
@@ -74,15 +76,17 @@ def try_kinds(
     settings: SurfaceSettings,
     report: Callable[[FitReport], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    most_steps: int = MOST_STEPS,
 ) -> TriedKinds | None:
     """The fit gone on with from the beginning that explains the photographs better, or as it was; None: should_stop(), asked before each step, said so.
 
     Args:
-        parameters: of a surface's fit. settings: of a pass; each beginning has as many steps, half of them as it began. report: is told of the steps of both.
+        parameters: of a surface's fit. settings: of a pass; each beginning has as many steps as it, half of them as it began. report: is told of all of them.
+        most_steps: in each half.
     """
     few = min(settings.pixels_a_step, PIXELS_A_STEP)
-    own = replace(settings, rounds=1, steps_a_round=_half(settings), still=True, fall_from=1.0, pixels_a_step=few)
-    targets = view_targets(views, 1.0, faces.device)
+    own = replace(settings, rounds=1, steps_a_round=_half(settings, most_steps), still=True, fall_from=1.0, pixels_a_step=few)
+    targets = whole_targets(views, faces.device)
     given = {name: value.detach() for name, value in parameters.items()}
     here = MovingSurface(views, faces, _state(given, own))  # nothing moves
     sums = here.sums(targets)
@@ -95,7 +99,7 @@ def try_kinds(
 
         def tell(r: FitReport) -> None:
             if report is not None:
-                report(replace(r, iteration=before + r.iteration, iterations=iterations(settings)))
+                report(replace(r, iteration=before + r.iteration, iterations=iterations(settings, most_steps)))
 
         fit_surface(views, mesh_from_surface_fit(state, faces), state, own, tell, should_stop, here)
         return state.iteration >= own.iterations
@@ -139,14 +143,14 @@ def is_believed(error: float, gone_on: float) -> bool:
     return error <= BEHIND * gone_on
 
 
-def iterations(settings: SurfaceSettings) -> int:
+def iterations(settings: SurfaceSettings, most_steps: int = MOST_STEPS) -> int:
     """Steps of both beginnings and of the fit as it was together, at most."""
-    return 2 * (len(KINDS) + 1) * _half(settings)
+    return 2 * (len(KINDS) + 1) * _half(settings, most_steps)
 
 
-def _half(settings: SurfaceSettings) -> int:
+def _half(settings: SurfaceSettings, most_steps: int) -> int:
     """Steps until evidence is asked, and after."""
-    return max(1, settings.iterations // 2)
+    return max(1, min(settings.iterations // 2, most_steps))
 
 
 def begun_as(kind: float, sums: ViewSums, parameters: dict[str, Tensor]) -> dict[str, Tensor]:

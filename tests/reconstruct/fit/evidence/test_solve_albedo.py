@@ -8,7 +8,7 @@ import torch
 from drgs.reconstruct.fit.evidence.solve_albedo import DetailSettings, SolvedAlbedo, parts_for, solve_albedo
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.view_targets import ViewTarget
-from drgs.reconstruct.geometry.average_around import averaging_matrix
+from drgs.reconstruct.geometry.average_around import averaged, averaging_matrix
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.scene.albedo_detail import MOST_PARTS, detailed_albedo, sample_places
@@ -25,11 +25,9 @@ def striped(metallic: float) -> tuple[TriangleMesh, TriangleMesh]:
     mesh = sphere_mesh(subdivisions=4, albedo=0.5, roughness=0.4)
     azimuth = torch.atan2(mesh.vertices[:, 1], mesh.vertices[:, 0])
     albedo = (0.5 + 0.25 * torch.sign(torch.sin(10 * azimuth)))[:, None].repeat(1, 3)
-    around, blurred = averaging_matrix(mesh_edges(mesh.faces), len(albedo)), albedo.double().numpy()
-    for _ in range(3 * RINGS):
-        blurred = around @ blurred
+    blurred = averaged(averaging_matrix(mesh_edges(mesh.faces), len(albedo)), albedo, 3 * RINGS)
     mesh = dataclasses.replace(mesh, albedo=albedo, metallic=torch.full_like(mesh.metallic, metallic))
-    return mesh, dataclasses.replace(mesh, albedo=0.75 * torch.from_numpy(blurred).float())
+    return mesh, dataclasses.replace(mesh, albedo=0.75 * blurred)
 
 
 def solved(mesh: TriangleMesh, targets: list[ViewTarget], tables: torch.Tensor, parts: int = 1, rings: int = RINGS) -> SolvedAlbedo:

@@ -59,7 +59,7 @@ def believed(mesh: TriangleMesh, metallic: float) -> dict[str, torch.Tensor]:
 def tried(metallic: float, belief: float, turned: bool) -> TriedKinds:
     mesh = sphere_of(metallic)
     settings = METAL_SETTINGS if metallic == 1 else SETTINGS
-    found = try_kinds(photographs(mesh, turned), believed(mesh, belief), mesh.faces, settings)
+    found = try_kinds(photographs(mesh, turned), believed(mesh, belief), mesh.faces, settings, most_steps=80)
     assert found is not None
     return found
 
