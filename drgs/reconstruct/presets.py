@@ -94,10 +94,10 @@ PRESETS = {
     "fast": Preset(
         15_000,
         512,
-        FitSettings(iterations=660, densify=DensifySettings(budget=30_000)),
+        FitSettings(iterations=600, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70, pixels_a_step=32_768), cameras_after=(1, 2, 3)),
-        replace(FINE_MATERIALS, iterations=360, rounds=3),
+        replace(FINE_MATERIALS, iterations=330, rounds=3),
         DetailSettings(),
         mesh_surfels=MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
