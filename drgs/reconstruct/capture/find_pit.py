@@ -9,7 +9,7 @@ In: a lid of the hull and rays through it. Out: the depth of the object below it
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -59,6 +59,10 @@ class PitSettings:
     """Share of the lid's difference that may be left without the third that differ most: many heights explain more than one wall and one depth."""
     least: int = 16
     """Columns that hang together."""
+    unlike: float = 0.055
+    """Mean difference of the rays that enter around a column, from which it is left full."""
+    around: int = 5
+    """Columns, each way, over which that is averaged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +78,12 @@ class Pit:
     """Height of the hull."""
     depth: Float[ndarray, "u v"]
     """0: nothing is empty there."""
+    alike: Bool[ndarray, "u v"]
+    """Where that deserves belief by itself, and not only because the rest of the pit does."""
+
+    def where_alike(self) -> "Pit":
+        """Less deep nowhere, and full where views do not agree."""
+        return replace(self, depth=np.where(self.alike, self.depth, 0.0))
 
     def holds(self, places: Float[ndarray, "x y z 3"], above: float) -> Bool[ndarray, "x y z"]:
         """What is empty, and up to `above` over the lid."""
@@ -114,7 +124,9 @@ def find_pit(
     patch, count = ndimage.label(depth >= settings.shallow * radius)
     large = np.flatnonzero(np.bincount(patch.ravel(), minlength=count + 1) >= settings.least)
     depth = np.where(np.isin(patch, large[large > 0]), depth, 0.0)
-    return Pit(columns.axes, columns.low, columns.width, columns.lid, depth) if bool((depth > 0).any()) else None
+    if not bool((depth > 0).any()):
+        return None
+    return Pit(columns.axes, columns.low, columns.width, columns.lid, depth, search.alike(depth))
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,12 +311,29 @@ class _Search:
 
     def left(self, depth: Float[ndarray, "u v"]) -> float:
         """Mean difference of rays from what other views see where they end."""
+        difference, known = self._differences(depth)
+        return float(difference[known].mean()) if bool(known.any()) else MOST_DIFFERENCE
+
+    def alike(self, depth: Float[ndarray, "u v"]) -> Bool[ndarray, "u v"]:
+        """Columns at which views agree about what is below; asked twice, for what is left full hides what was seen across it."""
+        alike = depth > 0
+        place = self.rays.at(self.rays.enters) / self.columns.width
+        column = tuple(place[:, axis].long().clamp(0, size - 1).cpu().numpy() for axis, size in enumerate(depth.shape))
+        for _ in range(2):
+            difference, known = (values.cpu().double().numpy() for values in self._differences(depth * alike))
+            total, count = np.zeros(depth.shape), np.zeros(depth.shape)
+            np.add.at(total, column, difference * known)
+            np.add.at(count, column, known)
+            total, count = (ndimage.uniform_filter(values, self.settings.around) for values in (total, count))
+            alike &= total <= self.settings.unlike * count
+        return ndimage.median_filter(alike, 3)
+
+    def _differences(self, depth: Float[ndarray, "u v"]) -> tuple[Float[Tensor, "ray"], Bool[Tensor, "ray"]]:
+        """Of rays from what other views see where they end, and whether anything is seen there."""
         rays = self.rays
         heights = np.where(self.columns.inside, self.columns.lid - np.minimum(depth, self.columns.most), FAR)
         distance = rays.ends(torch.from_numpy(heights).to(rays.origin), self.columns.width)
         ended = distance >= 0
         mean, seen = seen_from_elsewhere(rays.at(distance), ended, rays.colors, rays.view, self.cell)
         difference = (rays.colors - mean).abs().mean(1).clamp(max=MOST_DIFFERENCE)
-        difference = torch.where(ended, difference, torch.full_like(difference, MOST_DIFFERENCE))
-        known = seen | ~ended
-        return float(difference[known].mean()) if bool(known.any()) else MOST_DIFFERENCE
+        return torch.where(ended, difference, torch.full_like(difference, MOST_DIFFERENCE)), seen | ~ended

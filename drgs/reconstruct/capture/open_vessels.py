@@ -24,7 +24,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from drgs.reconstruct.capture.find_pit import PitSettings, find_pit
+from drgs.reconstruct.capture.find_pit import Pit, PitSettings, find_pit
 from drgs.reconstruct.capture.hull_rays import (
     TRIMMED,
     SolidRays,
@@ -235,13 +235,19 @@ class _Search:
         pit = find_pit(lid.vertices, lid.direction, looks, self.outer, self.radius, cell, settings.pits)
         if pit is None:
             return None
+        vessel = self._emptied(pit, looks)
+        whole, brightness = _difference(looks, self.outer, cell), float(looks.colors.mean())
+        if not self._believed(vessel.left, whole, brightness, settings.pits.better):
+            return None
+        return self._emptied(pit.where_alike(), looks) if bool(pit.alike.any()) else None
+
+    def _emptied(self, pit: Pit, looks: SolidRays) -> _Vessel:
         holds = pit.holds(self.places, 2 * self.cell)
         empty = self.cell * np.clip(
             ndimage.distance_transform_edt(holds) - ndimage.distance_transform_edt(~holds), -EXACT_NODES, EXACT_NODES
         )
-        vessel = _Vessel(_difference(looks, self._tracer(np.maximum(self._hull_field(), empty)), cell), empty)
-        whole, brightness = _difference(looks, self.outer, cell), float(looks.colors.mean())
-        return vessel if self._believed(vessel.left, whole, brightness, settings.pits.better) else None
+        tracer = self._tracer(np.maximum(self._hull_field(), empty))
+        return _Vessel(_difference(looks, tracer, self.settings.same_place * self.radius), empty)
 
     def _believed(self, left: _Difference, whole: _Difference, brightness: float, share: float) -> bool:
         better = left.trimmed <= share * whole.trimmed and left.mean <= self.settings.better * whole.mean

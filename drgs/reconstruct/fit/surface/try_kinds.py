@@ -65,7 +65,7 @@ class TriedKinds:
     """Of the surface, from the better one; as they were given, where neither is."""
     errors: tuple[float, float]
     """Mean squared error of all photographs (display values): begun as metal, begun as paint."""
-    gone_on: float | None
+    gone_on: float | None = None
     """That of the fit as it was after as many steps; None where it was not asked."""
 
 

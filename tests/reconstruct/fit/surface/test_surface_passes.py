@@ -83,7 +83,8 @@ def test_a_sphere_that_is_too_small_is_as_large_as_its_photographs_after_two_pas
     assert (fit.index, fit.state.iteration) == (0, 2)
     assert fit_surface_in_passes(views, fit, settings, SPHERE_RADIUS, lambda r: told.append(r.iteration))
     assert abs(float((fit.mesh.vertices - CENTER).norm(dim=1).mean()) / SPHERE_RADIUS - 1) < 0.01
-    assert not torch.equal(fit.faces, start.faces) and told == list(range(3, 25))
+    assert not torch.equal(fit.faces, start.faces) and told == sorted(told)
+    assert set(told) | set(range(19, 25)) == set(range(3, 31)), "steps by which the fit as it was is compared may not be asked for"
 
 
 @pytest.mark.slow
@@ -151,7 +152,7 @@ def test_what_trials_moved_is_at_home_there_and_stopped_trials_are_done_again(tm
     assert asked[0] == asked[1]
     kinds = iterations(settings_of_pass(settings, 1))
     total = 4 + kinds + settings.trials.iterations
-    assert told == [(k, total) for k in (*range(3, 4 + kinds), total - 1, total)]
+    assert told[:4] == [(k, total) for k in range(3, 7)] and told[-3:] == [(k, total) for k in (3 + kinds, total - 1, total)]
     assert float(homes[0][0].norm()) == 0 and float(homes[0][1:].norm(dim=1).min()) > 0
 
 
@@ -229,7 +230,7 @@ def test_both_kinds_are_tried_after_the_first_pass_whether_light_turns_or_not(tm
     assert (fit.index, fit.state.iteration, kept) == (0, 2, [])
     assert fit_surface_in_passes(turned, fit, settings, SPHERE_RADIUS, lambda r: told.append((r.iteration, r.iterations)))
     assert asked == [asked[0]] * 2 and kept == [pytest.approx(0.7)]
-    assert told == [(3, 8), (7, 8), (8, 8)]
+    assert told == [(3, 10), (9, 10), (10, 10)]
     assert fit_surface_in_passes(views, started(), settings, SPHERE_RADIUS) and asked == [asked[0]] * 3
     assert fit_surface_in_passes(views, started(), replace(settings, passes=1), SPHERE_RADIUS) and len(asked) == 3, "nothing follows it"
 
