@@ -26,16 +26,21 @@ SETTINGS = VesselSettings(nodes=72, bounded=2.0)
 """Whatever runs around a lid, it is no vessel's."""
 
 
-def tray() -> trimesh.Trimesh:
-    def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
-        made = trimesh.creation.box(np.subtract(high, low))
-        made.apply_translation(np.add(low, high) / 2)
-        return made
+def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
+    made = trimesh.creation.box(np.subtract(high, low))
+    made.apply_translation(np.add(low, high) / 2)
+    return made
 
+
+def tray() -> trimesh.Trimesh:
+    return trimesh.util.concatenate([tray_without_block(), block((0.12, -0.12, -HALF[2]), (0.32, 0.12, 0.1))])
+
+
+def tray_without_block() -> trimesh.Trimesh:
     x, y, z = HALF
     walls = [block((-x, -y, -z), (-ALONG, y, z)), block((ALONG, -y, -z), (x, y, z))]
     walls += [block((-x, -y, -z), (x, -ACROSS, z)), block((-x, ACROSS, -z), (x, y, z))]
-    return trimesh.util.concatenate([*walls, block((-x, -y, -z), (x, y, FLOOR_Z)), block((0.12, -0.12, -z), (0.32, 0.12, 0.1))])
+    return trimesh.util.concatenate([*walls, block((-x, -y, -z), (x, y, FLOOR_Z))])
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +128,39 @@ def test_rays_meet_columns_where_small_steps_find_them() -> None:
 def test_a_pit_holds_what_is_below_its_lid_and_above_its_floor() -> None:
     depth = np.zeros((4, 3))
     depth[1, 1], depth[2, 1] = 0.5, 0.2
-    pit = Pit(np.eye(3), np.array([-0.2, -0.15]), 0.1, np.full((4, 3), 1.0), depth)
+    pit = Pit(np.eye(3), np.array([-0.2, -0.15]), 0.1, np.full((4, 3), 1.0), depth, depth > 0)
     places = np.array(
         [[-0.05, 0, 0.6], [-0.05, 0, 0.4], [0.05, 0, 0.9], [0.05, 0, 0.7], [0.05, 0, 1.05], [0.05, 0, 1.3], [0.15, 0, 0.95], [9, 9, 0.9]]
     )
     assert pit.holds(places[:, None, None], 0.1).ravel().tolist() == [True, False, True, False, True, False, False, False]
+
+
+def test_a_pit_is_full_where_views_do_not_agree() -> None:
+    depth = np.full((2, 2), 0.5)
+    pit = Pit(np.eye(3), np.zeros(2), 1.0, np.ones((2, 2)), depth, np.array([[True, False], [False, True]]))
+    assert pit.where_alike().depth.tolist() == [[0.5, 0.0], [0.0, 0.5]]
+
+
+@pytest.mark.slow
+def test_a_mirror_that_stands_in_a_tray_is_not_dug_out() -> None:
+    """A pit explains what it mirrors better than its hull does, and the rest of the tray is one."""
+    ball = trimesh.creation.icosphere(3, radius=0.2)
+    ball.apply_translation([0.0, 0.0, 0.05])
+    whole = trimesh.util.concatenate([tray_without_block(), ball])
+    object_ = tracer_of(whole)
+    paint = plain(object_)
+
+    def shade(place: torch.Tensor, normal: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+        on_ball = (place - torch.tensor([0.0, 0.0, 0.05])).norm(dim=1, keepdim=True) < 0.21
+        return torch.where(on_ball, satin(place, normal, direction), paint(place, normal, direction))
+
+    views = photographed(object_, shade, 32, 96)
+    hull = hull_of(views)
+    dug, opened = (
+        open_vessels(views, hull, replace(SETTINGS, pits=PitSettings(unlike=unlike)), CPU) for unlike in (9.0, PitSettings().unlike)
+    )
+    assert dug is not hull and opened is not hull
+    tops = [height_at(surface, 0.0, 0.0) for surface in (dug, opened)]
+    assert tops[0] < 0.22 and abs(tops[1] - 0.25) < 0.01, tops
+    floor = [height_at(opened, x, y) for x in (-0.32, 0.32) for y in (-0.2, 0.2)]
+    assert float(np.median(floor)) < 0.08 and min(height_at(hull, x, y) for x in (-0.32, 0.32) for y in (-0.2, 0.2)) > 0.14, floor
