@@ -3,7 +3,8 @@
 Seen along the lid's direction the object is a height a column, at most the hull's. Whole floors with walls are tried first, then blocks of columns at other
 depths, large ones before small ones; what is kept leaves the least difference between the colour of a ray and what other views see where it ends, the mean
 over all rays through the lid. A convex mirror shows things behind itself, as pits do, and such heights explain it well. But a pit has a rim: all around, most
-of the lid is where the hull is. What mirrors show has none, it lies deep up to the lid's border, wherever that is.
+of the lid is where the hull is. What mirrors show has none, it lies deep up to the lid's border, wherever that is. And a mirror that stands in a pit is
+explained better by what it shows than by itself, but not well: columns at which views still differ by as much as they never do on paint are left full.
 
 In: a lid of the hull and rays through it. Out: the depth of the object below it, a column.
 """
@@ -60,7 +61,8 @@ class PitSettings:
     least: int = 16
     """Columns that hang together."""
     unlike: float = 0.055
-    """Mean difference of the rays that enter around a column, from which it is left full."""
+    """Mean difference (display values) of the rays that enter around a column, from which it is left full. Columns that are rightly empty have 0.03 to 0.04 in the
+    median and 0.06 to 0.08 at most in nine of ten (things on a plate, a plant's pot), those dug into metal 0.07 to 0.08 and 0.05 at least in nine of ten."""
     around: int = 5
     """Columns, each way, over which that is averaged."""
 
