@@ -62,6 +62,7 @@ OTHERS = {
     ("drgs/exchange/gltf_accessors.py", 1e30): "a bound on the numbers of a file",
     ("drgs/reconstruct/capture/masks_by_strokes/masks_by_strokes.py", 0.04): "a share of a picture's longer side",
     ("drgs/reconstruct/capture/find_pit.py", 0.04): "a depth below which a place is rim",
+    ("drgs/reconstruct/capture/find_pit.py", 0.055): "a difference of colours",
     ("drgs/reconstruct/capture/sharpen_masks.py", 0.99): "a share of pixels",
     ("drgs/reconstruct/fit/evidence/light_from_paint.py", 0.99): "a share of places",
     ("drgs/reconstruct/capture/hull_rays.py", 0.99): "the coverage of a pixel that the object fills",
