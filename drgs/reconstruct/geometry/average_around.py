@@ -12,7 +12,7 @@ from drgs.reconstruct.geometry.symmetric_systems import SymmetricPlaces
 
 @dataclass(frozen=True, eq=False)
 class Averaging:
-    """Takes the mean over each vertex and its neighbours."""
+    """Takes the mean over each vertex and its neighbours; on the CPU."""
 
     neighbours: Tensor
     """(vertex, vertex) sparse: weights of neighbours, float64."""
@@ -26,9 +26,9 @@ def averaging_matrix(edges: MeshEdges, count: int, weight: Float[Tensor, "edge"]
     Args:
         weight: of a neighbour at the other end of each edge, against 1 of the vertex itself; None: 1.
     """
-    values = torch.ones(len(edges.vertices), device=edges.vertices.device) if weight is None else weight
+    values = torch.ones(len(edges.vertices)) if weight is None else weight.cpu()
     neighbours = SymmetricPlaces.of(edges.vertices, count).filled(values.double())
-    return Averaging(neighbours, 1 + neighbours @ torch.ones(count, 1, dtype=torch.float64, device=values.device))
+    return Averaging(neighbours, 1 + neighbours @ torch.ones(count, 1, dtype=torch.float64))
 
 
 def rings_as_wide_as(width: float, edges: MeshEdges, vertices: Float[Tensor, "vertex 3"]) -> int:
@@ -40,7 +40,7 @@ def rings_as_wide_as(width: float, edges: MeshEdges, vertices: Float[Tensor, "ve
 
 def averaged(around: Averaging, values: Tensor, rings: int) -> Tensor:
     """Values (vertex, k), averaged `rings` times by an averaging_matrix."""
-    result = values.to(around.total)
+    result = values.cpu().double()
     for _ in range(rings):
         result = (result + around.neighbours @ result) / around.total
     return result.to(values)

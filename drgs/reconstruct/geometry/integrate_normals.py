@@ -94,22 +94,22 @@ def integrate_normals(
     by_corners = outlines.weights * (outlines.gradient[:, None] * direction[outlines.corners]).sum(-1)
 
     count, edge2 = len(vertices), float(length.mean()) ** 2
-    held, pull = torch.full((count,), settings.anchor / edge2).to(by_start).double(), torch.zeros(count).to(by_start).double()
+    held, pull = torch.full((count,), settings.anchor / edge2, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
     reach = settings.longest_move * _mean_of_edges(length, edges, count)
     for places, strength in ((homes, settings.home), (texture, settings.texture)):
         if places is not None:
-            hold = strength / edge2 * places.weight.double()
+            hold = strength / edge2 * _there(places.weight)
             away = (places.towards * direction).sum(1)
             if places is texture:
                 away = torch.maximum(torch.minimum(away, reach), -reach)
-            held, pull = held + hold, pull + hold * away.double()
-    even = settings.even / length.double() ** 2
-    for corner in (start, end):
+            held, pull = held + hold, pull + hold * _there(away)
+    even = settings.even / _there(length) ** 2
+    for corner in edges.vertices.cpu().unbind(1):
         held.index_add_(0, corner, even)
-    tilts = _Residuals(edges.vertices, torch.stack([by_start, by_end], 1).double(), tilt.double())
-    leaps = _Residuals(outlines.corners, by_corners.double(), outlines.distance.double())
+    tilts = _Residuals(edges.vertices.cpu(), _there(torch.stack([by_start, by_end], 1)), _there(tilt))
+    leaps = _Residuals(outlines.corners.cpu(), _there(by_corners), _there(outlines.distance))
     pattern = SymmetricPlaces.of(torch.cat([tilts.pairs, leaps.pairs]), count)
-    outline_length = settings.outline_weight * outlines.length.double()
+    outline_length = settings.outline_weight * _there(outlines.length)
     moved = torch.zeros_like(held)
     for _ in range(settings.reweightings):
         diagonal, right_side, beside = held.clone(), pull.clone(), []
@@ -199,3 +199,8 @@ def _mean_of_neighbours(values: Tensor, edges: MeshEdges) -> Tensor:
         total.index_add_(0, here, values[there])
         number.index_add_(0, here, torch.ones_like(values[there]))
     return total / number.clamp(min=1)
+
+
+def _there(values: Tensor) -> Float64[Tensor, "*shape"]:
+    """Where systems are solved."""
+    return values.detach().cpu().double()

@@ -4,7 +4,7 @@ Where weights change from one solve to the next, as in reweighted least squares,
 unknown divided by its diagonal, begin at the solve before. What holds each vertex a little to its place keeps their number to a few hundred, of
 a millisecond each for 120 000 unknowns, where factors take a second. Source: Saad 2003, Alg. 9.1 (docs/sources.md: saad2003).
 
-In: pairs of unknowns, values for them. Out: solutions.
+In: pairs of unknowns, values for them. Out: solutions. All of it is on the CPU.
 """
 
 import warnings
@@ -49,9 +49,10 @@ class SymmetricPlaces:
         Args:
             pairs: of two different unknowns, some perhaps more than once. count: of unknowns.
         """
-        row, column = torch.cat([pairs, pairs.flip(1)]).long().unbind(1)
+        pairs = pairs.cpu().long()
+        row, column = torch.cat([pairs, pairs.flip(1)]).unbind(1)
         places, entry = torch.unique(row * count + column, return_inverse=True)
-        before = torch.zeros(count + 1, dtype=torch.long, device=pairs.device)
+        before = torch.zeros(count + 1, dtype=torch.long)
         torch.cumsum(torch.bincount(places // count, minlength=count), 0, out=before[1:])
         return cls(before.int(), (places % count).int(), entry)
 
@@ -97,6 +98,6 @@ def solved(
 
 
 def _solved_by_factors(beside: Tensor, diagonal: Tensor, right_side: Tensor) -> Tensor:
-    parts = (part.cpu().numpy() for part in (beside.values(), beside.col_indices(), beside.crow_indices()))
-    matrix = csr_matrix(tuple(parts), shape=tuple(beside.shape)) + diags(diagonal.cpu().numpy())
-    return torch.from_numpy(factored(matrix.tocsc()).solve(right_side.cpu().numpy())).to(right_side)
+    parts = (part.numpy() for part in (beside.values(), beside.col_indices(), beside.crow_indices()))
+    matrix = csr_matrix(tuple(parts), shape=tuple(beside.shape)) + diags(diagonal.numpy())
+    return torch.from_numpy(factored(matrix.tocsc()).solve(right_side.numpy()))
