@@ -235,19 +235,18 @@ class _Search:
         pit = find_pit(lid.vertices, lid.direction, looks, self.outer, self.radius, cell, settings.pits)
         if pit is None:
             return None
-        vessel = self._emptied(pit, looks)
+        left = _difference(looks, self._tracer(np.maximum(self._hull_field(), self._empty(pit))), cell)
         whole, brightness = _difference(looks, self.outer, cell), float(looks.colors.mean())
-        if not self._believed(vessel.left, whole, brightness, settings.pits.better):
+        if not bool(pit.alike.any()) or not self._believed(left, whole, brightness, settings.pits.better):
             return None
-        return self._emptied(pit.where_alike(), looks) if bool(pit.alike.any()) else None
+        return _Vessel(left, self._empty(pit.where_alike()))
 
-    def _emptied(self, pit: Pit, looks: SolidRays) -> _Vessel:
+    def _empty(self, pit: Pit) -> Float[ndarray, "x y z"]:
+        """Positive in the pit."""
         holds = pit.holds(self.places, 2 * self.cell)
-        empty = self.cell * np.clip(
+        return self.cell * np.clip(
             ndimage.distance_transform_edt(holds) - ndimage.distance_transform_edt(~holds), -EXACT_NODES, EXACT_NODES
         )
-        tracer = self._tracer(np.maximum(self._hull_field(), empty))
-        return _Vessel(_difference(looks, tracer, self.settings.same_place * self.radius), empty)
 
     def _believed(self, left: _Difference, whole: _Difference, brightness: float, share: float) -> bool:
         better = left.trimmed <= share * whole.trimmed and left.mean <= self.settings.better * whole.mean

@@ -21,7 +21,7 @@ class Averaging:
 
 
 def averaging_matrix(edges: MeshEdges, count: int, weight: Float[Tensor, "edge"] | None = None) -> Averaging:
-    """
+    """Of a mesh's vertices.
 
     Args:
         weight: of a neighbour at the other end of each edge, against 1 of the vertex itself; None: 1.

@@ -98,18 +98,18 @@ def integrate_normals(
     reach = settings.longest_move * _mean_of_edges(length, edges, count)
     for places, strength in ((homes, settings.home), (texture, settings.texture)):
         if places is not None:
-            hold = strength / edge2 * _there(places.weight)
+            hold = strength / edge2 * _on_cpu(places.weight)
             away = (places.towards * direction).sum(1)
             if places is texture:
                 away = torch.maximum(torch.minimum(away, reach), -reach)
-            held, pull = held + hold, pull + hold * _there(away)
-    even = settings.even / _there(length) ** 2
+            held, pull = held + hold, pull + hold * _on_cpu(away)
+    even = settings.even / _on_cpu(length) ** 2
     for corner in edges.vertices.cpu().unbind(1):
         held.index_add_(0, corner, even)
-    tilts = _Residuals(edges.vertices.cpu(), _there(torch.stack([by_start, by_end], 1)), _there(tilt))
-    leaps = _Residuals(outlines.corners.cpu(), _there(by_corners), _there(outlines.distance))
+    tilts = _Residuals(edges.vertices.cpu(), _on_cpu(torch.stack([by_start, by_end], 1)), _on_cpu(tilt))
+    leaps = _Residuals(outlines.corners.cpu(), _on_cpu(by_corners), _on_cpu(outlines.distance))
     pattern = SymmetricPlaces.of(torch.cat([tilts.pairs, leaps.pairs]), count)
-    outline_length = settings.outline_weight * _there(outlines.length)
+    outline_length = settings.outline_weight * _on_cpu(outlines.length)
     moved = torch.zeros_like(held)
     for _ in range(settings.reweightings):
         diagonal, right_side, beside = held.clone(), pull.clone(), []
@@ -201,6 +201,6 @@ def _mean_of_neighbours(values: Tensor, edges: MeshEdges) -> Tensor:
     return total / number.clamp(min=1)
 
 
-def _there(values: Tensor) -> Float64[Tensor, "*shape"]:
-    """Where systems are solved."""
+def _on_cpu(values: Tensor) -> Float64[Tensor, "*shape"]:
+    """Where systems are solved, and as exactly."""
     return values.detach().cpu().double()
