@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import UInt8
@@ -16,18 +16,16 @@ from torch import Tensor
 
 from drgs.brief_waits import brief_waits_where_crowded
 from drgs.exchange.photographs import encode_photographs
-from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
+from drgs.reconstruct.build_settings import BuildSettings, check_settings
+from drgs.reconstruct.capture.build_box import whole_or_within
 from drgs.reconstruct.capture.cut_to_box import views_of
-from drgs.reconstruct.capture.exposures import with_gains_of_fit, with_gains_of_points
+from drgs.reconstruct.capture.exposures import with_gains_of_fit
 from drgs.reconstruct.capture.find_masks import masked_by_surfels
 from drgs.reconstruct.capture.initial_points import InitialPoints
 from drgs.reconstruct.capture.load_views.capture import Capture
 from drgs.reconstruct.capture.look_nearer import look_nearer, object_windows
-from drgs.reconstruct.capture.masks_by_strokes import masks_by_strokes
-from drgs.reconstruct.capture.open_capture import open_capture
 from drgs.reconstruct.capture.sharpen_masks import sharpen_masks
-from drgs.reconstruct.capture.turn_up import UP, Direction, rotation_to_up
-from drgs.reconstruct.capture.turning_light import LIGHT_CHOICES, LightChoice, LightFound, light_found, with_light_of_camera
+from drgs.reconstruct.capture.turn_up import UP
 from drgs.reconstruct.facts_of_views import facts_of_views
 from drgs.reconstruct.fit.evidence.photographs_as_taken import PhotographsAsTaken
 from drgs.reconstruct.fit.evidence.register_cameras import moved_pixels, seen_from
@@ -43,7 +41,6 @@ from drgs.reconstruct.fit.surface.surface_passes import SurfaceFit
 from drgs.reconstruct.fit.surfels.fit_gaussians import drawn_object, gaussians_from_state
 from drgs.reconstruct.fit.surfels.fit_materials import gaussians_from_materials
 from drgs.reconstruct.fit.surfels.fit_mesh_surfels import gaussians_from_mesh_fit
-from drgs.reconstruct.fit.surfels.try_light_frames import light_by_trial
 from drgs.reconstruct.fit.view_targets import whole_targets
 from drgs.reconstruct.geometry.bake_materials import bake_materials
 from drgs.reconstruct.geometry.bind_gaussians import bind_gaussians, points_from_binding
@@ -55,26 +52,16 @@ from drgs.reconstruct.geometry.mesh_from_gaussians import chosen_surfels, reduce
 from drgs.reconstruct.geometry.mesh_surfels import mesh_surfels
 from drgs.reconstruct.geometry.order_in_space import order_in_space
 from drgs.reconstruct.outline_agreement import complaint, outline_agreement
-from drgs.reconstruct.pose.pose_photographs import PoseSettings
-from drgs.reconstruct.pose.posed_dataset import needs_poses, pose_source, provenance_of
 from drgs.reconstruct.presets import PRESETS, Preset
-from drgs.reconstruct.progress import POSED, STAGE_SHARES, BuildStopped, Progress
+from drgs.reconstruct.progress import STAGE_SHARES, BuildStopped, Progress
+from drgs.reconstruct.read_photographs import read_photographs
 from drgs.reconstruct.report_progress import BuildReporter
 from drgs.reconstruct.stages import (
     Workplace,
     bind_stage,
-    capture_digest,
     fit_stage,
-    forget_checkpoints,
-    ground_again_stage,
-    ground_stage,
-    hollows_stage,
-    light_stage,
-    masks_stage,
     mesh_materials_stage,
     mesh_stage,
-    points_of_found_masks,
-    points_on_ground,
     stage_two_preview,
     surface_preview,
     surface_stage,
@@ -88,43 +75,9 @@ from drgs.scene.certainty import Certainty
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
-from drgs.scene.strokes import Stroke, plain_strokes
+from drgs.scene.strokes import plain_strokes
 from drgs.scene.views import Views
 from drgs.warp_torch import device_from_name
-
-
-@dataclass(frozen=True)
-class BuildSettings:
-    """What a user chooses."""
-
-    preset: str = "fast"
-    """draft, fast or full."""
-    binding: str = "particles"
-    """particles: surfels lie on the surface as it was fitted. mesh: those on its faces are fitted to the photographs once more."""
-    device: str = "auto"
-    """auto, cpu or cuda."""
-    seed: int = 0
-    resume: bool = False
-    light: LightChoice = "auto"
-    """What the lamps stood still with while the photographs were taken."""
-    masks: Literal["auto", "given"] = "auto"
-    """Where they end: auto: where the photographs show the object to end (sharpen_masks); given: as the capture or the strokes have it."""
-    cameras: Literal["auto", "given"] = "auto"
-    """Where photographs were taken from: auto: where they fit the surface best, if the given places are off (register_cameras); given: where the capture, or
-    COLMAP, has them."""
-    up: Direction = UP
-    """Direction of the capture's world that points up. The asset's world is the capture's, turned so that it is z (turn_up.rotation_to_up)."""
-    box: BuildBox | None = None
-    """Of the asset's world: what lies outside is not built. None: all of the object is."""
-    strokes: tuple[Stroke, ...] = ()
-    """What is the object in some pictures, and what is not: the masks of all follow from them, whatever masks the capture has. None: its own count."""
-    materials: str | None = None
-    """Preset of the stage `materials` alone: None is `preset`. It is how material and light are separated anew on kept geometry."""
-
-
-BINDINGS = tuple(STAGE_SHARES)
-POSING_SHARE = 0.7
-"""Of the stage `read`, where pictures are posed in it."""
 
 
 def build_asset(
@@ -165,11 +118,10 @@ def build_stages(
 
     On `resume`, finished stages are skipped; only the capture is read again.
     """
-    _check(settings, out)
-    preset = PRESETS[settings.preset]
-    device = device_from_name(settings.device)
+    check_settings(settings, out)
     seconds: dict[str, float] = {}
     reporter = BuildReporter(progress, STAGE_SHARES[settings.binding], previews)
+    device = device_from_name(settings.device)
 
     @contextmanager
     def timed(stage: str) -> Iterator[None]:
@@ -177,40 +129,15 @@ def build_stages(
         yield
         seconds[stage] = round(time.monotonic() - started, 2)
 
-    found_by: dict[str, str] = {}
     with timed("read"):
-        reporter.report("read", 0.0, "reading the capture")
-        capture, poses = _posed(dataset, out, settings, reporter, should_stop)
-        stop = should_stop or (lambda: False)
-        found, views, points = _opened(capture, settings, preset, reporter, stop)
-        photographs, gains_of_files = views, views.gains is not None
-        views = with_gains_of_points(views, points)
-        identity: dict[str, Any] = {"preset": settings.preset, "seed": settings.seed, "capture": capture_digest(views, settings.box)}
-        place = Workplace(Path(f"{out}.build"), identity, settings.resume, reporter, stop)
-        if not settings.resume:
-            forget_checkpoints(place)
-        if not views.has_masks:
-            views, masked, points = _with_found_masks(place, views, points, device, settings, preset)
-            found_by = {"object_found_by": "surroundings" if views.ground is None else "ground"}
-        else:
-            masked = views
-        light = _light(settings, preset, found, masked, points)
-        # Masks that a build had to find are of whole pictures, whose room mostly stands still with the object.
-        if light.wants_trial and not found_by:
-            light = light_by_trial(light, *light_stage(place, masked, points, settings.seed, device))
-        if light.frame == "camera":
-            views, masked, place = with_light_of_camera(views), with_light_of_camera(masked), place.of(light="camera")
-            preset = preset.under_turning_light()
-        points = hollows_stage(place, masked, points, preset, settings.seed, device, settings.box)
-        if light.frame == "camera" and not gains_of_files:
-            # with_gains_of_points took for exposures what the light's turns do. It helps to look for hollows as if light stood still; a fit has the light.
-            views = replace(views, gains=None)
+        read = read_photographs(dataset, out, settings, PRESETS[settings.preset], device, reporter, should_stop)
+    place, views, photographs, points, preset = read.place, read.views, read.photographs, read.points, read.preset
     yield "read", None
 
     with timed("fit"):
         fit = fit_stage(place, views, points, replace(preset.fit, seed=settings.seed), device)
         if not views.has_masks:
-            views = _masked_by_fit(fit, found, views, points, preset, settings)
+            views = _masked_by_fit(fit, read.capture, views, points, preset, settings)
             photographs = replace(views_of(photographs, views), cameras=views.cameras, images_srgb=views.images_srgb)
         views = with_gains_of_fit(views, drawn_object(fit, points.bounds_radius, preset.fit.sh_degree))
     yield "fit", None
@@ -222,43 +149,16 @@ def build_stages(
     if place.should_stop():
         raise BuildStopped
 
-    built = _Built(place, found, views, points, preset, settings, fit, gaussians, mesh, timed)
+    built = _Built(place, read.capture, views, points, preset, settings, fit, gaussians, mesh, timed)
     asset, thumbnail, views = yield from _on_mesh(built) if preset.materials_on == "mesh" else _on_surfels(built)
     agreement = outline_agreement(asset.mesh, views)
     provenance = {"source": views.source, "dataset": dataset.name} | _provenance(settings, device, asset.mesh, seconds)
-    provenance |= poses | found_by | {"outline_agreement": round(agreement, 4)} | facts_of_views(views)
-    provenance["light"] = {key: value for key, value in asdict(light).items() if value is not None}
-    asset = replace(asset, provenance=provenance, cameras=views.cameras, light_frame=light.frame)
+    provenance |= read.facts | {"outline_agreement": round(agreement, 4)} | facts_of_views(views)
+    provenance["light"] = {key: value for key, value in asdict(read.light).items() if value is not None}
+    asset = replace(asset, provenance=provenance, cameras=views.cameras, light_frame=read.light.frame)
     save_asset(asset, out, thumbnail, kept_photographs(photographs))
     reporter.report("pack", 1.0, "; ".join(filter(None, ("done", complaint(agreement)))))
     yield "pack", asset
-
-
-def _posed(
-    dataset: Path, out: Path, settings: BuildSettings, reporter: BuildReporter, should_stop: Callable[[], bool] | None
-) -> tuple[Path, dict[str, Any]]:
-    """The capture with cameras, and what the asset tells of how they were found; the very dataset where it has them."""
-    if not needs_poses(dataset):
-        return dataset, {}
-    place = Path(f"{out}.build") / POSED
-    place.parent.mkdir(parents=True, exist_ok=True)
-    pose_settings = PoseSettings(seed=settings.seed, resume=settings.resume)
-
-    def report(at: Progress) -> None:
-        reporter.report("read", POSING_SHARE * at.fraction, at.message)
-
-    found = pose_source(dataset, place, pose_settings, progress=report, should_stop=should_stop)
-    reporter.begun["read"] = POSING_SHARE
-    return place, {"poses": provenance_of(found)}
-
-
-def _opened(
-    capture: Path, settings: BuildSettings, preset: Preset, reporter: BuildReporter, should_stop: Callable[[], bool]
-) -> tuple[Capture, Views, InitialPoints]:
-    """open_capture, as the settings say."""
-    masked_by = _by_strokes(settings.strokes, reporter, should_stop) if settings.strokes else None
-    given = (settings.seed, settings.up, settings.box, masked_by, preset.hull)
-    return open_capture(capture, preset.image_side, preset.points, *given, sharpen=settings.masks == "auto", nearer=True)
 
 
 def _masked_by_fit(fit: FitState, capture: Capture, views: Views, points: InitialPoints, preset: Preset, settings: BuildSettings) -> Views:
@@ -270,49 +170,6 @@ def _masked_by_fit(fit: FitState, capture: Capture, views: Views, points: Initia
     windows = object_windows(capture, views, preset.image_side)
     views = views if windows is None else look_nearer(capture, views, windows, False, sharpen)
     return views if ground is None else replace(views, ground=fitted_ground(fit.parameters["ground"], ground))
-
-
-def _by_strokes(strokes: tuple[Stroke, ...], reporter: BuildReporter, should_stop: Callable[[], bool]) -> Callable[[Views], Views]:
-    """masks_by_strokes, as open_capture takes it."""
-
-    def masked(views: Views) -> Views:
-        def report(share: float) -> None:
-            reporter.report("read", share, "finding masks by strokes")
-
-        found = masks_by_strokes(views, strokes, report=report, should_stop=should_stop)
-        if found is None:
-            raise BuildStopped
-        return found
-
-    return masked
-
-
-def _with_found_masks(
-    place: Workplace,
-    views: Views,
-    points: InitialPoints,
-    device: torch.device,
-    settings: BuildSettings,
-    preset: Preset,
-) -> tuple[Views, Views, InitialPoints]:
-    """Views without masks, but with the ground where there is one; the same with masks, for what looks at the object; points on those."""
-    fit_settings = replace(preset.fit, seed=settings.seed)
-    views = ground_stage(place, views, settings.seed)
-    points = points_on_ground(views, points, preset.points, settings.seed, settings.box, preset.hull)
-    masked = masks_stage(place, views, points, fit_settings, device, settings.box)
-    views = views_of(views, masked)  # without those in which the box's content is hidden
-    if views.ground is not None:
-        views, masked = ground_again_stage(place, views, masked, settings.seed)
-    return views, masked, points_of_found_masks(masked, points, preset.points, settings.seed, settings.box, preset.hull)
-
-
-def _light(settings: BuildSettings, preset: Preset, capture: Capture, views: Views, points: InitialPoints) -> LightFound:
-    """What the light stood still with: as it was said, else as the pictures say."""
-    if settings.light != "auto":
-        return LightFound(settings.light, "it was said so")
-    if preset.materials_on == "surfels":
-        return LightFound("object", "materials are fitted on surfels")
-    return light_found(capture, views, points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,28 +328,6 @@ def _detailed(built: _Built, fit: SurfaceFit) -> tuple[TriangleMesh, Certainty]:
     parts = parts_for(mesh, photographs.cameras, settings)
     solved = solve_albedo(tracer, targets, photographs.target, light_of, edges, rings, parts)
     return replace(mesh, albedo=solved.albedo, detail=solved.detail), certainty
-
-
-def _check(settings: BuildSettings, out: Path) -> None:
-    checkpoints = Path(f"{out}.build")
-    if checkpoints.exists() and not checkpoints.is_dir():
-        raise ValueError(
-            f"{checkpoints}: is a file; expected a folder for the checkpoints of this build, or nothing: move it away, or choose another OUT"
-        )
-    for name in (settings.preset, settings.materials or settings.preset):
-        if name not in PRESETS:
-            raise ValueError(f"preset {name!r} is unknown; expected one of {', '.join(PRESETS)}")
-    if settings.masks not in ("auto", "given"):
-        raise ValueError(f"masks {settings.masks!r} is unknown; expected auto or given")
-    if settings.cameras not in ("auto", "given"):
-        raise ValueError(f"cameras {settings.cameras!r} is unknown; expected auto or given")
-    if settings.light not in LIGHT_CHOICES:
-        raise ValueError(f"light {settings.light!r} is unknown; expected one of {', '.join(LIGHT_CHOICES)}")
-    if settings.light == "camera" and PRESETS[settings.preset].materials_on == "surfels":
-        raise ValueError("light 'camera' needs materials that are fitted on the mesh; expected a preset that does so")
-    if settings.binding not in BINDINGS:
-        raise ValueError(f"binding {settings.binding!r} is unknown; expected one of {', '.join(BINDINGS)}")
-    rotation_to_up(settings.up)
 
 
 def _provenance(settings: BuildSettings, device: torch.device, mesh: TriangleMesh, seconds: dict[str, float]) -> dict[str, Any]:
