@@ -226,22 +226,15 @@ def _cost_of_pixels(
     """
     environment, surface = leaves
     twice = seen_twice(target, pixels[first:last], around.tracer, generator)
-    photo = target.saturation.reshape(-1, 3)[twice[0].pixels]
-    count = photo.numel()
-    if not count:
+    photo = target.saturation.reshape(-1, 3)[twice.pixels]
+    if not len(photo):
         return environment.sum() * 0, environment.new_zeros(2)
-    halves = [
-        display_image(
-            _radiance(seen, surface, environment, target, around, settings, 2 * iteration + half),
-            torch.ones_like(photo[:, 0]),
-            photo,
-            target.ceiling,
-        )
-        for half, seen in enumerate(twice)
-    ]
-    mean = 0.5 * (halves[0] + halves[1]).detach()
+    radiance = _radiance(twice, surface, environment, target, around, settings, iteration)
+    shown = display_image(radiance, torch.ones_like(photo[:, 0]), photo, target.ceiling)
+    (one, other), photo = shown.chunk(2), photo.chunk(2)[0]
+    mean, count = 0.5 * (one + other).detach(), photo.numel()
     squared = (mean.clamp(0, 1) - photo).square().sum()
-    return crossed_halves(halves[0], halves[1], photo) * count, torch.stack([squared, squared.new_tensor(count)])
+    return crossed_halves(one, other, photo) * count, torch.stack([squared, squared.new_tensor(count)])
 
 
 def _radiance(
@@ -253,7 +246,11 @@ def _radiance(
     settings: MeshMaterialSettings,
     draw: int,
 ) -> Tensor:
-    """(place, 3) by one set of rays; gradients reach materials, normals and the light."""
+    """(place, 3), each by rays of its own; gradients reach materials, normals and the light.
+
+    Args:
+        seen: of seen_twice.
+    """
     tracer, turn = around.tracer, target.light_from_world
     here = at_corners(surface, seen.corners, seen.weights)
     points = ShadingPoints(
@@ -263,7 +260,8 @@ def _radiance(
         albedo=here[:, 3:6].contiguous(),
         roughness=here[:, 6].contiguous(),
         metallic=here[:, 7].contiguous(),
-        pixel=seen.pixels.int(),
+        # By which rays are drawn: a pixel's second place has others than its first.
+        pixel=torch.cat([half.pixels + k * target.mask.numel() for k, half in enumerate(seen.halves())]).int(),
     )
     turned = in_light(points, turn)
     with torch.no_grad():

@@ -22,14 +22,14 @@ from torch import Tensor
 from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
 from drgs.reconstruct.fit.fit_loop import FitLoop, FitReport, FitState, StepLoss, run_fit
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
-from drgs.reconstruct.fit.light.mesh_light import MeshLight
+from drgs.reconstruct.fit.light.mesh_light import LightOf
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.light.turned_light import COARSE, FINE
 from drgs.reconstruct.fit.losses import crossed_halves
 from drgs.reconstruct.fit.surface.displaced_surface import DisplacedSurface, weights_where_seen
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.prior_terms import prior_terms
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_photographs
 from drgs.reconstruct.fit.surfel_parameters import leaves, light_parameters, logits_of_shares, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, whole_targets
 from drgs.reconstruct.geometry.bake_materials import average_surfels, outward_normals, vertex_weights
@@ -246,14 +246,11 @@ class _Steps:
         chosen = [self._some_pixels(target, len(targets)) for target in targets]
 
         def cost(first: int, last: int, leaves: tuple[Tensor, ...], generator: torch.Generator) -> tuple[Tensor, Tensor]:
-            seen = zip(chosen[first:last], targets[first:last], strict=True)
+            if first == last:  # fewer photographs than threads
+                return leaves[0].sum() * 0, torch.zeros(2, device=surface.device)
             # Light that turns is found here, by the thread that needs it.
             light_of = self.surface.light_of(leaves[0], leaves[1][:, :3].contiguous())
-            parts = [_cost_of_pixels(pixels, target, tracer, light_of(target), leaves[1:], generator) for pixels, target in seen]
-            if not parts:  # fewer photographs than threads
-                return leaves[0].sum() * 0, torch.zeros(2, device=surface.device)
-            errors, others = zip(*parts, strict=True)
-            return torch.stack(errors).sum(), torch.stack(others).sum(0)
+            return _cost_of_pixels(chosen[first:last], targets[first:last], tracer, light_of, leaves[1:], generator)
 
         leaves = (tables, surface) if positions is None else (tables, surface, positions)
         total, (squared, count) = cost_in_slices(len(targets), leaves, cost, self.state.generator)
@@ -271,20 +268,24 @@ class _Steps:
 
 
 def _cost_of_pixels(
-    pixels: Tensor, target: ViewTarget, tracer: AbstractTracer, light: MeshLight, leaves: tuple[Tensor, ...], generator: torch.Generator
+    chosen: list[Tensor],
+    targets: list[ViewTarget],
+    tracer: AbstractTracer,
+    light_of: LightOf,
+    leaves: tuple[Tensor, ...],
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Of the `pixels` (flat) the error, summed; the squared one and the number of channels that were compared.
+    """Of the `chosen` pixels (flat) of each photograph the error, summed; the squared one and the number of channels that were compared.
 
     Args:
         leaves: packed_surface and, of a displaced surface, positions.
     """
     surface, *positions = leaves
     normals = surface.detach()[:, :3].contiguous()
-    compared = list(seen_twice(target, pixels, tracer, generator, normals))
+    compared = [seen_twice(target, pixels, tracer, generator, normals) for pixels, target in zip(chosen, targets, strict=True)]
     if positions:
         compared = [replace(seen, weights=weights_where_seen(seen, tracer.mesh.vertices, positions[0])) for seen in compared]
-    halves = [shade_places(seen, target, tracer, surface, light, generator) for seen in compared]
-    photo = target.saturation.reshape(-1, 3)[compared[0].pixels]
+    first, second, photo = shade_photographs(compared, targets, tracer, surface, light_of, generator)
     count = photo.numel()
-    error = crossed_halves(halves[0], halves[1], photo) * count if count else surface.sum() * 0
-    return error, torch.stack([(halves[0].detach().clamp(0, 1) - photo).square().sum(), surface.new_tensor(count)])
+    error = crossed_halves(first, second, photo) * count if count else surface.sum() * 0
+    return error, torch.stack([(first.detach().clamp(0, 1) - photo).square().sum(), surface.new_tensor(count)])

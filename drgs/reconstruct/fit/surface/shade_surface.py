@@ -13,7 +13,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from drgs.reconstruct.fit.light.mesh_light import MeshLight, at_corners, corner_weights, mirrored_light
+from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, at_corners, corner_weights, mirrored_light
 from drgs.reconstruct.fit.light.mesh_light_kernels import normal_at, vector_at
 from drgs.reconstruct.fit.surface.surface_color import surface_color
 from drgs.reconstruct.fit.view_targets import ViewTarget
@@ -46,10 +46,21 @@ class SeenPlaces:
         at = chosen.nonzero().squeeze(1) if chosen.dtype == torch.bool else chosen
         return SeenPlaces(*(values.index_select(0, at) for values in vars(self).values()))
 
+    def halves(self) -> tuple["SeenPlaces", "SeenPlaces"]:
+        """Of what seen_twice gives: the first places of the pixels, and the second ones."""
+        middle = len(self.pixels) // 2
+        first, second = (SeenPlaces(*(values[some] for values in vars(self).values())) for some in (slice(middle), slice(middle, None)))
+        return first, second
+
     @property
     def nearest(self) -> Int[Tensor, "place"]:
         """Vertex at the nearest corner."""
         return self.corners.gather(1, self.weights.argmax(1, keepdim=True)).squeeze(1)
+
+
+def joined(several: list[SeenPlaces]) -> SeenPlaces:
+    """One after the other."""
+    return SeenPlaces(*(torch.cat(values) for values in zip(*(vars(places).values() for places in several), strict=True)))
 
 
 @torch.no_grad()
@@ -67,8 +78,10 @@ def seen_twice(
     tracer: AbstractTracer,
     generator: torch.Generator,
     normals: Float[Tensor, "vertex 3"] | None = None,
-) -> tuple[SeenPlaces, SeenPlaces]:
-    """Of those of `pixels` (flat) that see the mesh two times, each time by a place of the pixel drawn anew.
+) -> SeenPlaces:
+    """Of those of `pixels` (flat) that see the mesh two times, each time by a place of the pixel drawn anew: first places of all of them, then second ones.
+
+    Together, for what is done with them is done once: half as many operations, which threads must take turns to begin.
 
     Why: a pixel shows its mean. With one place for both estimates, what differs within a pixel is noise that both share, and crossed_halves
     takes it for error: what is finer than a pixel would be flattened.
@@ -91,13 +104,12 @@ def seen_twice(
     outputs = [warp_argument(seen), warp_argument(wo, wp.vec3), warp_argument(weights, wp.vec3), warp_argument(face)]
     launch(seen_twice_kernel(tracer.kernel_query), count, inputs, outputs, warp_device(pixels))
     at = seen.nonzero().squeeze(1)
+    twice = torch.cat([at, at + count])
+    faces = face.view(-1).index_select(0, twice)
+    corners = mesh.faces.index_select(0, faces).long()
     chosen = pixels.index_select(0, at)
-    halves = []
-    for k in range(2):
-        faces = face[k].index_select(0, at)
-        corners = mesh.faces.index_select(0, faces).long()
-        halves.append(SeenPlaces(chosen, wo[k].index_select(0, at), faces, corners, weights[k].index_select(0, at)))
-    return halves[0], halves[1]
+    wo, weights = (values.view(-1, 3).index_select(0, twice) for values in (wo, weights))
+    return SeenPlaces(torch.cat([chosen, chosen]), wo, faces, corners, weights)
 
 
 @cache
@@ -194,10 +206,50 @@ def shade_places(
     Args:
         tracer: its mesh has the materials that mirrors see. surface: of packed_surface. light: its tables may want a gradient.
     """
+    return _shade(seen, photo_of(seen, target), target.ceiling, tracer, surface, light, generator)
+
+
+def photo_of(seen: SeenPlaces, target: ViewTarget) -> Float[Tensor, "place 3"]:
+    """What the photograph shows there (display values)."""
+    return target.saturation.reshape(-1, 3).index_select(0, seen.pixels)
+
+
+def shade_photographs(
+    seen: list[SeenPlaces],
+    targets: list[ViewTarget],
+    tracer: AbstractTracer,
+    surface: Float[Tensor, "vertex 8"],
+    light_of: LightOf,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
+    """Both estimates of the pixels of several photographs, and what these show there.
+
+    Photographs under one light are shaded at once: of small operations most time is what it takes to begin them.
+
+    Args:
+        seen: of seen_twice, for each of `targets`. The rest: of shade_places.
+    """
+    photos = [photo_of(places, target) for places, target in zip(seen, targets, strict=True)]
+    together: dict[tuple[int, float], list[int]] = {}
+    lights = [light_of(target) for target in targets]
+    for number, (light, target) in enumerate(zip(lights, targets, strict=True)):
+        together.setdefault((id(light), target.ceiling), []).append(number)
+    shaded: list[Tensor] = [surface] * len(targets)
+    for (_, ceiling), numbers in together.items():
+        places, shown = joined([seen[number] for number in numbers]), torch.cat([photos[number] for number in numbers])
+        colors = _shade(places, shown, ceiling, tracer, surface, lights[numbers[0]], generator)
+        for number, one in zip(numbers, colors.split([len(photos[number]) for number in numbers]), strict=True):
+            shaded[number] = one
+    first, second, photo = ([values.chunk(2)[k] for values in every] for every, k in ((shaded, 0), (shaded, 1), (photos, 0)))
+    return torch.cat(first), torch.cat(second), torch.cat(photo)
+
+
+def _shade(
+    seen: SeenPlaces, photo: Tensor, ceiling: float, tracer: AbstractTracer, surface: Tensor, light: MeshLight, generator: torch.Generator
+) -> Float[Tensor, "place 3"]:
     known = replace(light, tables=light.tables.detach())
     with torch.no_grad():
         transmittance, met = mirrored_light(tracer, seen.face, seen.weights.detach(), seen.wo, known, generator)
-    photo = target.saturation.reshape(-1, 3)[seen.pixels]
     corners, weights = seen.corners, seen.weights
     if weights.requires_grad:
         # The kernel has no slope by weights: it gets what lies at each place, as that place's own vertex.
@@ -205,4 +257,4 @@ def shade_places(
         light = replace(light, open_share=open_share)
         corners = torch.arange(len(weights), device=weights.device)[:, None].expand(-1, 3).contiguous()
         weights = torch.eye(3, device=weights.device)[0].expand(len(corners), 3).contiguous()
-    return surface_color(corners, weights, seen.wo, transmittance, met, photo, target.ceiling, surface, light)
+    return surface_color(corners, weights, seen.wo, transmittance, met, photo, ceiling, surface, light)

@@ -28,7 +28,7 @@ from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_squares
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceSettings, fit_surface
 from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_places
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, packed_surface, seen_twice, shade_photographs
 from drgs.reconstruct.fit.surfel_parameters import leaves, logits_of_shares, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, whole_targets
 from drgs.scene.views import Views
@@ -208,9 +208,7 @@ def _error(surface: MovingSurface, state: FitState, targets: list[ViewTarget], s
         solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
         solid = solid[:: max(1, len(solid) // PIXELS)]
         twice = seen_twice(target, solid, surface.tracer, generator, packed[:, :3])
-        light = light_of(target)
-        first, second = (shade_places(seen, target, surface.tracer, packed, light, generator) for seen in twice)
-        photo = target.saturation.reshape(-1, 3)[twice[0].pixels]
+        first, second, photo = shade_photographs([twice], [target], surface.tracer, packed, light_of, generator)
         total += float(crossed_squares(first, second, photo).sum())
         count += len(photo)
     return total / max(count, 1)

@@ -106,7 +106,7 @@ def test_of_large_photographs_some_pixels_are_looked_at(views: Views):
 def test_a_step_shares_its_pixels_among_several_photographs(views: Views, several: int, monkeypatch: pytest.MonkeyPatch) -> None:
     looked: list[tuple[int, int, int]] = []  # which photograph, pixels drawn, pixels it has
 
-    def watched(target: ViewTarget, pixels: Tensor, *rest: Any) -> tuple[SeenPlaces, SeenPlaces]:
+    def watched(target: ViewTarget, pixels: Tensor, *rest: Any) -> SeenPlaces:
         solid = (target.mask.flatten() > SOLID).nonzero().squeeze(1)
         assert len(pixels.unique()) == len(pixels) and torch.isin(pixels, solid).all()
         looked.append((id(target), len(pixels), len(solid)))

@@ -42,7 +42,7 @@ def image_places(seen: SeenPlaces, tracer: AbstractTracer, target: ViewTarget) -
 
 
 def test_two_places_of_a_pixel_lie_apart_and_within_it(target: ViewTarget, tracer: AbstractTracer):
-    first, second = seen_twice(target, solid(target), tracer, torch.Generator().manual_seed(1))
+    first, second = seen_twice(target, solid(target), tracer, torch.Generator().manual_seed(1)).halves()
     assert torch.equal(first.pixels, second.pixels) and len(first.pixels) > 100
     inside = []
     for seen in (first, second):
@@ -74,7 +74,7 @@ def test_what_is_finer_than_a_pixel_is_not_flattened(target: ViewTarget):
     def mean_gradient(places: tuple[int, int]) -> float:
         contrast = torch.tensor(0.1, requires_grad=True)
         for _ in range(12):
-            twice = seen_twice(target, solid(target), fine, generator)
+            twice = seen_twice(target, solid(target), fine, generator).halves()
             first, second = (
                 (0.5 + contrast * (pattern[twice[k].corners] * twice[k].weights).sum(1))[:, None].expand(-1, 3) for k in places
             )
