@@ -32,7 +32,15 @@ from drgs.reconstruct.fit.losses import crossed_halves, crossed_squares
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates
 from drgs.reconstruct.fit.surface.moving_surface import MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.prior_terms import prior_terms
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_places, shade_places, steep_enough
+from drgs.reconstruct.fit.surface.shade_surface import (
+    SOLID,
+    SeenPlaces,
+    joined,
+    packed_surface,
+    seen_places,
+    shade_photographs,
+    steep_enough,
+)
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer, rate_of_group
 from drgs.reconstruct.fit.view_targets import drawn_view, whole_targets
 from drgs.reconstruct.geometry.agree_along_edges import agree_along_edges
@@ -306,9 +314,7 @@ class Trials:
             index: int, places: SeenPlaces, tracer: AbstractTracer, packed: Tensor, light: MeshLight, generator: torch.Generator
         ) -> tuple[Tensor, Tensor, Tensor]:
             """Two estimates of the colours of a view's places, and the photograph's colours."""
-            target = self._targets[index]
-            first, second = (shade_places(places, target, tracer, packed, light, generator) for _ in range(2))
-            return first, second, target.saturation.reshape(-1, 3)[places.pixels]
+            return shade_photographs([joined([places, places])], [self._targets[index]], tracer, packed, lambda _: light, generator)
 
         def materials_of_now() -> AbstractTracer:
             return surface.tracer.with_materials(mesh_from_surface_fit(state, self._faces))

@@ -12,6 +12,7 @@ from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.checkpoints import fit_tensors, read_tensors, restore_fit, write_tensors
 from drgs.reconstruct.fit.fit_loop import FitReport, FitState, StepLoss
 from drgs.reconstruct.fit.light.environment_pyramid import environment_table
+from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.surface import fit_mesh_materials as fit_mesh_materials_file
 from drgs.reconstruct.fit.surface.fit_mesh_materials import (
     MeshMaterialSettings,
@@ -20,7 +21,11 @@ from drgs.reconstruct.fit.surface.fit_mesh_materials import (
 )
 from drgs.reconstruct.fit.surface.fit_surface import SurfaceRates, SurfaceSettings, start_surface
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
+from drgs.reconstruct.fit.surface.shade_surface import joined, packed_surface, seen_places
+from drgs.reconstruct.fit.view_targets import whole_targets
+from drgs.render.integrate.environment_table import build_environment_table
 from drgs.render.records import SampleCounts
+from drgs.scene.environment import Environment
 from drgs.scene.ground import Ground
 from drgs.scene.views import Views
 from tests.reconstruct.fit.painted_sphere import CENTER, grey_light, painted_views, placed_sphere
@@ -63,6 +68,30 @@ def test_a_grey_sphere_takes_on_the_colours_of_its_photographs(views: Views):
     normal = (mesh.vertices - CENTER) / SPHERE_RADIUS
     for channel in range(3):  # the paint's red grows with the normal's x, and so on
         assert float(torch.corrcoef(torch.stack([mesh.albedo[:, channel], normal[:, channel]]))[0, 1]) > 0.5
+
+
+def test_the_second_place_of_a_pixel_has_rays_of_its_own(views: Views) -> None:
+    """Also where it is the very place of the first: with the same rays both estimates would share their noise, and crossed_halves would take it for error."""
+    settings = short(1)
+    state, targets = started(settings), whole_targets(views, torch.device("cpu"))
+    surface = MovingSurface(views, placed_sphere().faces, state)
+    tracer = surface.tracer.with_materials(mesh_from_surface_fit(state, placed_sphere().faces))
+    lamp = torch.ones(128, 256, 3)
+    lamp[20:50, 40:70] = 30.0
+    around = fit_mesh_materials_file.Surroundings(
+        tracer, surface.light_of(filter_environment(lamp))(targets[0]), build_environment_table(Environment(lamp))
+    )
+    seen = seen_places(targets[0], (targets[0].mask.flatten() > 0.995).nonzero().squeeze(1), tracer)
+    packed = packed_surface(state.parameters).detach()
+
+    def halves(draw: int) -> tuple[torch.Tensor, ...]:
+        return fit_mesh_materials_file._radiance(joined([seen, seen]), packed, lamp, targets[0], around, settings, draw).chunk(2)
+
+    draws = [torch.stack(halves(draw)).mean(-1) for draw in range(16)]
+    noise = torch.stack(draws) - torch.stack(draws).mean(0)
+    first, second = noise[:, 0].flatten(), noise[:, 1].flatten()
+    assert float(first.std()) > 0.02
+    assert abs(float(torch.corrcoef(torch.stack([first, second]))[0, 1])) < 0.1
 
 
 @pytest.mark.slow

@@ -8,7 +8,15 @@ import torch
 from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import filter_environment
 from drgs.reconstruct.fit.losses import crossed_halves
-from drgs.reconstruct.fit.surface.shade_surface import SeenPlaces, seen_places, seen_twice, shade_places, steep_enough
+from drgs.reconstruct.fit.surface.shade_surface import (
+    SeenPlaces,
+    joined,
+    seen_places,
+    seen_twice,
+    shade_photographs,
+    shade_places,
+    steep_enough,
+)
 from drgs.reconstruct.fit.view_targets import ViewTarget, view_targets
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
@@ -117,3 +125,37 @@ def test_colours_change_with_the_place_as_differences_say(target: ViewTarget, tr
     assert float(difference.abs().mean()) > 1e-4
     # what blocks light, and where, is taken as known: here it is the same everywhere
     assert float((difference - slope).abs().mean()) < 0.01 * float(difference.abs().mean())
+
+
+def test_photographs_shaded_at_once_have_the_colours_and_gradients_of_one_by_one(target: ViewTarget, tracer: AbstractTracer):
+    """Three with two ceilings and two lights, of different sizes; from a sphere every mirrored ray escapes, so nothing differs by what is drawn."""
+    generator, count = torch.Generator().manual_seed(5), len(tracer.mesh.vertices)
+    outward = torch.nn.functional.normalize(tracer.mesh.vertices - tracer.mesh.vertices.mean(0), dim=-1)
+    packed = torch.cat([outward, 0.2 + 0.6 * torch.rand(count, 5, generator=generator)], 1).requires_grad_()
+    lights = [MeshLight(filter_environment((k + 0.5) * torch.ones(128, 256, 3)), torch.full((count, 3), 0.9)) for k in range(2)]
+    targets = [target, replace(target, ceiling=0.4, saturation=target.saturation.clamp(max=0.4)), replace(target)]
+    light_of = {id(one): lights[k] for one, k in zip(targets, (0, 0, 1), strict=True)}
+    looks = [seen_twice(one, solid(one)[:: k + 2], tracer, generator) for k, one in enumerate(targets)]
+
+    first, second, photo = shade_photographs(looks, targets, tracer, packed, lambda one: light_of[id(one)], generator)
+    factor = torch.rand(first.shape, generator=generator)
+    at_once = torch.autograd.grad((first * factor).sum() + 2 * (second * factor).sum(), packed)[0]
+
+    alone = [
+        [shade_places(half, one, tracer, packed, light_of[id(one)], generator) for half in look.halves()]
+        for look, one in zip(looks, targets, strict=True)
+    ]
+    expected = [torch.cat([halves[k] for halves in alone]) for k in range(2)]
+    assert len({len(look.pixels) for look in looks}) == 3 and float(expected[0].detach().max()) > 0.5
+    torch.testing.assert_close(first, expected[0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(second, expected[1], rtol=1e-5, atol=1e-6)
+    shown = [one.saturation.reshape(-1, 3)[look.halves()[0].pixels] for look, one in zip(looks, targets, strict=True)]
+    assert torch.equal(photo, torch.cat(shown))
+    one_by_one = torch.autograd.grad((expected[0] * factor).sum() + 2 * (expected[1] * factor).sum(), packed)[0]
+    torch.testing.assert_close(at_once, one_by_one, rtol=1e-4, atol=1e-5)
+
+
+def test_what_is_joined_comes_apart_again(target: ViewTarget, tracer: AbstractTracer):
+    seen = seen_places(target, solid(target)[::9], tracer)
+    for half in joined([seen, seen]).halves():
+        assert all(torch.equal(values, getattr(seen, name)) for name, values in vars(half).items())
