@@ -28,7 +28,7 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.turning_light import with_light_of_camera
 from drgs.reconstruct.fit.light.mesh_light import LightOf, MeshLight, at_corners
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, seen_places, shade_places, steep_enough
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, photo_of, seen_places, shade_places, steep_enough
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.mask_outlines import MaskOutline, outline_rays, outline_residuals
 from drgs.render.intersect.tracer import AbstractTracer
@@ -258,7 +258,7 @@ def _of_colors(
     seen = seen_places(target, (target.mask.flatten() > SOLID).nonzero().squeeze(1), tracer)
     seen = seen[steep_enough(seen, surface[:, :3].contiguous())]
     predicted = torch.stack([shade_places(seen, target, tracer, surface, light, generator) for _ in range(DRAWS)]).mean(0)
-    photo = target.saturation.reshape(-1, 3)[seen.pixels]
+    photo = photo_of(seen, target)
     world = at_corners(tracer.mesh.vertices, seen.corners, seen.weights)
     in_camera = world @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
     pixels = seen.pixels.cpu().numpy()

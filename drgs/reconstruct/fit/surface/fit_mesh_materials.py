@@ -34,7 +34,7 @@ from drgs.reconstruct.fit.losses import crossed_halves, display_image
 from drgs.reconstruct.fit.surface.fit_surface import NOT_FITTED, SurfaceRates
 from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface, mesh_from_surface_fit
 from drgs.reconstruct.fit.surface.prior_terms import prior_terms
-from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, seen_twice
+from drgs.reconstruct.fit.surface.shade_surface import SOLID, SeenPlaces, packed_surface, photo_of, seen_twice
 from drgs.reconstruct.fit.surfel_parameters import leaves, make_optimizer
 from drgs.reconstruct.fit.view_targets import ViewTarget, drawn_view, whole_targets
 from drgs.reconstruct.geometry.average_around import averaged
@@ -226,7 +226,7 @@ def _cost_of_pixels(
     """
     environment, surface = leaves
     twice = seen_twice(target, pixels[first:last], around.tracer, generator)
-    photo = target.saturation.reshape(-1, 3)[twice.pixels]
+    photo = photo_of(twice, target)
     if not len(photo):
         return environment.sum() * 0, environment.new_zeros(2)
     radiance = _radiance(twice, surface, environment, target, around, settings, iteration)

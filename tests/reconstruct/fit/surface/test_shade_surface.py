@@ -159,3 +159,11 @@ def test_what_is_joined_comes_apart_again(target: ViewTarget, tracer: AbstractTr
     seen = seen_places(target, solid(target)[::9], tracer)
     for half in joined([seen, seen]).halves():
         assert all(torch.equal(values, getattr(seen, name)) for name, values in vars(half).items())
+
+
+def test_photographs_that_see_nothing_have_no_colours(target: ViewTarget, tracer: AbstractTracer):
+    nothing = seen_twice(target, solid(target)[:0], tracer, torch.Generator().manual_seed(1))
+    count = len(tracer.mesh.vertices)
+    light = MeshLight(filter_environment(torch.ones(128, 256, 3)), torch.ones(count, 3))
+    values = shade_photographs([nothing] * 2, [target] * 2, tracer, torch.rand(count, 8), lambda _: light, torch.Generator())
+    assert [value.shape for value in values] == [(0, 3)] * 3
