@@ -127,7 +127,7 @@ def thread_pool() -> ThreadPoolExecutor:
 
 def warp_array(tensor: Tensor, dtype: Any = None) -> wp.array:
     """A Warp array on a tensor's memory; `dtype` (wp.vec3, ...) consumes trailing dimensions. No gradient is tracked."""
-    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+    return wp.from_torch(_own_memory(tensor.detach().contiguous()), dtype=dtype, requires_grad=False)
 
 
 def warp_argument(tensor: Tensor, dtype: Any = None) -> Any:
@@ -142,9 +142,12 @@ def warp_argument(tensor: Tensor, dtype: Any = None) -> Any:
         raise ValueError(
             f"an argument of strides {tensor.stride()} would be copied, and the copy gone before the launch; make it contiguous and keep it"
         )
-    # What is expanded and empty counts as contiguous, but not for Warp.
-    tensor = tensor.detach() if tensor.numel() else tensor.new_empty(tensor.shape)
-    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
+    return wp.from_torch(_own_memory(tensor.detach()), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+def _own_memory(tensor: Tensor) -> Tensor:
+    """What is expanded and empty counts as contiguous, but not for Warp."""
+    return tensor if tensor.numel() else tensor.new_empty(tensor.shape)
 
 
 def warp_view(tensor: Tensor, dtype: Any = None) -> wp.array:

@@ -94,14 +94,14 @@ PRESETS = {
     "fast": Preset(
         15_000,
         512,
-        FitSettings(iterations=600, densify=DensifySettings(budget=30_000)),
+        FitSettings(iterations=400, densify=DensifySettings(budget=30_000)),
         FAST_MESH,
         PassSettings(5, SurfaceSettings(rounds=1, steps_a_round=70, pixels_a_step=32_768), cameras_after=(1, 2, 3)),
         replace(FINE_MATERIALS, iterations=330, rounds=3),
         DetailSettings(),
         mesh_surfels=MeshFitSettings(iterations=300),
         surfel_materials=MaterialSettings(iterations=300),
-        turning=UnderTurningLight(times_stage_one=2, passes=2, displacement_steps=150),
+        turning=UnderTurningLight(times_stage_one=3, passes=2, displacement_steps=150),
     ),
     "full": Preset(
         25_000,

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.maths.color import srgb_from_linear
+from drgs.reconstruct.fit.image_terms import MaskEntropy, Shown, Smoothness
 from drgs.reconstruct.fit.similarity import structural_similarity
 
 
@@ -15,9 +15,8 @@ def display_image(
     ceiling: float = 1.0,
 ) -> Float[Tensor, "*pixels 3"]:
     """Radiance (..., 3) as the camera would have stored it, times coverage: sRGB, and no reward for passing `ceiling` where the photo is saturated."""
-    srgb = srgb_from_linear(radiance_linear)
-    saturated = photo_srgb >= 254 / 255 * ceiling
-    return torch.where(saturated, srgb.clamp(max=ceiling), srgb) * coverage[..., None]
+    shown = Shown.apply(radiance_linear.reshape(-1, 3), coverage.reshape(-1), photo_srgb.reshape(-1, 3), ceiling)
+    return shown.view(radiance_linear.shape)
 
 
 def structural_dissimilarity(image: Float[Tensor, "height width 3"], photo: Float[Tensor, "height width 3"]) -> Float[Tensor, ""]:
@@ -27,22 +26,14 @@ def structural_dissimilarity(image: Float[Tensor, "height width 3"], photo: Floa
 
 def mask_loss(coverage: Float[Tensor, "height width"], mask: Float[Tensor, "height width"]) -> Float[Tensor, ""]:
     """Scalar binary cross-entropy of coverage (height, width) against the mask 0..1."""
-    return torch.nn.functional.binary_cross_entropy(coverage.clamp(1e-4, 1 - 1e-4), mask)
+    return MaskEntropy.apply(coverage.contiguous(), mask)
 
 
 def edge_aware_smoothness(
     maps: Float[Tensor, "height width channel"], photo: Float[Tensor, "height width 3"], coverage: Float[Tensor, "height width"]
 ) -> Float[Tensor, ""]:
     """Scalar first-order smoothness of maps (height, width, c), less where the photo has an edge, only between solid pixels."""
-    solid = (coverage.detach() > 0.9).float()
-    total = maps.new_zeros(())
-    for axis in (0, 1):
-        ahead, here = [slice(None)] * 2, [slice(None)] * 2
-        ahead[axis], here[axis] = slice(1, None), slice(None, -1)
-        edge = (photo[tuple(ahead)] - photo[tuple(here)]).abs().mean(-1)
-        weight = torch.exp(-8 * edge) * solid[tuple(ahead)] * solid[tuple(here)]
-        total = total + ((maps[tuple(ahead)] - maps[tuple(here)]).abs().mean(-1) * weight).sum() / solid.sum().clamp(min=1)
-    return total
+    return Smoothness.apply(maps.contiguous(), photo.contiguous(), coverage.detach().contiguous())
 
 
 def white_light(environment_radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, ""]:

@@ -8,17 +8,20 @@ from torch import Tensor
 
 from drgs.maths.brdf import f0_from_base
 from drgs.maths.frames import rotation_from_quat_wxyz, tangents_from_normal
-from drgs.maths.spherical_harmonics import evaluate_sh, sh_basis
+from drgs.maths.spherical_harmonics import sh_basis
 from drgs.reconstruct.fit.light.split_sum import filter_environment, shade_split_sum
 from drgs.reconstruct.geometry.bind_gaussians import nearest_surfels
 from drgs.scene.environment import Environment
 from drgs.scene.gaussians import Gaussians
 from drgs.scene.mesh import TriangleMesh
+from drgs.warp_torch import by_pool
 
 NEIGHBOURS = 8
 """Surfels that a vertex averages."""
 HARMONIC_DIRECTIONS = 64
 """Directions of the hemisphere that a surfel's outgoing radiance is sampled in."""
+SURFELS_AT_ONCE = 1024
+"""Whose outgoing radiance is baked by one thread at a time: what their directions need stays in a core's cache."""
 
 
 def vertex_weights(
@@ -69,22 +72,31 @@ def bake_outgoing_radiance(
     Args:
         residual_sh: (surfel, 16, 3) of the residual radiance, no offset. normals: (surfel, 3) outward.
     """
-    k = torch.arange(HARMONIC_DIRECTIONS, device=normals.device) + 0.5
+    device = normals.device
+    k = torch.arange(HARMONIC_DIRECTIONS, device=device) + 0.5
     cosine = 1 - k / HARMONIC_DIRECTIONS * 0.95
     sine, azimuth = (1 - cosine * cosine).sqrt(), k * (math.pi * (3 - math.sqrt(5)))
-    t_u, t_v = tangents_from_normal(normals)
+    local = torch.stack([sine * azimuth.cos(), sine * azimuth.sin(), cosine], 1)
     tables = filter_environment(environment.radiance)
-    f0 = f0_from_base(gaussians.albedo, gaussians.metallic)
-    diffuse_albedo = gaussians.albedo * (1 - gaussians.metallic)[:, None]
-    count = len(normals)
-    normal_matrix = torch.zeros(count, 16, 16, device=normals.device)
-    right_side = torch.zeros(count, 16, 3, device=normals.device)
-    for c, s, phi in zip(cosine.tolist(), sine.tolist(), azimuth.tolist(), strict=True):
-        wo = c * normals + s * math.cos(phi) * t_u + s * math.sin(phi) * t_v
-        radiance = shade_split_sum(diffuse_albedo, evaluate_sh(residual_sh, -wo), f0, gaussians.roughness, normals, wo, tables).clamp(min=0)
-        basis = sh_basis(-wo)
-        normal_matrix += basis[:, :, None] * basis[:, None, :]
-        right_side += basis[:, :, None] * (radiance - 0.5)[:, None, :]
-    degree = torch.tensor([math.isqrt(i) for i in range(16)], device=normals.device)
-    ridge = HARMONIC_DIRECTIONS * 1e-3 * (1.0 + degree**2)
-    return torch.linalg.solve(normal_matrix + torch.diag(ridge), right_side)
+    degree = torch.tensor([math.isqrt(i) for i in range(16)], device=device)
+    ridge = torch.diag(HARMONIC_DIRECTIONS * 1e-3 * (1.0 + degree**2))
+
+    @torch.no_grad()
+    def baked(first: int, last: int) -> Float[Tensor, "some 16 3"]:
+        normal, some = normals[first:last], slice(first, last)
+        wo = torch.stack([*tangents_from_normal(normal), normal], 1)  # (some, frame, 3)
+        wo = (local @ wo).view(-1, 3)
+        basis = sh_basis(-wo).view(last - first, HARMONIC_DIRECTIONS, 16)
+
+        def each_way(values: Tensor) -> Tensor:
+            return values[some].repeat_interleave(HARMONIC_DIRECTIONS, 0)
+
+        albedo, metallic, residual = each_way(gaussians.albedo), each_way(gaussians.metallic), (basis @ residual_sh[some]).view(-1, 3)
+        f0, diffuse_albedo = f0_from_base(albedo, metallic), albedo * (1 - metallic)[:, None]
+        surface = (diffuse_albedo, residual, f0, each_way(gaussians.roughness), each_way(normals))
+        radiance = shade_split_sum(*surface, wo, tables).clamp(min=0).view(last - first, HARMONIC_DIRECTIONS, 3)
+        turned = basis.transpose(1, 2)
+        return torch.linalg.solve(turned @ basis + ridge, turned @ (radiance - 0.5))
+
+    edges = [*range(0, len(normals), SURFELS_AT_ONCE), len(normals)]
+    return torch.cat(by_pool(baked, edges, device))

@@ -14,7 +14,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drgs.maths.constants import SRGB_GAMMA, SRGB_LINEAR_END, SRGB_OFFSET, SRGB_SCALE, SRGB_SLOPE
+from drgs.reconstruct.fit.image_terms import SATURATED, display_slope, display_value
 from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.mesh_light_kernels import base_f0, normal_at, rotation_of, vector_at
 from drgs.reconstruct.fit.light.split_sum import factor_table
@@ -25,8 +25,6 @@ wp.set_module_options({"enable_backward": False})
 
 NUMBERS = 8
 """Of a vertex: normal, albedo, roughness, metallic."""
-SATURATED = 254 / 255
-"""Of the ceiling, from where on a photograph only says "at least"."""
 
 
 @wp.struct
@@ -75,21 +73,6 @@ def _seen(
     return place
 
 
-@wp.func
-def _display(linear: float) -> float:
-    return wp.where(
-        linear <= SRGB_LINEAR_END,
-        SRGB_SLOPE * linear,
-        SRGB_SCALE * wp.pow(wp.max(linear, SRGB_LINEAR_END), 1.0 / SRGB_GAMMA) - SRGB_OFFSET,
-    )
-
-
-@wp.func
-def _display_slope(linear: float, shown: float) -> float:
-    # By what is shown, for a power costs as much as all else.
-    return wp.where(linear <= SRGB_LINEAR_END, SRGB_SLOPE, (shown + SRGB_OFFSET) / (SRGB_GAMMA * wp.max(linear, SRGB_LINEAR_END)))
-
-
 @wp.kernel
 def color_kernel(
     first: int,
@@ -121,7 +104,7 @@ def color_kernel(
         place.open_share, tables, factors,
     )  # fmt: skip
     radiance[i] = linear
-    value = wp.vec3(_display(linear[0]), _display(linear[1]), _display(linear[2]))
+    value = wp.vec3(display_value(linear[0]), display_value(linear[1]), display_value(linear[2]))
     uncut[i] = value
     shown = value
     for k in range(3):
@@ -160,7 +143,7 @@ def color_adjoint(
     g = wp.vec3(0.0, 0.0, 0.0)
     for k in range(3):
         beyond = wp.where(photo[i][k] >= SATURATED * ceiling, uncut[i][k], 0.0) > ceiling
-        g[k] = wp.where(beyond, 0.0, color_gradient[i][k] * _display_slope(linear[k], uncut[i][k]))
+        g[k] = wp.where(beyond, 0.0, color_gradient[i][k] * display_slope(linear[k], uncut[i][k]))
     found = gradients_of_point(
         g, place.diffuse, place.f0, place.roughness, light_from_world * place.normal, light_from_world * wo[i], transmittance[i], met[i],
         place.open_share, tables, factors, table_gradients,

@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drgs.reconstruct.fit.light.split_sum import shade_split_sum
+from drgs.reconstruct.fit.surfels.covered_pixels import LEAST_COVERAGE, covered_pixels
 from drgs.reconstruct.fit.surfels.surfel_features import surfel_features
-from drgs.render.visible.rasterize import RasterSettings, face_camera, rasterize
-from drgs.scene.camera import Camera, pixel_rays_world
+from drgs.render.visible.rasterize import RasterSettings, rasterize
+from drgs.scene.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,21 +48,16 @@ def render_stage_one(
     centers = parameters["centers"]
     tangents, features = surfel_features(parameters, camera.center_world, sh_degree, open_share)
     maps = rasterize(centers, tangents, torch.sigmoid(parameters["opacity_logits"]), features, camera, RasterSettings(near=near))
-    # Maps are divided by coverage; a pixel hardly covered keeps a bounded gradient.
-    inverse = 1 / maps.coverage.clamp(min=0.02)
     assert maps.depth_sum is not None  # asked for by RasterSettings.depth
-    depth = maps.depth_sum * inverse + maps.depth_origin
-    pixels = (maps.coverage.detach().flatten() > 0.02).nonzero().squeeze(1)
-    # Split as planes, once: back through a slice autograd writes zeros for all that it leaves out.
-    values = maps.features.flatten(1).index_select(1, pixels) * inverse.flatten().index_select(0, pixels)
-    blended_normal, diffuse, f0, roughness, residual = (plane.T for plane in values.split([3, 3, 3, 1, 3]))
-    _, directions = pixel_rays_world(camera)
-    wo = -directions.reshape(-1, 3).index_select(0, pixels)
-    normal = face_camera(blended_normal, wo)
-    radiance = shade_split_sum(diffuse, residual, f0, roughness[:, 0], normal, wo, tables, light_from_world=light_from_world)
+    depth = maps.depth_sum / maps.coverage.clamp(min=LEAST_COVERAGE) + maps.depth_origin
+    pixels = (maps.coverage.detach().flatten() > LEAST_COVERAGE).nonzero().squeeze(1)
+    seen = covered_pixels(maps.features, maps.coverage, pixels, camera)
+    radiance = shade_split_sum(
+        seen.diffuse_albedo, seen.residual, seen.f0, seen.roughness, seen.normal, seen.wo, tables, light_from_world=light_from_world
+    )
     size = (camera.height, camera.width)
 
     def image(packed: Float[Tensor, "pixel channel"]) -> Float[Tensor, "height width channel"]:
         return packed.new_zeros(camera.height * camera.width, packed.shape[1]).index_copy(0, pixels, packed).view(*size, -1)
 
-    return StageOneMaps(image(radiance), maps.coverage, image(normal), depth, image(roughness)[..., 0], residual)
+    return StageOneMaps(image(radiance), maps.coverage, image(seen.normal), depth, image(seen.roughness[:, None])[..., 0], seen.residual)

@@ -6,9 +6,9 @@ import torch
 from drgs.maths.brdf import f0_from_base
 from drgs.reconstruct.fit.light.mesh_light import MeshLight
 from drgs.reconstruct.fit.light.split_sum import ENVIRONMENT_SIZE, brdf_table, filter_environment
-from drgs.reconstruct.fit.losses import display_image
 from drgs.reconstruct.fit.surface.surface_color import surface_color
 from drgs.reference import split_sum as reference
+from drgs.reference.image_terms import display_image
 
 VERTICES, PLACES, CEILING = 60, 500, 0.6
 TURN = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(5)))[0]
