@@ -90,6 +90,9 @@ def run_fit(fit: FitLoop, report: Callable[[FitReport], None] | None = None, sho
 
     Args:
         report: called after each step; may look at, not change, the state.
+
+    Raises:
+        ValueError: a step's loss is not finite; the state is as it was before that step.
     """
     state = fit.state
     recent: deque[float] = deque(maxlen=fit.view_count)
@@ -101,7 +104,14 @@ def run_fit(fit: FitLoop, report: Callable[[FitReport], None] | None = None, sho
         for group in state.optimizer.param_groups:
             group["lr"] = rates.get(group["name"], group["lr"])
         loss = fit.step(state.iteration)
-        torch.stack(list(loss.terms.values())).sum().backward()
+        total = torch.stack(list(loss.terms.values())).sum()
+        if not torch.isfinite(total):
+            lost = ", ".join(name for name, term in loss.terms.items() if not torch.isfinite(term))
+            raise ValueError(
+                f"step {state.iteration + 1} of {fit.iterations} of a fit has no finite error (of {lost or 'all terms together'}), so the build cannot go on; "
+                "expected finite numbers: look at the capture with `drgs doctor`, or build again with another --seed"
+            )
+        total.backward()
         if fit.after_backward is not None:
             fit.after_backward(loss)
         state.optimizer.step()

@@ -16,8 +16,8 @@ from drgs.warp_torch import launch, warp_array, warp_device
 
 SATURATED = 254 / 255
 """Of the ceiling, from where on a photograph only says "at least"."""
-LEAST_COVERAGE = 1e-4
-"""And as far from all of a pixel: beyond, masks have no gradient."""
+MASK_MARGIN = 1e-4
+"""Coverage nearer to none or all of a pixel than this has no gradient by masks."""
 SOLID = wp.constant(0.9)
 """Coverage from which neighbours are held together."""
 EDGE = wp.constant(8.0)
@@ -113,7 +113,12 @@ def compare_masks(
 ):
     """The cross-entropy of each pixel and its derivative."""
     i = first + wp.tid()
-    held = wp.clamp(coverage[i], LEAST_COVERAGE, 1.0 - LEAST_COVERAGE)
+    held = coverage[i]
+    # Not clamp, which makes a number of what is none: the sum must say that something went wrong.
+    if held < MASK_MARGIN:
+        held = MASK_MARGIN
+    if held > 1.0 - MASK_MARGIN:
+        held = 1.0 - MASK_MARGIN
     wanted = mask[i]
     value = float(0.0)
     if wanted > 0.0:

@@ -100,3 +100,17 @@ def test_cosine_rates_fall_to_a_tenth():
     rates = [cosine_rates(state.optimizer, iteration, 10)["light"] for iteration in range(11)]
     assert rates[0] == pytest.approx(0.1) and rates[5] == pytest.approx(0.055) and rates[10] == pytest.approx(0.01)
     assert rates == sorted(rates, reverse=True)
+
+
+def test_a_fit_without_a_finite_error_ends_in_a_sentence_and_keeps_the_state_of_before():
+    state = parabola_state()
+
+    def step(iteration: int) -> StepLoss:
+        terms = terms_of(state)
+        name = next(iter(terms))
+        return StepLoss(terms | ({name: terms[name] * float("nan")} if iteration == 2 else {}), CAMERA, 0.0)
+
+    with pytest.raises(ValueError, match=r"step 3 of 5 of a fit has no finite error \(of \w+\).*another --seed"):
+        run_fit(loop(state, 5, step=step))
+    assert state.iteration == 2
+    assert all(bool(torch.isfinite(value).all()) for value in state.parameters.values())

@@ -69,6 +69,12 @@ def test_masks_cost_their_cross_entropy_and_nothing_pulls_beyond_its_ends(device
     assert float(slope[::3].abs().max()) == float(slope[1::3].abs().max()) == 0
 
 
+def test_what_is_no_number_is_none_in_the_cost_of_masks(device):
+    coverage = torch.full((HEIGHT, WIDTH), 0.5, device=device)
+    coverage[3, 4] = torch.nan
+    assert torch.isnan(losses.mask_loss(coverage, torch.ones_like(coverage)))
+
+
 @pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("solid", ["some", "none"])
 def test_smoothness_is_that_of_solid_neighbours(device, channels, solid):

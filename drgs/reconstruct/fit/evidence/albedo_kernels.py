@@ -6,7 +6,8 @@ from torch import Tensor
 
 from drgs.maths.constants import SRGB_ENCODED_END, SRGB_GAMMA, SRGB_OFFSET, SRGB_SCALE, SRGB_SLOPE
 from drgs.reconstruct.fit.evidence.metal_evidence import DARK
-from drgs.reconstruct.fit.evidence.seen_vertices import SATURATED, SOLID
+from drgs.reconstruct.fit.evidence.seen_vertices import SOLID
+from drgs.reconstruct.fit.image_terms import SATURATED
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.face_samples import FaceSamples
 from drgs.warp_torch import launch, warp_argument, warp_device

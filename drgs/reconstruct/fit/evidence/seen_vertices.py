@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drgs.maths.color import linear_from_srgb
+from drgs.reconstruct.fit.image_terms import SATURATED
 from drgs.reconstruct.fit.light.mesh_light import MeshLight, radiance_along
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.render.intersect.trace_rays import trace_rays
@@ -18,7 +19,6 @@ from drgs.render.intersect.tracer import AbstractTracer
 FACING = 0.25
 """Least cosine between normal and view."""
 SOLID = 0.995
-SATURATED = 254 / 255
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,8 @@ from torch import Tensor
 from drgs.maths.color import linear_from_srgb
 from drgs.reconstruct.fit.evidence.albedo_kernels import add_photograph
 from drgs.reconstruct.fit.evidence.metal_evidence import DARK
-from drgs.reconstruct.fit.evidence.seen_vertices import SATURATED, SOLID
+from drgs.reconstruct.fit.evidence.seen_vertices import SOLID
+from drgs.reconstruct.fit.image_terms import SATURATED
 from drgs.reconstruct.fit.view_targets import ViewTarget
 from drgs.reconstruct.geometry.face_samples import FaceSamples, face_samples
 from drgs.scene.camera import Camera
