@@ -14,16 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import warp as wp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy import ndimage
 from torch import Tensor
 
-from drgs.reconstruct.capture.hull_rays import SolidRays, seen_from_elsewhere
+from drgs.reconstruct.capture.column_trials import ColumnTrials
+from drgs.reconstruct.capture.hull_rays import SolidRays
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.render.intersect.tracer import AbstractTracer
-from drgs.warp_torch import by_pool, launch, warp_array, warp_device
 
 BEYOND = 1e-3
 """Of the radius: from where a ray enters or leaves the hull to where it is followed on."""
@@ -118,7 +117,7 @@ def find_pit(
     columns = _Columns.below(lid, direction, outer, radius, settings)
     if int(columns.inside.sum()) < settings.least:
         return None
-    search = _Search(columns, _Rays.of(looks, columns, outer, radius, settings), radius, cell, settings)
+    search = _Search(columns, _rays_of(looks, columns, outer, radius, cell, settings), radius, settings)
     depth = search.best()
     if depth is None:
         return None
@@ -173,78 +172,28 @@ class _Columns:
         return cls(axes, low, width, height.reshape(shape), covered, np.maximum(thick - settings.shallow * radius, 0))
 
 
-@wp.kernel(enable_backward=False, module="unique")
-def meet_columns(
-    first: int,
-    origin: wp.array[wp.vec3],
-    direction: wp.array[wp.vec3],
-    start: wp.array[float],
-    end: wp.array[float],
-    height: wp.array2d[float],
-    width: float,
-    step: float,
-    # outputs
-    distance: wp.array[float],
-):
-    """Along each ray, by the columns' axes, to the first place that is in a column or beside all of them; -1 where there is none before the end."""
-    i = first + wp.tid()
-    t = start[i]
-    found = float(-1.0)
-    while t < end[i] and found < 0.0:
-        place = origin[i] + t * direction[i]
-        u = int(wp.floor(place[0] / width))
-        v = int(wp.floor(place[1] / width))
-        if u < 0 or v < 0 or u >= height.shape[0] or v >= height.shape[1] or place[2] <= height[u, v]:
-            found = t
-        t += step
-    distance[i] = found
+def _rays_of(looks: SolidRays, columns: _Columns, outer: AbstractTracer, radius: float, cell: float, settings: PitSettings) -> ColumnTrials:
+    """Some of the looks, followed through the hull."""
+    drawn = torch.randperm(len(looks), generator=torch.Generator().manual_seed(0))[: settings.rays].sort().values
+    kept = torch.zeros(len(looks), dtype=torch.bool)
+    kept[drawn] = True
+    looks = looks[kept.to(looks.view.device)]
+    origin, direction = looks.rays.origin, looks.rays.direction
+    axes = torch.from_numpy(columns.axes).to(origin)
 
+    def next_hit(start: Float[Tensor, "ray"]) -> tuple[Float[Tensor, "ray"], Bool[Tensor, "ray"]]:
+        hits = trace_rays((origin + start[:, None] * direction).contiguous(), direction, outer)
+        return start + torch.where(hits.hit, hits.distance, torch.zeros_like(start)), hits.hit
 
-@dataclass(frozen=True, eq=False)
-class _Rays:
-    """Through the lid; by the columns' axes, from where the first column begins."""
-
-    origin: Float[Tensor, "ray 3"]
-    direction: Float[Tensor, "ray 3"]
-    enters: Float[Tensor, "ray"]
-    """The hull; a little later."""
-    leaves: Float[Tensor, "ray"]
-    returns: Float[Tensor, "ray"]
-    """Where it meets the hull once more; -1: nowhere."""
-    colors: Float[Tensor, "ray 3"]
-    view: Int[Tensor, "ray"]
-
-    @classmethod
-    def of(cls, looks: SolidRays, columns: _Columns, outer: AbstractTracer, radius: float, settings: PitSettings) -> "_Rays":
-        drawn = torch.randperm(len(looks), generator=torch.Generator().manual_seed(0))[: settings.rays].sort().values
-        kept = torch.zeros(len(looks), dtype=torch.bool)
-        kept[drawn] = True
-        looks = looks[kept.to(looks.view.device)]
-        origin, direction = looks.rays.origin, looks.rays.direction
-        axes = torch.from_numpy(columns.axes).to(origin)
-
-        def next_hit(start: Float[Tensor, "ray"]) -> tuple[Float[Tensor, "ray"], Bool[Tensor, "ray"]]:
-            hits = trace_rays((origin + start[:, None] * direction).contiguous(), direction, outer)
-            return start + torch.where(hits.hit, hits.distance, torch.zeros_like(start)), hits.hit
-
-        enters, _ = next_hit(torch.zeros_like(origin[:, 0]))
-        leaves, _ = next_hit(enters + 0.2 * BEYOND * radius)
-        again, returns = next_hit(leaves + BEYOND * radius)
-        low = torch.from_numpy(np.append(columns.low, 0.0)).to(origin)
-        return cls(
-            (origin @ axes.T - low).contiguous(), (direction @ axes.T).contiguous(), enters + BEYOND * radius, leaves,
-            torch.where(returns, again, torch.full_like(again, -1.0)), looks.colors, torch.unique(looks.view, return_inverse=True)[1],
-        )  # fmt: skip
-
-    def at(self, distance: Float[Tensor, "ray"]) -> Float[Tensor, "ray 3"]:
-        return self.origin + distance[:, None] * self.direction
-
-    def ends(self, heights: Float[Tensor, "u v"], width: float) -> Float[Tensor, "ray"]:
-        """Distances to where rays meet columns of these heights, or the hull once more; -1: they leave the object."""
-        found = torch.empty_like(self.enters)
-        inputs = [warp_array(self.origin, wp.vec3), warp_array(self.direction, wp.vec3), warp_array(self.enters), warp_array(self.leaves)]
-        launch(meet_columns, len(found), [*inputs, warp_array(heights), width, 0.5 * width], [warp_array(found)], warp_device(found))
-        return torch.where(found < 0, self.returns, found)
+    enters, _ = next_hit(torch.zeros_like(origin[:, 0]))
+    leaves, _ = next_hit(enters + 0.2 * BEYOND * radius)
+    again, returns = next_hit(leaves + BEYOND * radius)
+    low = torch.from_numpy(np.append(columns.low, 0.0)).to(origin)
+    return ColumnTrials(
+        (origin @ axes.T - low).contiguous(), (direction @ axes.T).contiguous(), enters + BEYOND * radius, leaves,
+        torch.where(returns, again, torch.full_like(again, -1.0)), looks.colors, torch.unique(looks.view, return_inverse=True)[1],
+        columns.width, cell, MOST_DIFFERENCE,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,16 +201,15 @@ class _Search:
     """Of the depths that leave least."""
 
     columns: _Columns
-    rays: _Rays
+    rays: ColumnTrials
     radius: float
-    cell: float
     settings: PitSettings
 
     def best(self) -> Float[ndarray, "u v"] | None:
         """None where one floor or large blocks leave too much already, and where there is no rim."""
         settings, inside = self.settings, self.columns.inside
         depth = np.zeros(inside.shape)
-        (whole,) = self._left_by([depth])
+        (whole,) = self._left_by([depth], depth)
         within = ndimage.distance_transform_edt(inside) * self.columns.width
         floors = ((within > wall * self.radius) * deep * self.radius for wall in settings.walls for deep in settings.depths)
         least, depth = self._least(whole, depth, list(floors))
@@ -306,15 +254,15 @@ class _Search:
         self, least: float, depth: Float[ndarray, "u v"], trials: list[Float[ndarray, "u v"]]
     ) -> tuple[float, Float[ndarray, "u v"]]:
         """What is left by the depth or the trial that leaves least, the first of them, and which that is."""
-        return min([(least, depth), *zip(self._left_by(trials), trials, strict=True)], key=lambda pair: pair[0])
+        return min([(least, depth), *zip(self._left_by(trials, depth), trials, strict=True)], key=lambda pair: pair[0])
 
-    def _left_by(self, trials: list[Float[ndarray, "u v"]]) -> list[float]:
-        return by_pool(lambda k, _: self.left(trials[k]), range(len(trials) + 1), self.rays.origin.device)
+    def _left_by(self, trials: list[Float[ndarray, "u v"]], depth: Float[ndarray, "u v"]) -> list[float]:
+        """By each trial's depths, much like `depth`, the mean difference of rays from what other views see where they end."""
+        return self.rays.left(self._heights(np.stack(trials)), self._heights(depth)).tolist()
 
-    def left(self, depth: Float[ndarray, "u v"]) -> float:
-        """Mean difference of rays from what other views see where they end."""
-        difference, known = self._differences(depth)
-        return float(difference[known].mean()) if bool(known.any()) else MOST_DIFFERENCE
+    def _heights(self, depth: Float[ndarray, "*trial u v"]) -> Float[Tensor, "*trial u v"]:
+        heights = np.where(self.columns.inside, self.columns.lid - np.minimum(depth, self.columns.most), FAR)
+        return torch.from_numpy(heights.astype(np.float32)).to(self.rays.origin.device)
 
     def alike(self, depth: Float[ndarray, "u v"]) -> Bool[ndarray, "u v"]:
         """Columns at which views agree about what is below; asked twice, for what is left full hides what was seen across it."""
@@ -322,20 +270,10 @@ class _Search:
         place = self.rays.at(self.rays.enters) / self.columns.width
         column = tuple(place[:, axis].long().clamp(0, size - 1).cpu().numpy() for axis, size in enumerate(depth.shape))
         for _ in range(2):
-            difference, known = (values.cpu().double().numpy() for values in self._differences(depth * alike))
+            difference, known = (values.cpu().double().numpy() for values in self.rays.differences(self._heights(depth * alike)))
             total, count = np.zeros(depth.shape), np.zeros(depth.shape)
             np.add.at(total, column, difference * known)
             np.add.at(count, column, known)
             total, count = (ndimage.uniform_filter(values, self.settings.around) for values in (total, count))
             alike &= total <= self.settings.unlike * count
         return ndimage.median_filter(alike, 3)
-
-    def _differences(self, depth: Float[ndarray, "u v"]) -> tuple[Float[Tensor, "ray"], Bool[Tensor, "ray"]]:
-        """Of rays from what other views see where they end, and whether anything is seen there."""
-        rays = self.rays
-        heights = np.where(self.columns.inside, self.columns.lid - np.minimum(depth, self.columns.most), FAR)
-        distance = rays.ends(torch.from_numpy(heights).to(rays.origin), self.columns.width)
-        ended = distance >= 0
-        mean, seen = seen_from_elsewhere(rays.at(distance), ended, rays.colors, rays.view, self.cell)
-        difference = (rays.colors - mean).abs().mean(1).clamp(max=MOST_DIFFERENCE)
-        return torch.where(ended, difference, torch.full_like(difference, MOST_DIFFERENCE)), seen | ~ended

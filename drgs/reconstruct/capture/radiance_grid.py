@@ -10,8 +10,7 @@ In: rays with colours, a box, what of it is inside. Out: RadianceGrid, which tel
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,7 +18,8 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.ray_costs import ray_costs, ray_depths
 from drgs.reconstruct.fit.adam import Adam
-from drgs.reconstruct.fit.cost_in_slices import cost_in_slices
+from drgs.reconstruct.fit.cost_in_slices import SLICES
+from drgs.warp_torch import by_pool
 
 HARMONICS = 4
 """Of degree 0 and 1: 1, x, y, z."""
@@ -138,16 +138,12 @@ def fit_radiance_grid(
             drawn = torch.randint(len(colors), (settings.rays_a_step,), generator=generator).to(colors.device)
             shake = torch.rand(settings.rays_a_step, 1, generator=generator).to(colors.device)
             batch = (rays[drawn], colors[drawn], shake)
-            cost = partial(_cost_of_rays, grid, batch, settings, done > settings.gathered_from * total)
-            loss, _ = cost_in_slices(len(drawn), (grid.density, grid.colors), cost, generator)
-            steps_between = [grid.density.diff(dim=axis).square().mean() for axis in range(3)]
-            optimizer.zero_grad()
-            (loss / len(drawn) + settings.weight_even * torch.stack(steps_between).sum()).backward()
+            grid.density.grad, grid.colors.grad = _gradients(grid, batch, settings, done > settings.gathered_from * total)
             optimizer.step()
             done += 1
             if report is not None and done % 20 == 0:
                 report(done / total)
-    return None if grid is None else replace(grid, density=grid.density.detach(), colors=grid.colors.detach())
+    return grid
 
 
 def _finer(
@@ -171,28 +167,36 @@ def _finer(
     colors = torch.zeros(len(active) + 1, 3 * HARMONICS, device=low.device)
     density = torch.full_like(inside, settings.start_density)
     if coarse is not None:
-        with torch.no_grad():
-            density = coarse.looked_up(coarse.density, places).reshape(inside.shape).contiguous()
-            colors[1:] = coarse.coefficients_at(places[active])
-    return RadianceGrid(low, cell, density.requires_grad_(), inside, colors.requires_grad_(), row)
+        density = coarse.looked_up(coarse.density, places).reshape(inside.shape).contiguous()
+        colors[1:] = coarse.coefficients_at(places[active])
+    return RadianceGrid(low, cell, density, inside, colors, row)
 
 
-def _cost_of_rays(
-    grid: RadianceGrid, batch: tuple[Rays, Tensor, Tensor], settings: RadianceGridSettings, gather: bool, first: int, last: int,
-    leaves: tuple[Tensor, ...], generator: torch.Generator,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """SliceCost of some rays of a batch (rays, colours, shakes).
-
-    Args:
-        leaves: density and colours.
-    """
-    some = slice(first, last)
+def _gradients(
+    grid: RadianceGrid, batch: tuple[Rays, Tensor, Tensor], settings: RadianceGridSettings, gather: bool
+) -> tuple[Tensor, Tensor]:
+    """Of the cost of a batch (rays, colours, shakes), by density and colours."""
     rays, colors, shake = batch
-    here = rays[some]
     weights = (settings.weight_opaque, settings.weight_gathered if gather else 0.0)
-    density, hue = leaves
-    through = (here.origin, here.direction, here.near, here.far)
-    cost = ray_costs(
-        through, colors[some], shake[some], grid.low, grid.cell, grid.inside, grid.row, density, hue, weights, settings.least_weight
-    )
-    return cost, shake.new_zeros(())
+
+    def of_some(first: int, last: int) -> tuple[Tensor, Tensor]:
+        some = slice(first, last)
+        here = rays[some]
+        through = (here.origin, here.direction, here.near, here.far)
+        return ray_costs(
+            through, colors[some], shake[some], grid.low, grid.cell, grid.inside, grid.row, grid.density, grid.colors, weights,
+            settings.least_weight,
+        )[1:]  # fmt: skip
+
+    device = colors.device
+    parts = SLICES if device.type == "cpu" else 1
+    found = by_pool(of_some, [len(shake) * k // parts for k in range(parts + 1)], device)
+    density, hue = (sum(others, start=first).div_(len(shake)) for first, *others in zip(*found, strict=True))
+    field = grid.density
+    for axis in range(3):
+        slope = field.diff(dim=axis)
+        slope *= 2 * settings.weight_even / slope.numel()
+        last = field.shape[axis] - 1
+        density.narrow(axis, 1, last).add_(slope)
+        density.narrow(axis, 0, last).sub_(slope)
+    return density, hue

@@ -3,9 +3,6 @@
 As some fifty operations on all samples a step of the fit took five times as long. Formulas: drgs/reference/ray_costs.py.
 """
 
-from typing import Any
-
-import torch
 import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -56,12 +53,12 @@ def _share(here: _Cell, corner: int) -> float:
 
 
 @wp.func
-def _value(field: wp.array[float], here: _Cell, count: int) -> float:
-    total = float(0.0)
+def _inside_and_density(inside: wp.array[float], density: wp.array[float], here: _Cell, count: int) -> wp.vec2:
+    total = wp.vec2(0.0, 0.0)
     for corner in range(8):
         node = _node(here, corner, count)
         if node >= 0:
-            total += _share(here, corner) * field[node]
+            total += _share(here, corner) * wp.vec2(inside[node], density[node])
     return total
 
 
@@ -72,27 +69,32 @@ def _inner(at: wp.vec3, count: int) -> wp.vec3:
 
 
 @wp.func
-def _shown(colors: wp.array2d[float], row: wp.array[wp.int64], here: _Cell, count: int, direction: wp.vec3) -> wp.vec3:
-    raw = wp.vec3(0.0, 0.0, 0.0)
+def _shown(colors: wp.array2d[wp.vec4], row: wp.array[wp.int64], here: _Cell, count: int, harmonics: wp.vec4) -> wp.vec3:
+    red = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    green = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    blue = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for corner in range(8):
         r = int(row[_node(here, corner, count)])
         share = _share(here, corner)
-        for c in range(3):
-            value = colors[r, 4 * c] + colors[r, 4 * c + 1] * direction[0] + colors[r, 4 * c + 2] * direction[1]
-            raw[c] = raw[c] + share * (value + colors[r, 4 * c + 3] * direction[2])
+        red += share * colors[r, 0]
+        green += share * colors[r, 1]
+        blue += share * colors[r, 2]
+    raw = wp.vec3(wp.dot(red, harmonics), wp.dot(green, harmonics), wp.dot(blue, harmonics))
     return wp.vec3(1.0 / (1.0 + wp.exp(-raw[0])), 1.0 / (1.0 + wp.exp(-raw[1])), 1.0 / (1.0 + wp.exp(-raw[2])))
 
 
 @wp.func
-def _add_color(gradients: wp.array2d[float], row: wp.array[wp.int64], here: _Cell, count: int, direction: wp.vec3, g: wp.vec3):
+def _add_color(gradients: wp.array2d[wp.vec4], row: wp.array[wp.int64], here: _Cell, count: int, harmonics: wp.vec4, g: wp.vec3):
     """The gradient g of what _shown has before the sigmoid."""
+    red = g[0] * harmonics
+    green = g[1] * harmonics
+    blue = g[2] * harmonics
     for corner in range(8):
         r = int(row[_node(here, corner, count)])
         share = _share(here, corner)
-        for c in range(3):
-            wp.atomic_add(gradients, r, 4 * c, share * g[c])
-            for axis in range(3):
-                wp.atomic_add(gradients, r, 4 * c + 1 + axis, share * g[c] * direction[axis])
+        wp.atomic_add(gradients, r, 0, share * red)
+        wp.atomic_add(gradients, r, 1, share * green)
+        wp.atomic_add(gradients, r, 2, share * blue)
 
 
 @wp.func
@@ -122,11 +124,12 @@ def rays_there(
     count: int,
     density: wp.array[float],
     inside: wp.array[float],
-    colors: wp.array2d[float],
+    colors: wp.array2d[wp.vec4],
     row: wp.array[wp.int64],
     least: float,
     # outputs
     samples: wp.array2d[wp.vec3],
+    shown: wp.array2d[wp.vec3],
     off: wp.array[wp.vec3],
     stopped_and_middle: wp.array[wp.vec2],
 ):
@@ -137,6 +140,7 @@ def rays_there(
     """
     ray = first + wp.tid()
     d = direction[ray]
+    harmonics = wp.vec4(1.0, d[0], d[1], d[2])
     start = near[ray] - cell
     length = far[ray] + cell - start
     step = length / (float(count) * cell)
@@ -150,19 +154,20 @@ def rays_there(
         offset = _offset(k, shake[ray], count)
         at = (origin[ray] + (start + length * offset) * d - low) / cell
         here = _cell_at(at)
-        value = float(0.0)
+        value = _inside_and_density(inside, density, here, count)
         stopped = float(0.0)
-        if _value(inside, here, count) > 0.5:
-            value = _value(density, here, count)
-            stopped = _stopped(value, step)
+        if value[0] > 0.5:
+            stopped = _stopped(value[1], step)
         w = stopped * passed
-        samples[ray, k] = wp.vec3(value, stopped, w)
+        samples[ray, k] = wp.vec3(value[1], stopped, w)
         passed *= 1.0 - stopped + PASSED
         total += w
         middle += w * offset * length / side
         if w > least:
             kept += w
-            image += w * _shown(colors, row, _cell_at(_inner(at, count)), count, d)
+            seen = _shown(colors, row, _cell_at(_inner(at, count)), count, harmonics)
+            shown[ray, k] = seen
+            image += w * seen
     # What was not looked up has the photograph's colour.
     off[ray] = image + (total - kept) * photo[ray] - photo[ray]
     stopped_and_middle[ray] = wp.vec2(total, middle / wp.max(total, LEAST_STOPPED))
@@ -179,17 +184,17 @@ def rays_back(
     low: wp.vec3,
     cell: float,
     count: int,
-    colors: wp.array2d[float],
     row: wp.array[wp.int64],
     weights: wp.vec2,
     least: float,
     samples: wp.array2d[wp.vec3],
+    shown: wp.array2d[wp.vec3],
     off: wp.array[wp.vec3],
     stopped_and_middle: wp.array[wp.vec2],
     # outputs
     cost: wp.array[float],
     density_gradient: wp.array[float],
-    color_gradient: wp.array2d[float],
+    color_gradient: wp.array2d[wp.vec4],
 ):
     """Each ray's cost and its gradient. `weights` are those of an opaque object and of gathered density.
 
@@ -197,6 +202,7 @@ def rays_back(
     """
     ray = first + wp.tid()
     d = direction[ray]
+    harmonics = wp.vec4(1.0, d[0], d[1], d[2])
     start = near[ray] - cell
     length = far[ray] + cell - start
     step = length / (float(count) * cell)
@@ -223,10 +229,10 @@ def rays_back(
         at = (origin[ray] + (start + length * offset) * d - low) / cell
         g_weight = g_total + weights[1] * (wp.abs(offset * scale - middle) + pull * offset * scale / wp.max(total, LEAST_STOPPED))
         if w > least:
-            within = _cell_at(_inner(at, count))
-            shown = _shown(colors, row, within, count, d)
-            g_weight += wp.dot(g_image, shown)
-            _add_color(color_gradient, row, within, count, d, wp.cw_mul(g_image, wp.cw_mul(shown, wp.vec3(1.0, 1.0, 1.0) - shown)) * w)
+            seen = shown[ray, k]
+            g_weight += wp.dot(g_image, seen)
+            slope = wp.cw_mul(g_image, wp.cw_mul(seen, wp.vec3(1.0, 1.0, 1.0) - seen)) * w
+            _add_color(color_gradient, row, _cell_at(_inner(at, count)), count, harmonics, slope)
         if stopped > 0.0:
             g_opacity = g_weight * w / stopped - behind / (1.0 - stopped + PASSED)
             g_value = g_opacity * step * (1.0 - stopped) / (1.0 + wp.exp(-samples[ray, k][0]))
@@ -271,10 +277,10 @@ def rays_stop(
     half = float(wp.inf)
     for k in range(samples):
         distance = start + length * _offset(k, 0.5, samples)
-        here = _cell_at((origin[ray] + distance * direction[ray] - low) / cell)
+        value = _inside_and_density(inside, density, _cell_at((origin[ray] + distance * direction[ray] - low) / cell), count)
         stopped = float(0.0)
-        if _value(inside, here, count) > 0.5:
-            stopped = _stopped(_value(density, here, count), step)
+        if value[0] > 0.5:
+            stopped = _stopped(value[1], step)
         w = stopped * passed
         weights[ray, k] = w
         passed *= 1.0 - stopped + PASSED
@@ -324,8 +330,10 @@ def ray_costs(
     colors: Float[Tensor, "row 12"],
     weights: tuple[float, float],
     least: float,
-) -> Float[Tensor, ""]:
-    """Their sum, differentiable in `density` and `colors`, once.
+) -> tuple[Float[Tensor, ""], Float[Tensor, "n n n"], Float[Tensor, "row 12"]]:
+    """Their sum, and its gradients by `density` and `colors`.
+
+    Many arguments because they are what rays_there and rays_back take.
 
     Args:
         rays: origins (ray, 3), unit directions (ray, 3), where they enter the hull (ray,) and leave it (ray,). photo: sRGB. shake: 0..1, of a ray's
@@ -333,32 +341,34 @@ def ray_costs(
         least: RadianceGridSettings.least_weight.
     """
     given = tuple(values.contiguous() for values in (*rays, photo, shake[:, 0]))
-    return _RayCosts.apply(density, colors, given, tuple(low.tolist()), cell, inside, row, weights, least)
+    density, colors = density.detach().contiguous(), colors.detach().contiguous()
+    flat, device, count, side = density.reshape(-1), warp_device(density), len(given[0]), len(density)
+    samples, hues = density.new_empty(count, side, 3), density.new_empty(count, side, 3)
+    off, sums, cost = (density.new_empty(count, *tail) for tail in ((3,), (2,), ()))
+    origin, direction, near, far, photos, shaken = (warp_argument(x, dtype) for x, dtype in zip(given, _TYPES, strict=True))
+    space = (wp.vec3(*low.tolist()), cell, side)
+    there = [*(warp_argument(x, wp.vec3) for x in (samples, hues, off)), warp_argument(sums, wp.vec2)]
+    rows = warp_argument(row)
+    inputs = [
+        origin,
+        direction,
+        near,
+        far,
+        photos,
+        shaken,
+        *space,
+        warp_argument(flat),
+        warp_argument(inside.reshape(-1)),
+        warp_argument(colors.reshape(-1, 3, 4), wp.vec4),
+        rows,
+        least,
+    ]
+    launch(rays_there, count, inputs, there, device)
+    inputs = [origin, direction, near, far, shaken, *space, rows, wp.vec2(*weights), least, *there]
+    by_density, by_colors = launch_adding(
+        rays_back, count, inputs, [warp_argument(cost)], [(flat, None), (colors.reshape(-1, 3, 4), wp.vec4)], device
+    )
+    return cost.sum(), by_density.reshape(density.shape), by_colors.reshape(colors.shape)
 
 
 _TYPES = (wp.vec3, wp.vec3, None, None, wp.vec3, None)
-
-
-class _RayCosts(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, density, colors, given, low, cell, inside, row, weights, least) -> Tensor:
-        density, colors = density.detach().contiguous(), colors.detach().contiguous()
-        flat, device, count, side = density.reshape(-1), warp_device(density), len(given[0]), len(density)
-        samples = density.new_empty(count, side, 3)
-        off, sums, cost = (density.new_empty(count, *tail) for tail in ((3,), (2,), ()))
-        origin, direction, near, far, photo, shake = (warp_argument(x, dtype) for x, dtype in zip(given, _TYPES, strict=True))
-        space, there = (
-            (wp.vec3(*low), cell, side),
-            [warp_argument(samples, wp.vec3), warp_argument(off, wp.vec3), warp_argument(sums, wp.vec2)],
-        )
-        hues = [warp_argument(colors), warp_argument(row)]
-        inputs = [origin, direction, near, far, photo, shake, *space, warp_argument(flat), warp_argument(inside.reshape(-1)), *hues, least]
-        launch(rays_there, count, inputs, there, device)
-        inputs = [origin, direction, near, far, shake, *space, *hues, wp.vec2(*weights), least, *there]
-        by_density, by_colors = launch_adding(rays_back, count, inputs, [warp_argument(cost)], [(flat, None), (colors, None)], device)
-        ctx.save_for_backward(by_density.reshape(density.shape), by_colors)
-        return cost.sum()
-
-    @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        return (*(gradient * upstream for gradient in ctx.saved_tensors), *[None] * 7)

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-import warp as wp
 
 from drgs.reconstruct.capture import open_vessels as module
-from drgs.reconstruct.capture.find_pit import FAR, Pit, PitSettings, meet_columns
+from drgs.reconstruct.capture.find_pit import Pit, PitSettings
 from drgs.reconstruct.capture.open_vessels import VesselSettings, open_vessels
 from drgs.reconstruct.capture.visual_hull import VisualHull
 from drgs.render.intersect.trace_rays import trace_rays
 from drgs.scene.views import Views
-from drgs.warp_torch import launch, warp_array, warp_device
 from tests.reconstruct.capture.test_find_hollows import CPU, photographed, tracer_of
 from tests.reconstruct.capture.test_open_vessels import hull_of, plain, satin
 
@@ -102,29 +100,6 @@ def test_small_lids_are_not_asked(white_tray: Views, solid: VisualHull, monkeypa
     assert open_vessels(white_tray, solid, replace(SETTINGS, pits=PitSettings(least_lid=1.1)), CPU) is solid
 
 
-def test_rays_meet_columns_where_small_steps_find_them() -> None:
-    random = np.random.default_rng(0)
-    height = np.where(random.random((9, 7)) < 0.2, FAR, random.uniform(-1, 0, (9, 7)))
-    width, count = 0.2, 300
-    origin = np.concatenate([random.uniform(0, 1.3, (count, 2)), np.full((count, 1), 0.4)], 1)
-    direction = random.normal(size=(count, 3)) - [0, 0, 0.6]
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    start, end = np.full(count, 0.05), random.uniform(0.3, 2.0, count)
-    tensors = [torch.from_numpy(part).float() for part in (origin, direction, start, end, height)]
-    found = torch.empty(count)
-    step = 0.002
-    inputs = [*(warp_array(part, kind) for part, kind in zip(tensors, (wp.vec3, wp.vec3, None, None, None), strict=True)), width, step]
-    launch(meet_columns, count, inputs, [warp_array(found)], warp_device(found))
-    for ray in range(count):
-        along = start[ray] + step * np.arange(int(np.ceil((end[ray] - start[ray]) / step)))
-        place = origin[ray] + along[:, None] * direction[ray]
-        column = np.floor(place[:, :2] / width).astype(int)
-        outside = ((column < 0) | (column >= height.shape)).any(1)
-        met = outside | (place[:, 2] <= height[tuple(np.where(outside[:, None], 0, column).T)])
-        expected = along[met.argmax()] if met.any() else -1.0
-        assert float(found[ray]) == pytest.approx(expected, abs=2 * step)
-
-
 def test_a_pit_holds_what_is_below_its_lid_and_above_its_floor() -> None:
     depth = np.zeros((4, 3))
     depth[1, 1], depth[2, 1] = 0.5, 0.2
@@ -144,14 +119,14 @@ def test_a_pit_is_full_where_views_do_not_agree() -> None:
 @pytest.mark.slow
 def test_a_mirror_that_stands_in_a_tray_is_not_dug_out() -> None:
     """A pit explains what it mirrors better than its hull does, and the rest of the tray is one."""
-    ball = trimesh.creation.icosphere(3, radius=0.2)
+    ball = trimesh.creation.icosphere(3, radius=0.17)
     ball.apply_translation([0.0, 0.0, 0.05])
     whole = trimesh.util.concatenate([tray_without_block(), ball])
     object_ = tracer_of(whole)
     paint = plain(object_)
 
     def shade(place: torch.Tensor, normal: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-        on_ball = (place - torch.tensor([0.0, 0.0, 0.05])).norm(dim=1, keepdim=True) < 0.21
+        on_ball = (place - torch.tensor([0.0, 0.0, 0.05])).norm(dim=1, keepdim=True) < 0.18
         return torch.where(on_ball, satin(place, normal, direction), paint(place, normal, direction))
 
     views = photographed(object_, shade, 32, 96)
@@ -161,6 +136,6 @@ def test_a_mirror_that_stands_in_a_tray_is_not_dug_out() -> None:
     )
     assert dug is not hull and opened is not hull
     tops = [height_at(surface, 0.0, 0.0) for surface in (dug, opened)]
-    assert tops[0] < 0.22 and abs(tops[1] - 0.25) < 0.01, tops
+    assert tops[0] < 0.19 and abs(tops[1] - 0.22) < 0.01, tops
     floor = [height_at(opened, x, y) for x in (-0.32, 0.32) for y in (-0.2, 0.2)]
     assert float(np.median(floor)) < 0.08 and min(height_at(hull, x, y) for x in (-0.32, 0.32) for y in (-0.2, 0.2)) > 0.14, floor
