@@ -21,6 +21,8 @@ wp.set_module_options({"enable_backward": False})
 
 SLACK = 1.0
 """[pixels] outside its outline that a mask still allows: outlines are rough by as much."""
+TOGETHER = 64
+"""Points that are asked about one view after the other, so that what they see of it stays in the cache."""
 REACH = 16.0
 """[pixels] at which distances in the pictures end."""
 
@@ -33,23 +35,25 @@ def farthest_outside(
     sizes: wp.array[wp.vec2i],
     distances: wp.array3d[float],
     focal: wp.array[float],
+    together: int,
     # outputs
     outside: wp.array[float],
 ):
-    """One thread a point: the largest distance [world units] of all views that see it, and what is there already."""
-    i = first + wp.tid()
-    farthest = outside[i]
+    """One thread so many points `together`, which lie beside each other, as their pixels do: the largest distance [world units] of all views that see
+    each, and what is there already."""
+    start = together * (first + wp.tid())
+    end = wp.min(start + together, points.shape[0])
     for view in range(distances.shape[0]):
-        place = seen_at(pixel_from_world, sizes, view, points[i])
-        if place[2] > 0.0:
-            column = corner_of(place[0], sizes[view][0])
-            row = corner_of(place[1], sizes[view][1])
-            u = between(place[0], column)
-            v = between(place[1], row)
-            top = distances[view, row, column] * (1.0 - u) + distances[view, row, column + 1] * u
-            bottom = distances[view, row + 1, column] * (1.0 - u) + distances[view, row + 1, column + 1] * u
-            farthest = wp.max(farthest, (top * (1.0 - v) + bottom * v) * place[2] / focal[view])
-    outside[i] = farthest
+        for i in range(start, end):
+            place = seen_at(pixel_from_world, sizes, view, points[i])
+            if place[2] > 0.0:
+                column = corner_of(place[0], sizes[view][0])
+                row = corner_of(place[1], sizes[view][1])
+                u = between(place[0], column)
+                v = between(place[1], row)
+                top = distances[view, row, column] * (1.0 - u) + distances[view, row, column + 1] * u
+                bottom = distances[view, row + 1, column] * (1.0 - u) + distances[view, row + 1, column + 1] * u
+                outside[i] = wp.max(outside[i], (top * (1.0 - v) + bottom * v) * place[2] / focal[view])
 
 
 class OutsideMasks:
@@ -67,8 +71,8 @@ class OutsideMasks:
         """Distances [world units], positive where a mask leaves the point out by more than SLACK; views that do not see it say nothing."""
         points = points.float().cpu().contiguous()
         outside = torch.full((len(points),), -UNBOUNDED)
-        inputs = [*self._masks.inputs(points)[:3], warp_array(self._distances), warp_array(self._masks.focal)]
-        launch(farthest_outside, len(points), inputs=inputs, outputs=[warp_array(outside)], device=warp_device(points))
+        inputs = [*self._masks.inputs(points)[:3], warp_array(self._distances), warp_array(self._masks.focal), TOGETHER]
+        launch(farthest_outside, -(-len(points) // TOGETHER), inputs=inputs, outputs=[warp_array(outside)], device=warp_device(points))
         return outside
 
 
