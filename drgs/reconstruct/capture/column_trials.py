@@ -1,7 +1,7 @@
 """What heights of columns leave between the views: whole trials side by side.
 
-find_pit tries thousands, of eight thousand rays each; as torch's operations one took more than twice as long, most of it sorting. A thread takes every
-so-maniest trial. Formulas: drgs/reference/column_trials.py.
+find_pit tries thousands, of eight thousand rays each; as torch's operations one took three times as long, most of it sorting. On the CPU each thread takes
+its share of the trials whole. Formulas: drgs/reference/column_trials.py.
 
 In: rays through a lid, heights of the columns below it. Out: what each trial leaves.
 """
@@ -17,8 +17,6 @@ from torch import Tensor
 from drgs.reconstruct.capture.hull_rays import seen_from_elsewhere
 from drgs.warp_torch import launch, thread_count, warp_array, warp_device
 
-AT_ONCE = 64
-"""Trials on a GPU; on the CPU as many as there are threads, whose tables stay in their caches."""
 CELLS_AWAY = wp.constant(1 << 14)
 """A place is numbered by its cell along three axes, each less far from the first column's: 45 bits, which leave 18 for a view."""
 
@@ -194,6 +192,8 @@ class ColumnTrials:
         Args:
             near: heights that the trials' do not differ much from: only rays that pass where they differ are followed for each.
         """
+        if self.origin.device.type != "cpu":  # where one thread for all rays of a trial is slow, and a sort is not
+            return torch.stack([self._mean_of(*self.differences(height)) for height in heights])
         changed = (heights != near).any(0).nonzero()
         box = wp.vec4i(*changed.amin(0).tolist(), *changed.amax(0).tolist()) if len(changed) else wp.vec4i(0, 0, -1, -1)
         otherwise = self.ends(near)
@@ -208,6 +208,10 @@ class ColumnTrials:
         launch(leave_between_views, min(len(keys), len(heights)), inputs, [*scratch, warp_array(found)], warp_device(found))
         return found
 
+    def _mean_of(self, difference: Float[Tensor, "ray"], known: Bool[Tensor, "ray"]) -> Float[Tensor, ""]:
+        count = known.sum()
+        return torch.where(count > 0, (difference * known).sum() / count.clamp(min=1), self.most)
+
     @cached_property
     def _along(self) -> list[wp.array]:
         """What of the rays both kernels take."""
@@ -216,10 +220,9 @@ class ColumnTrials:
 
     @cached_property
     def _tables(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Keys, sums and slots of leave_between_views: half empty at least, so that searches in them are short."""
+        """Keys, sums and slots of leave_between_views, of each thread: half empty at least, so that searches in them are short."""
         rays = len(self.origin)
         slots = 1 << (2 * rays - 1).bit_length()
-        device = self.origin.device
-        size = (thread_count() if device.type == "cpu" else AT_ONCE, 2)
-        keys = torch.empty(*size, slots, dtype=torch.int64, device=device)
-        return keys, torch.empty(*size, slots, 4, device=device), torch.empty(*size, rays, dtype=torch.int32, device=device)
+        size = (thread_count(), 2)
+        keys = torch.empty(*size, slots, dtype=torch.int64)
+        return keys, torch.empty(*size, slots, 4), torch.empty(*size, rays, dtype=torch.int32)

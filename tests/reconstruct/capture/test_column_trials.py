@@ -57,3 +57,11 @@ def test_what_trials_leave_is_the_twins_whatever_they_are_near(trials: ColumnTri
 def test_nothing_that_others_see_leaves_the_most(trials: ColumnTrials, device: str) -> None:
     alone = replace(trials, view=torch.zeros_like(trials.view), returns=torch.full_like(trials.returns, 2.5))
     assert alone.left(heights_of(1, device), heights_of(1, device)[0]).tolist() == pytest.approx([0.3])
+
+
+def test_the_way_of_other_devices_gives_the_same(trials: ColumnTrials) -> None:
+    heights = heights_of(3, "cpu")
+    alone = replace(trials, view=torch.zeros_like(trials.view), returns=torch.full_like(trials.returns, 2.5))
+    for rays in (trials, alone):
+        means = [float(rays._mean_of(*rays.differences(height))) for height in heights.to(rays.origin.device)]
+        assert means == pytest.approx(rays.left(heights.to(rays.origin.device), heights[0].to(rays.origin.device)).tolist(), abs=1e-6)
