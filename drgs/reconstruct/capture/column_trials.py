@@ -18,7 +18,8 @@ from drgs.reconstruct.capture.hull_rays import seen_from_elsewhere
 from drgs.warp_torch import launch, thread_count, warp_array, warp_device
 
 CELLS_AWAY = wp.constant(1 << 14)
-"""A place is numbered by its cell along three axes, each less far from the first column's: 45 bits, which leave 18 for a view."""
+"""A place is numbered by its cell along three axes, each less far from where rays enter: 45 bits, which leave 18 for a view. The object is some hundred
+cells long."""
 
 
 @wp.func
@@ -84,6 +85,7 @@ def leave_between_views(
     otherwise: wp.array[float],
     width: float,
     cell: float,
+    first_cell: wp.vec3i,
     most: float,
     # outputs
     keys: wp.array3d[wp.int64],
@@ -117,9 +119,9 @@ def leave_between_views(
             slots[part, 0, ray] = -1
             if distance >= 0.0:
                 place = (origin[ray] + distance * direction[ray]) / cell
-                x = wp.int64(wp.floor(place[0])) + away
-                y = wp.int64(wp.floor(place[1])) + away
-                z = wp.int64(wp.floor(place[2])) + away
+                x = wp.int64(int(wp.floor(place[0])) - first_cell[0]) + away
+                y = wp.int64(int(wp.floor(place[1])) - first_cell[1]) + away
+                z = wp.int64(int(wp.floor(place[2])) - first_cell[2]) + away
                 key = (x * (away + away) + y) * (away + away) + z
                 color = wp.vec4(colors[ray][0], colors[ray][1], colors[ray][2], 1.0)
                 for table in range(2):
@@ -203,7 +205,17 @@ class ColumnTrials:
             *self._along,
             *(warp_array(part, kind) for part, kind in ((self.returns, None), (self.colors, wp.vec3), (self.view.int(), None))),
         ]
-        inputs = [*given, int(self.view.max()) + 1, warp_array(heights), box, warp_array(otherwise), self.width, self.cell, self.most]
+        inputs = [
+            *given,
+            int(self.view.max()) + 1,
+            warp_array(heights),
+            box,
+            warp_array(otherwise),
+            self.width,
+            self.cell,
+            self._first_cell,
+            self.most,
+        ]
         scratch = [warp_array(keys), warp_array(sums, wp.vec4), warp_array(slots)]
         launch(leave_between_views, min(len(keys), len(heights)), inputs, [*scratch, warp_array(found)], warp_device(found))
         return found
@@ -217,6 +229,11 @@ class ColumnTrials:
         """What of the rays both kernels take."""
         parts = ((self.origin, wp.vec3), (self.direction, wp.vec3), (self.enters, None), (self.leaves, None))
         return [warp_array(part, kind) for part, kind in parts]
+
+    @cached_property
+    def _first_cell(self) -> wp.vec3i:
+        """Of where rays enter: the world's own middle may be far from the object."""
+        return wp.vec3i(*torch.floor(self.at(self.enters).amin(0) / self.cell).int().tolist())
 
     @cached_property
     def _tables(self) -> tuple[Tensor, Tensor, Tensor]:

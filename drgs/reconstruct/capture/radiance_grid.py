@@ -18,7 +18,7 @@ from torch import Tensor
 
 from drgs.reconstruct.capture.ray_costs import ray_costs, ray_depths
 from drgs.reconstruct.fit.adam import Adam
-from drgs.reconstruct.fit.cost_in_slices import SLICES
+from drgs.reconstruct.fit.cost_in_slices import slice_edges
 from drgs.warp_torch import by_pool
 
 HARMONICS = 4
@@ -188,9 +188,7 @@ def _gradients(
             settings.least_weight,
         )[1:]  # fmt: skip
 
-    device = colors.device
-    parts = SLICES if device.type == "cpu" else 1
-    found = by_pool(of_some, [len(shake) * k // parts for k in range(parts + 1)], device)
+    found = by_pool(of_some, slice_edges(len(shake), colors.device), colors.device)
     density, hue = (sum(others, start=first).div_(len(shake)) for first, *others in zip(*found, strict=True))
     field = grid.density
     for axis in range(3):

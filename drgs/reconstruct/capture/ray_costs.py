@@ -133,8 +133,8 @@ def rays_there(
     off: wp.array[wp.vec3],
     stopped_and_middle: wp.array[wp.vec2],
 ):
-    """What each ray shows, less the photograph. Of its samples (ray, sample): density before softplus, opacity, weight; of all: opacity, and where
-    in sides of the box the weight lies on average.
+    """What each ray shows, less the photograph. Of its samples (ray, sample): density before softplus, opacity, weight, and the colour `shown`
+    where that is looked up; of all: opacity, and where in sides of the box the weight lies on average.
 
     Many arguments because a struct of them would be filled anew, array by array, for each launch.
     """

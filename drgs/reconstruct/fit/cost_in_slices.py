@@ -33,13 +33,19 @@ def cost_in_slices(
         generator: on the CPU; one number is drawn from it for each part. slices: None: SLICES on the CPU, else 1.
     """
     device = inputs[0].device
-    parts = slices or (SLICES if device.type == "cpu" else 1)
-    edges = [count * k // parts for k in range(parts + 1)]
+    edges = slice_edges(count, device, slices)
+    parts = len(edges) - 1
     seeds = torch.randint(1 << 62, (parts,), generator=generator).tolist()
     done = by_pool(lambda k, _: _part(cost, edges[k], edges[k + 1], inputs, seeds[k]), range(parts + 1), device)
     gradients = tuple(torch.stack(one).sum(0) for one in zip(*(gradients for _, _, gradients in done), strict=True))
     value = torch.stack([value for value, _, _ in done]).sum(0)
     return _Known.apply(value, gradients, *inputs), torch.stack([other for _, other, _ in done]).sum(0)
+
+
+def slice_edges(count: int, device: torch.device, slices: int | None = None) -> list[int]:
+    """First of each part of `count` places, and the end; slices: None: SLICES on the CPU, else 1."""
+    parts = slices or (SLICES if device.type == "cpu" else 1)
+    return [count * k // parts for k in range(parts + 1)]
 
 
 def _part(cost: SliceCost, first: int, last: int, inputs: tuple[Tensor, ...], seed: int) -> tuple[Tensor, Tensor, list[Tensor]]:

@@ -65,3 +65,11 @@ def test_the_way_of_other_devices_gives_the_same(trials: ColumnTrials) -> None:
     for rays in (trials, alone):
         means = [float(rays._mean_of(*rays.differences(height))) for height in heights.to(rays.origin.device)]
         assert means == pytest.approx(rays.left(heights.to(rays.origin.device), heights[0].to(rays.origin.device)).tolist(), abs=1e-6)
+
+
+def test_an_object_far_from_the_worlds_middle_leaves_the_same(trials: ColumnTrials, device: str) -> None:
+    up = torch.tensor([0.0, 0.0, 2.0**15 * trials.cell], device=device)
+    far, heights = replace(trials, origin=trials.origin + up), heights_of(2, device) + up[2]
+    for height, left in zip(heights, far.left(heights, heights[0]).tolist(), strict=True):
+        difference, known = far.differences(height)
+        assert left == pytest.approx(float(difference[known].mean()), abs=1e-6)
