@@ -26,6 +26,7 @@ from torch import Tensor
 from drgs.reconstruct.geometry.mask_outlines import OutlineResiduals
 from drgs.reconstruct.geometry.mesh_edges import MeshEdges
 from drgs.reconstruct.geometry.symmetric_systems import SymmetricPlaces, solved
+from drgs.reconstruct.geometry.thickness import OtherSide
 from drgs.scene.mesh import vertex_normals
 
 TURNED = 0.3
@@ -76,12 +77,13 @@ def integrate_normals(
     settings: IntegrationSettings,
     homes: Places | None = None,
     texture: Places | None = None,
+    behind: OtherSide | None = None,
 ) -> Tensor:
     """(vertex, 3) positions after one solve.
 
     Args:
         vertices: (vertex, 3). faces: (face, 3). wanted_normals: (vertex, 3) unit. outlines: of these vertices.
-        homes, texture: None: there are none.
+        homes, texture: None: there are none. behind: which no vertex comes nearer to than it allows; None: none is held off.
     """
     direction = vertex_normals(vertices, faces)
     start, end = edges.vertices.unbind(1)
@@ -123,6 +125,8 @@ def integrate_normals(
         beside[0] -= even
         moved = solved(pattern.filled(torch.cat(beside)), diagonal, right_side, moved)
     step = torch.maximum(torch.minimum(moved.to(vertices), reach), -reach)
+    if behind is not None:
+        step = behind.kept_apart(step)
     return vertices + unfolded(vertices, direction, step, faces, edges)[:, None] * direction
 
 

@@ -16,11 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drgs.reconstruct.capture.build_box import BuildBox, whole_or_within
+from drgs.reconstruct.capture.build_box import whole_or_within
 from drgs.reconstruct.fit.adam import Adam
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.light.mesh_light import at_corners
-from drgs.reconstruct.fit.surface.moving_surface import MovingSurface
+from drgs.reconstruct.fit.surface.moving_surface import MoveSettings, MovingSurface
 from drgs.reconstruct.fit.surface.shade_surface import SeenPlaces
 from drgs.reconstruct.geometry.diffused import Diffusion
 from drgs.reconstruct.geometry.integrate_normals import unfolded
@@ -38,12 +38,12 @@ STEEP = 0.1
 class DisplacedSurface:
     """Final. The surface of a fit, displaced."""
 
-    def __init__(self, surface: MovingSurface, state: FitState, box: BuildBox | None = None) -> None:
+    def __init__(self, surface: MovingSurface, state: FitState, moves: MoveSettings | None = None) -> None:
         """
         Args:
-            box: of the build, which the surface does not leave.
+            moves: which parts stay how thick, and the box that the surface does not leave.
         """
-        self._surface, self._state, self._box = surface, state, box
+        self._surface, self._state, self._moves = surface, state, moves or MoveSettings()
         self._diffusion = Diffusion(surface.edges, len(state.parameters["vertices"]), DIFFUSION)
         self._begin()
 
@@ -79,12 +79,12 @@ class DisplacedSurface:
 
     @torch.no_grad()
     def settle(self) -> None:
-        """The displaced surface becomes the fit's, with offsets 0. Faces do not turn over."""
+        """The displaced surface becomes the fit's, with offsets 0. Faces do not turn over, and thin parts not inside out."""
         parameters = self._state.parameters
         vertices, offsets = parameters["vertices"], parameters["offsets"]
-        step = self._edge * self._diffusion(offsets)
+        step = self._surface.behind(self._moves).kept_apart(self._edge * self._diffusion(offsets))
         moved = vertices + unfolded(vertices, self._own, step, self._surface.faces, self._surface.edges)[:, None] * self._own
-        moved = whole_or_within(self._box, moved)
+        moved = whole_or_within(self._moves.box, moved)
         parameters["normals"].copy_(self.normals(moved))
         for place in (parameters["homeward"], parameters["to_texture"]):
             place += vertices - moved

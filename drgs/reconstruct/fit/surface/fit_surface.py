@@ -176,7 +176,7 @@ class _Steps:
         self.targets = whole_targets(views, faces.device)
         # A surface that stays has divided faces, whose many vertices would take seconds to trace finely, or is only compared.
         self.surface = MovingSurface(views, faces, state, same_place, COARSE if settings.still else FINE)
-        self.displaced = DisplacedSurface(self.surface, state, settings.moves.box) if settings.displaces else None
+        self.displaced = DisplacedSurface(self.surface, state, settings.moves) if settings.displaces else None
         # What photographs say of light that turns (light_from_turns) they say by normals, which a move has returned to the surface's own.
         self._light_at = settings.iterations // 2 if self.surface.light_turns else 0
 

@@ -28,6 +28,7 @@ from drgs.reconstruct.geometry.average_around import Averaging, averaged, averag
 from drgs.reconstruct.geometry.integrate_normals import IntegrationSettings, Places, integrate_normals
 from drgs.reconstruct.geometry.mask_outlines import OutlineRays, mask_outlines, outline_rays, outline_residuals
 from drgs.reconstruct.geometry.mesh_edges import mesh_edges
+from drgs.reconstruct.geometry.thickness import OtherSide, other_side
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
 from drgs.scene.environment import Environment
@@ -38,6 +39,8 @@ SHARED_RINGS = 2
 """Edges over which shares of irradiance are averaged."""
 MEAN_VIEWS = 8
 """Photographs over which irradiance is averaged where the light turns with the camera."""
+LEAST_CELLS = 1.5
+"""Of the mesh that is made anew, below which no move makes a part thinner: what is thinner than a cell has holes then."""
 ALIKE = 16
 """Power of the cosine between normals by which a neighbour counts."""
 
@@ -51,6 +54,8 @@ class MoveSettings:
     """Of positions: outlines are found anew between."""
     to_surface: float = 1.0
     """Share by which normals return to the surface's own afterwards."""
+    resolution: int = 200
+    """Cells along the longest side, with which the surface is meshed anew."""
     share_rays: int = 48
     """A vertex, for the irradiance that arrives there."""
     texture_radius: float = 0.0
@@ -109,6 +114,13 @@ class MovingSurface:
         self.tracer, self._around = self._tracer(), None
 
     @torch.no_grad()
+    def behind(self, settings: MoveSettings) -> OtherSide:
+        """The other side of what is thin, as the tracer has it now."""
+        vertices = self.tracer.mesh.vertices
+        cell = float((vertices.amax(0) - vertices.amin(0)).max()) / settings.resolution
+        return other_side(self.tracer, LEAST_CELLS * cell)
+
+    @torch.no_grad()
     def move(self, settings: MoveSettings, relight: bool = True) -> None:
         """Positions from normals and outlines, then light that the moved surface blocks and sends back.
 
@@ -123,7 +135,9 @@ class MovingSurface:
             # Of metal mirrors say where it lies.
             homes = Places(homeward, (-parameters["metal"]).clamp(0, 1))
             texture = Places(parameters["to_texture"], parameters["texture_weight"])
-            moved = integrate_normals(vertices, self.faces, normals, self.edges, residuals, settings.integration, homes, texture)
+            moved = integrate_normals(
+                vertices, self.faces, normals, self.edges, residuals, settings.integration, homes, texture, self.behind(settings)
+            )
             moved = whole_or_within(settings.box, moved)
             for place in (homeward, parameters["to_texture"]):
                 place += vertices - moved

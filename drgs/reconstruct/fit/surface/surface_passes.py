@@ -122,6 +122,7 @@ class SurfaceFit:
 def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
     """Of pass `index`: weights and the normals' rate go on where the pass before ended; the other rates fall in the last one alone."""
     given, last = settings.surface, index == settings.passes - 1
+    moves = replace(given.moves, resolution=settings.mesh.resolution)
 
     def between(start: float, end: float, place: float) -> float:
         share = place / settings.passes
@@ -137,7 +138,7 @@ def settings_of_pass(settings: PassSettings, index: int) -> SurfaceSettings:
         fall_from=given.fall_from if last else 1.0,
         light_at_end=last,
         looks_for_light=index + 1 in settings.light_before,
-        moves=replace(given.moves, to_surface=given.to_surface_end) if last else given.moves,
+        moves=replace(moves, to_surface=given.to_surface_end) if last else moves,
         seed=given.seed + index,
     )
 
