@@ -1,6 +1,6 @@
 """A capture with everything known, drawn by us: the mesh and cameras of a scene of the benchmark, of other matter or shape, under other light.
 
-    python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn|mug|plant|chair|bricks] --light FILE.exr --new-light FILE.exr [--spp 64]
+    python -m benchmarks draw_scene SCENE OUT --matter chrome|lacquer|gold|as_it_is [--shape urn|mug|plant|chair|bricks|panels] --light FILE.exr --new-light FILE.exr [--spp 64]
                                     [--turned] [--above] [--every 2] [--side 200]
 
 With --above photographs are taken from a ring above the object, as people take them of things on tables, and test views from between them: what faces
@@ -32,6 +32,7 @@ from benchmarks.scenes.draw_film import looking_pose
 from benchmarks.scenes.embossed_urn import embossed_urn
 from benchmarks.scenes.hollow_things import mug, plant
 from benchmarks.scenes.made_things import bricks, chair
+from benchmarks.scenes.thin_panels import panels
 from drgs.reconstruct.capture.load_views import load_cameras
 from drgs.render.intersect.trace_rays import build_tracer
 from drgs.render.intersect.tracer import AbstractTracer
@@ -81,7 +82,7 @@ def urn() -> TriangleMesh:
     )
 
 
-SHAPES: dict[str, Callable[[], TriangleMesh]] = {"urn": urn, "mug": mug, "plant": plant, "chair": chair, "bricks": bricks}
+SHAPES: dict[str, Callable[[], TriangleMesh]] = {"urn": urn, "mug": mug, "plant": plant, "chair": chair, "bricks": bricks, "panels": panels}
 
 
 def of_matter(mesh: TriangleMesh, matter: Matter | None) -> TriangleMesh:

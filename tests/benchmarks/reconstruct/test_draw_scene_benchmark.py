@@ -14,6 +14,7 @@ from benchmarks.reconstruct import draw_scene
 from benchmarks.scenes.embossed_urn import BEAD, embossed_urn
 from benchmarks.scenes.hollow_things import MUG_HEIGHT, WALL, mug, plant
 from benchmarks.scenes.made_things import bricks, chair
+from benchmarks.scenes.thin_panels import FIRST, PITCH, THICKNESSES, panels
 from drgs.evaluate.metrics import score_renders
 from drgs.exchange.exr import encode_environment
 from drgs.reconstruct.capture.load_views import load_cameras, load_views
@@ -129,7 +130,7 @@ def test_the_urn_is_closed_looks_outward_and_carries_its_relief():
     assert 0.5 * BEAD < radii.max() - radii.min() < 1.5 * BEAD
 
 
-@pytest.mark.parametrize(("shape", "most"), [(mug, 0.4), (plant, 0.4), (chair, 0.15), (bricks, 0.7)])
+@pytest.mark.parametrize(("shape", "most"), [(mug, 0.4), (plant, 0.4), (chair, 0.15), (bricks, 0.7), (panels, 0.4)])
 def test_drawn_things_are_closed_look_outward_and_are_partly_empty(shape: Callable[[int], TriangleMesh], most: float):
     mesh = shape(130)
     solid = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy())
@@ -144,6 +145,14 @@ def test_one_looks_down_to_the_floor_of_the_mug():
     below = trace_rays(torch.tensor([[0.1, 0.05, 1.0]]), torch.tensor([[0.0, 0.0, -1.0]]), tracer)
     assert 1 - float(below.distance) == pytest.approx(WALL - MUG_HEIGHT / 2, abs=0.01)
     assert float(mesh.metallic[mesh.vertices[:, 2] > 0.51].min()) == 1 and float(mesh.metallic[mesh.vertices[:, 2] < 0.49].max()) == 0
+
+
+def test_panels_are_as_thin_as_they_are_called():
+    tracer = build_tracer(panels())
+    beside = torch.tensor([[FIRST + k * PITCH - 0.1, -0.3, -0.3] for k in range(len(THICKNESSES))])
+    along = torch.tensor([[1.0, 0.0, 0.0]]).expand(len(beside), 3)
+    near, far = trace_rays(beside, along, tracer), trace_rays(beside + 0.2 * along, -along, tracer)
+    np.testing.assert_allclose(0.2 - near.distance - far.distance, THICKNESSES, atol=0.001)
 
 
 def test_a_shape_takes_the_place_of_the_scenes_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
