@@ -16,7 +16,7 @@ from drgs.reconstruct.fit.densify import ScreenGradientStats
 from drgs.reconstruct.fit.fit_loop import FitState
 from drgs.reconstruct.fit.surfels.surfel_shadows import SurfelShadows
 
-CHECKPOINT_VERSION = "38"
+CHECKPOINT_VERSION = "39"
 """Of names and meaning of what is kept: raise it with every change after which older checkpoints would go on otherwise than they began."""
 
 

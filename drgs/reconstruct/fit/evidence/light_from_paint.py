@@ -4,15 +4,22 @@ Gradients leave light and paint where they began: a lamp above that stage 1 miss
 all that faces down, every photograph is explained, and nothing calls it back. But objects wear few paints, and wear them around bends. With the
 radiance R_i that paint sends at places i, the share T_ij of direction j's radiance that arrives there, and what the object itself sends to it, I_i,
 
-    R_i = a_i (sum_j T_ij L_j + I_i)
+    R_i = (a_i + g) (sum_j T_ij L_j + I_i),
 
-so albedo follows from light. Which light: that under which places of alike chroma and brightness, near each other, have alike albedo, most of them, in
-relative terms. Near each other, for else an object whose upper half is white and whose lower half is grey would be told to be of one paint.
+where g is the gloss of all paint, albedo follows from light. Which light: that under which places of alike chroma and brightness, near each other,
+have alike albedo, most of them, in relative terms. Near each other, for else an object whose upper half is white and whose lower half is grey would be
+told to be of one paint.
 Each place's albedo is held against the mean of places like it, light is solved for these means by non-negative least squares with what the fit had as a
 faint prior, and albedo is taken anew from it; again until they agree. The brightness of places alike may differ by a third, so that this finds what
 gradients do not.
 
-Source: places of alike chroma have one reflectance (docs/sources.md: garces2012), here on a surface and with light by direction; steps of beck2009.
+What faces down is lit by little, and of another colour than the rest; taken for lit by more, its paint is black or of another hue, a paint of its own to
+a narrow kernel, and what is wrong below agrees with itself. So light is solved for once more with a kernel that begins wide, which brings both together,
+and narrows, so that what truly is of two paints parts again. Not all does: of both lights the one is taken under which the object wears fewer paints.
+Gloss counts for the same reason: what sends next to nothing but gloss says nothing of light without it.
+
+Source: places of alike chroma have one reflectance (docs/sources.md: garces2012), here on a surface and with light by direction; paint is spread least
+under the right light (finlayson2004); steps of beck2009.
 
 Where the light turns with the camera, photographs say more: light_from_turns.
 
@@ -20,7 +27,7 @@ In: the mesh through its tracer, the light so far. Out: by what factor it is to 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -49,18 +56,22 @@ class PaintLightSettings:
     fewest: int = 200
     """Of them that are paint; with fewer the light stays."""
     alike_chroma: float = 0.09
-    """Of logarithms, less their mean: standard deviation of the kernel by which albedos are alike ..."""
+    """Of logarithms, less their mean: standard deviation of the kernel by which albedos are alike in the end ..."""
     alike_brightness: float = 0.35
-    """... that of their mean ..."""
+    """... and that of their mean."""
+    alike_at_first: float = 0.6
+    """Both in the first round of a second solve: under light of a wrong colour one paint has several, and only what counts as alike is brought together."""
     alike_place: float = 0.4
-    """... and that of where they are, over the root mean squared distance of places from their middle."""
+    """Of where they are, over the root mean squared distance of places from their middle."""
+    gloss: float = 0.05
+    """Share of the light that paint sends back without its colour: a dielectric's of reflectance 0.04, over all directions."""
     noise: float = 0.1
     """Relative error up to which places count by its square; beyond by its amount."""
     hold: float = 0.2
     """Of the light so far, against the places' mean squared relative error."""
     stride: float = 1.6
     """Albedo goes towards the mean of places like it by this much of the way: beyond, for from round to round means of the near change but slowly."""
-    rounds: int = 12
+    rounds: int = 16
     """Albedo and light in turns."""
     steps: int = 100
     """Of each solve."""
@@ -70,6 +81,15 @@ class PaintLightSettings:
     """... this share of the places, at least: beyond light is too dark, not what it falls on too bright."""
     most: float = 4.0
     """Factor by which a direction changes."""
+
+    def at_round(self, number: int) -> "PaintLightSettings":
+        """With the kernel of round `number`."""
+        place = number / max(self.rounds - 1, 1)
+
+        def between(end: float) -> float:
+            return max(self.alike_at_first, end) ** (1 - place) * end**place
+
+        return replace(self, alike_chroma=between(self.alike_chroma), alike_brightness=between(self.alike_brightness))
 
 
 @torch.no_grad()
@@ -93,17 +113,32 @@ def light_from_paint(
         return None
     known = mean_radiance(radiance, settings.rows)
     shares, from_object = _arriving(tracer, chosen, light, settings.rows, generator)
-    albedo = mesh.albedo[chosen] * (1 - mesh.metallic[chosen])[:, None]
+    albedo = mesh.albedo[chosen] * (1 - mesh.metallic[chosen])[:, None] + settings.gloss
     sent = (albedo * (shares @ known + from_object)).clamp(min=DARKEST)
-    solved = _solved(mesh.vertices[chosen], shares, from_object, sent, known, settings)
-    # How bright and of what colour light is as a whole it trades with albedo, and places that are alike say nothing of it: so it stays, ...
+    where = standing_apart(mesh.vertices[chosen], settings)
+    solved = min(
+        (_solved(where, shares, from_object, sent, known, own) for own in (replace(settings, alike_at_first=0.0), settings)),
+        key=lambda light: spread_of_paint(_log_albedo(sent, shares @ light + from_object), where, settings),
+    )
+    # How bright and of what colour light is as a whole it trades with albedo, and places that are alike say nothing of it: so it stays for most of what
+    # is seen by it (dark sides, where it was furthest off, do not count), ...
     before, after = ((shares @ radiance_of + from_object).clamp(min=DARKEST) for radiance_of in (known, solved))
-    solved = solved * (before / after).log().mean(0).exp()
+    solved = solved * weighted_median(before / after, sent.mean(1))
     # ... but for as much as leaves albedo room below white.
     area = solid_angles(settings.rows).to(known)[:, None]
     whole = (known * area).sum(0) / (solved * area).sum(0).clamp(min=DARKEST)
-    solved = solved * too_dark(torch.cat([sent / (shares @ solved + from_object).clamp(min=DARKEST), mesh.albedo[metal] * whole]), settings)
+    solved = solved * too_dark(
+        torch.cat([sent / (shares @ solved + from_object).clamp(min=DARKEST) - settings.gloss, mesh.albedo[metal] * whole]), settings
+    )
     return (solved / known.clamp(min=1e-6)).clamp(1 / settings.most, settings.most).view(settings.rows, 2 * settings.rows, 3)
+
+
+def weighted_median(values: Float[Tensor, "place column"], weight: Float[Tensor, "place"]) -> Float[Tensor, "column"]:
+    """Of each column: below and above it lies half of the weight."""
+    ranked, order = values.sort(dim=0)
+    summed = weight[order].cumsum(0)
+    at = (summed < 0.5 * summed[-1]).sum(0)
+    return ranked.gather(0, at[None]).squeeze(0)
 
 
 def too_dark(albedo: Float[Tensor, "place 3"], settings: PaintLightSettings) -> float:
@@ -152,7 +187,7 @@ def _arriving(
 
 
 def _solved(
-    positions: Float[Tensor, "place 3"],
+    where: Float[Tensor, "place 3"],
     shares: Float[Tensor, "place texel"],
     from_object: Float[Tensor, "place 3"],
     sent: Float[Tensor, "place 3"],
@@ -162,16 +197,16 @@ def _solved(
     """The light that makes paint alike.
 
     Args:
-        positions: of the places, in the world. sent: radiance, above 0. known: the light so far.
+        where: of standing_apart. sent: radiance, above 0. known: the light so far.
     """
     light = known
-    where = standing_apart(positions, settings)
     solid_angle = (solid_angles(settings.rows) / (4 * math.pi)).to(known)[:, None]
     unit = known + (known * solid_angle).sum(0)  # a texel's steps are relative, for those that are dark to their mean
-    for _ in range(settings.rounds):
-        arriving = (shares @ light + from_object).clamp(min=1e-4)
-        log_albedo = (sent / arriving).clamp(DARKEST, BRIGHTEST).log()
-        alike = (log_albedo + settings.stride * (_mean_of_alike(log_albedo, where, settings) - log_albedo)).exp()
+    for number in range(settings.rounds):
+        own = settings.at_round(number)
+        arriving = shares @ light + from_object
+        log_albedo = _log_albedo(sent, arriving)
+        alike = (log_albedo + settings.stride * (_mean_of_alike(log_albedo, where, own) - log_albedo)).exp()
         error = ((sent - alike * arriving) / sent).abs().mean(1)
         weight = error.clamp(min=settings.noise).rsqrt()
         weight = weight / weight.mean()
@@ -192,6 +227,21 @@ def _solved(
             -1,
         )
     return light
+
+
+def _log_albedo(sent: Float[Tensor, "place 3"], arriving: Float[Tensor, "place 3"]) -> Float[Tensor, "place 3"]:
+    """With gloss."""
+    return (sent / arriving.clamp(min=1e-4)).clamp(DARKEST, BRIGHTEST).log()
+
+
+def spread_of_paint(log_albedo: Float[Tensor, "place 3"], where: Float[Tensor, "place 3"], settings: PaintLightSettings) -> float:
+    """0 where all that is near each other is of one paint: the mean logarithm of how many times more is near a place than near and alike.
+
+    Args:
+        where: of standing_apart.
+    """
+    near = torch.exp(-0.5 * torch.cdist(where, where).square())
+    return float((near.sum(1) / alikeness(log_albedo, where, settings).sum(1)).log().mean())
 
 
 def _mean_of_alike(

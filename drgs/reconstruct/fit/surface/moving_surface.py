@@ -214,7 +214,9 @@ class MovingSurface:
             self.relight(settings.share_rays)
         after = self._mean_irradiance(targets)
         albedo = torch.sigmoid(parameters["albedo_logits"])
-        changed = logits_of_shares(albedo * before / after.clamp(min=1e-6))
+        # Gloss goes with the light, and paint has to make up for it.
+        gloss = settings.paint_light.gloss
+        changed = logits_of_shares((albedo + gloss) * before / after.clamp(min=1e-6) - gloss)
         parameters["albedo_logits"].copy_(torch.where(paint[:, None], changed, parameters["albedo_logits"]))
 
     def _mean_irradiance(self, targets: list[ViewTarget]) -> Tensor:

@@ -116,7 +116,7 @@ def test_paint_that_light_is_taken_from_sends_what_it_sent(tmp_path: Path) -> No
     @torch.no_grad()
     def sent() -> torch.Tensor:
         light = MeshLight(filter_environment(environment_table(parameters)), parameters["open_share"])
-        return torch.sigmoid(parameters["albedo_logits"]) * surface.irradiance(light)
+        return (torch.sigmoid(parameters["albedo_logits"]) + MoveSettings().paint_light.gloss) * surface.irradiance(light)
 
     before, metal = sent(), parameters["albedo_logits"][0].detach().clone()
     surface.look_for_light([target], MoveSettings(share_rays=64))
